@@ -56,7 +56,7 @@ pub enum RunError {
         "--master {master} leads back to this rosrescue: give the address of the real rosmaster, and serve another address with --listen"
     )]
     Loop { master: MasterUri },
-    /// Two computers have the same name. They would depose each other forever.
+    /// Two computers with one name would depose each other forever.
     #[error(
         "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give this one a unique name with --cluster-name"
     )]
@@ -210,7 +210,7 @@ fn watch(config: &Config, parts: &Parts, tasks: &mut JoinSet<()>) {
     }
 }
 
-/// Whether this computer manages the master alone or as one of several.
+/// Whether this computer has the master to itself or is one of several.
 enum Runs {
     /// The only computer. `None` for an external master.
     Single(Option<Supervised>),
@@ -274,7 +274,7 @@ impl Runs {
     }
 }
 
-/// The running manager of the master.
+/// The running driver of the master.
 enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),

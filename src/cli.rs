@@ -1,5 +1,5 @@
-//! The command line. Every option of `core` and `proxy` has an environment variable. Flags of the other commands have
-//! none: nobody consents by a variable that is left over from an earlier command.
+//! The command line. Each option of `core` and `proxy` has an environment variable. Options of the other commands have
+//! none: a variable left over from an earlier command must not confirm a change.
 
 pub(crate) mod cluster;
 mod files;
@@ -52,7 +52,7 @@ impl Cli {
             .get(1)
             .is_some_and(|first| command.find_subcommand(first).is_some())
         {
-            // Another command has no use for the variables of the bare `rosrescue`.
+            // The variables of the bare `rosrescue` do not apply to another command.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
         let matches = command.get_matches_from(words);
@@ -60,7 +60,7 @@ impl Cli {
     }
 }
 
-/// What to run.
+/// The command to run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Replace roscore: start rosmaster and rosout, watch them, and restore them when they die

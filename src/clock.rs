@@ -14,13 +14,12 @@ pub fn wall_time() -> f64 {
         .map_or(0.0, |since| since.as_secs_f64())
 }
 
-/// Wall time at `moment`, according to the clock as it is set now.
+/// Wall time at `moment`, computed from what the clock shows now.
 pub fn wall_time_of(moment: Instant) -> f64 {
     (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)
 }
 
-/// The moment of a wall time, according to the clock as it is set now. A time in the future gives
-/// the present.
+/// The moment of a wall time, computed from what the clock shows now. A time in the future gives the present.
 pub fn moment_of(seconds: f64) -> Instant {
     let now = Instant::now();
     let since = Duration::try_from_secs_f64(wall_time() - seconds).unwrap_or_default();

@@ -1,5 +1,5 @@
-//! The commands that do not serve nodes: each asks a running rosrescue, reads a checkpoint or looks at this
-//! computer, prints what it has found, and ends with an exit status that a script can use.
+//! The commands that do not serve nodes. Each asks a running rosrescue, reads a checkpoint or examines this computer,
+//! prints the result, and ends with an exit status for scripts.
 
 mod check;
 mod completions;
@@ -36,12 +36,12 @@ use crate::{
     log::{plain, plain_json},
 };
 
-/// How a command ends. A usage error of the command line has 2, too.
+/// Exit status of a command. A wrong command line has status 2 as well.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Exit {
-    /// It is done, and what was asked for is so.
+    /// The command worked, and its answer is yes: protected, equal, in time.
     Good = 0,
-    /// It is not so: unprotected, different, not in time, …
+    /// The command worked, and its answer is no: unprotected, different, too late.
     Bad = 1,
 }
 
@@ -49,19 +49,19 @@ pub(crate) enum Exit {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum Failure {
-    /// What was given makes no sense. Exit status 2.
+    /// The arguments make no sense. Exit status 2.
     #[error("{0}")]
     Usage(String),
     /// No rosrescue answers. Exit status 3.
     #[error("no rosrescue at {uri}: {why}. Start `rosrescue core`, or give its address with --uri")]
     Nobody { uri: String, why: String },
-    /// Something has the port and does not answer as a rosrescue. Exit status 3.
+    /// A process listens at the port but does not answer as rosrescue does. Exit status 3.
     #[error(
         "no rosrescue answers at {uri}: {why}. Something has the port: a rosrescue that is stopped or overloaded, \
          or another program; `rosrescue check` names it"
     )]
     Silent { uri: String, why: String },
-    /// It began and could not be finished. Exit status 1.
+    /// The command started and could not finish. Exit status 1.
     #[error("{0}")]
     Failed(String),
 }
@@ -76,9 +76,9 @@ impl Failure {
     }
 }
 
-/// Runs `tool` and says what it has found.
+/// Runs `tool` and prints the result.
 pub fn run(tool: &Tool) -> ExitCode {
-    // Not the current thread alone: what decodes a large answer steps out of the runtime.
+    // Decoding a large answer blocks a worker thread, which a current-thread runtime does not allow.
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -116,7 +116,7 @@ pub fn run(tool: &Tool) -> ExitCode {
     }
 }
 
-/// Prints `result`, as text or JSON. A reader that has gone, as `head` does, is no failure.
+/// Prints `result` as text or JSON. A reader that has closed the pipe, such as `head`, is not an error.
 fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), Failure> {
     let text = if output.json {
         let json = serde_json::to_string_pretty(result);
@@ -127,7 +127,7 @@ fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(),
     print_line(text.trim_end()).map(drop)
 }
 
-/// Prints `text`. Returns whether anybody reads it.
+/// Prints `text`. Returns false if the reader has closed the pipe.
 fn print_line(text: &str) -> Result<bool, Failure> {
     match writeln!(io::stdout(), "{text}") {
         Ok(()) => Ok(true),
@@ -136,7 +136,7 @@ fn print_line(text: &str) -> Result<bool, Failure> {
     }
 }
 
-/// A number of things, as in `1 message` and `2 messages`.
+/// A count with its noun, as in `1 message` and `2 messages`.
 fn counted(count: usize, thing: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };
     format!("{count} {thing}{plural}")

@@ -28,7 +28,7 @@ pub use self::cluster::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
 /// the same name.
 pub(crate) const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
-/// Shortest pause between two probes.
+/// Shortest allowed pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
 
 /// A command line that parses but makes no sense. The exit status is 2.
@@ -76,7 +76,7 @@ pub enum UsageError {
 pub struct Config {
     /// Addresses to serve. The first is required; the others are served if possible.
     pub listen: Vec<SocketAddr>,
-    /// The `ROS_MASTER_URI` announced to others.
+    /// The `ROS_MASTER_URI` that rosrescue announces.
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
@@ -97,14 +97,14 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well. None disables them, and also the eviction
-    /// of nodes whose port another node registers.
+    /// Pause between two health checks while all is well. `None` disables them. Then nodes also stay registered when
+    /// another node takes their port.
     pub reap_interval: Option<Duration>,
-    /// Networks that may call; none allows everybody.
+    /// Networks that may call. `None` allows all.
     pub allow: Vec<IpNet>,
-    /// Networks that may change state; none allows everybody who may call.
+    /// Networks that may change state. `None` allows all that may call.
     pub allow_write: Vec<IpNet>,
-    /// Pause between two comparisons of the mirror with the master; none disables them.
+    /// Pause between two comparisons of the mirror with the master. `None` disables them.
     pub resync_interval: Option<Duration>,
     /// Whether the mirror or the master answers reads while there is a master.
     pub reads: Reads,
@@ -114,9 +114,9 @@ pub struct Config {
     pub max_connections: usize,
     /// Largest request body in bytes.
     pub max_body: usize,
-    /// Which parameters' values the page hides.
+    /// Parameters whose values the page hides.
     pub hide: Hide,
-    /// The cluster of several computers; none for a single one.
+    /// The cluster of several computers. `None` for a single computer.
     pub cluster: Option<ClusterConfig>,
 }
 
@@ -144,9 +144,9 @@ impl MasterConfig {
 /// How to run rosmaster and rosout.
 #[derive(Clone, Debug)]
 pub struct SupervisedConfig {
-    /// The master's port; none for a free one.
+    /// The master's port. `None` for a free one.
     pub port: Option<u16>,
-    /// The rosmaster program; none to search for it.
+    /// The rosmaster program. `None` to search for it.
     pub rosmaster: Option<PathBuf>,
     /// Number of notifier threads of the master.
     pub numworkers: u32,
@@ -227,7 +227,7 @@ impl Config {
         }
     }
 
-    /// Adapts the configuration to the served `port`, which the system may have chosen.
+    /// Adapts the configuration to the served `port`. The system chooses it if port 0 was configured.
     pub fn serve_on(&mut self, port: u16) {
         self.advertised.port = port;
         if !self.checkpoint_is_given {
@@ -235,7 +235,7 @@ impl Config {
         }
     }
 
-    /// Serves `addresses` instead, which another process has bound.
+    /// Serves `addresses` instead of the configured ones. Another process has bound them.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
         let before = self.advertised.clone();
         let single = addresses.first().filter(|address| {

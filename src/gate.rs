@@ -9,23 +9,23 @@ use std::time::Duration;
 
 use tokio::{sync::watch, time::Instant};
 
-/// Who answers calls.
+/// The state of the gate: it says which side answers calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// The master of this incarnation.
+    /// Calls pass to the master of this incarnation.
     Open {
         /// Number of the incarnation; see [`Token`](crate::replay::Token).
         incarnation: u64,
     },
     /// The mirror answers reads and writes, because the master is away.
     StandingIn,
-    /// The mirror answers reads and writes, because the master is late. A batch or a look is still
-    /// under way; when the master answers it, it is given what it missed.
+    /// The mirror answers reads and writes, because the master is late. The master still has to answer a batch or a
+    /// read. Then it gets the writes that it has missed.
     Late,
     /// An injection is under way: the mirror answers reads, and writes that change nothing. Other
     /// writes wait.
     Injecting,
-    /// Another computer has the master or is about to get it: calls go there.
+    /// Another computer has the master or will have it soon. Calls go there.
     Elsewhere,
     /// No master has been seen yet, so the state is unknown and calls wait.
     Unknown,
@@ -45,7 +45,7 @@ struct Gate {
     since: Instant,
 }
 
-/// Creates a shut gate, as its writing and its reading half.
+/// Creates a shut gate and returns its writing and its reading half.
 pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
@@ -59,7 +59,7 @@ pub(crate) fn gate() -> (Tx, Rx) {
 pub(crate) struct Tx(watch::Sender<Gate>);
 
 impl Tx {
-    /// Changes the state and wakes waiters at once. Setting the same state again wakes nobody.
+    /// Changes the state and wakes all waiters at once. Setting the present state again has no effect.
     pub(crate) fn set(&self, state: State) {
         self.0.send_if_modified(|gate| {
             if gate.state == state {
@@ -93,21 +93,21 @@ impl Rx {
         self.state().is_open()
     }
 
-    /// Since when calls have been passing, or not passing.
+    /// When the gate last opened or shut.
     pub fn since(&self) -> Instant {
         self.0.borrow().since
     }
 
-    /// Returns when the state has changed since the last [`Self::look`] or the last return of this
-    /// method. Cancel safe. Never returns once the sender is gone.
+    /// Waits until the state has changed since the last [`Self::look`] or the last return of this method. Cancel safe.
+    /// Never returns once the sender is dropped.
     pub async fn changed(&mut self) {
         if self.0.changed().await.is_err() {
             std::future::pending::<()>().await;
         }
     }
 
-    /// Like [`Self::look`], and also tells whether the state has changed since the last look or
-    /// since [`Self::changed`] returned.
+    /// Like [`Self::look`]. Also returns whether the state has changed since the last look, or since [`Self::changed`]
+    /// returned.
     pub fn look_changed(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
@@ -118,7 +118,7 @@ impl Rx {
         self.0.borrow_and_update().state
     }
 
-    /// Returns when `is_it` accepts the state. Cancel safe.
+    /// Waits until `is_it` accepts the state. Cancel safe.
     pub async fn wait_for(&mut self, is_it: impl Fn(State) -> bool) -> State {
         loop {
             let state = self.look();
@@ -129,9 +129,8 @@ impl Rx {
         }
     }
 
-    /// Returns when no call has passed for an uninterrupted `time`, counted from now at the
-    /// earliest. Never returns while the gate is open. Cancel safe, but cancelling restarts the
-    /// count.
+    /// Waits until no call has passed for an uninterrupted `time`, counted from now at the earliest. Never returns
+    /// while the gate is open. Cancel safe, but cancelling restarts the count.
     pub async fn shut_for(&mut self, time: Duration) {
         loop {
             self.wait_for(|state| !state.is_open()).await;

@@ -2,7 +2,7 @@
 //!
 //! An interactive `rosrescue` is two processes. The guardian binds the sockets, starts the worker, which is
 //! the same program with the sockets passed on ([`handover`]), and restarts it when it dies ([`restart`]).
-//! Connections that arrive meanwhile wait in the kernel's queue; none is refused. The guardian does nothing
+//! Connections that arrive meanwhile wait in the kernel's queue and are not refused. The guardian does nothing
 //! else, so that little can kill it: it has no runtime and reads nothing from the network.
 //!
 //! Under systemd a socket unit replaces it.
@@ -37,17 +37,17 @@ use restart::{End, Next, Restarts};
 /// The running program, even after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
 
-/// The value of `OOMScoreAdjust=` in the systemd unit.
+/// Equals `OOMScoreAdjust=` in the systemd unit.
 const OOM_SCORE_ADJUST: &str = "-500";
 
-/// How long to wait for a worker to handle signals before one is sent anyway.
+/// How long to wait until a worker handles signals. Then signals are sent anyway.
 const START_TIME: Duration = Duration::from_secs(1);
 
 /// Why there is no worker. The exit status is 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GuardianError {
-    /// The system refused to start it.
+    /// The system refused to start the worker.
     #[error("cannot start the worker process: {0}; --no-guardian runs rosrescue without one")]
     Spawn(#[from] io::Error),
     /// This cannot happen, because every descriptor gets its own number.
@@ -55,12 +55,11 @@ pub enum GuardianError {
     Handover(#[from] FdMappingCollision),
 }
 
-/// Runs workers that serve `listeners` until one ends in order. Returns the exit status.
+/// Runs workers that serve `listeners` until one stops cleanly. Returns the exit status.
 ///
 /// # Errors
 ///
-/// If the first worker cannot be started, or signals cannot be received. Later the guardian never
-/// gives up.
+/// If the first worker cannot be started, or signals cannot be received. Later failures are retried forever.
 pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     evade_oom_killer();
     let signals = receive_signals()?;
@@ -96,8 +95,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     }
 }
 
-/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is
-/// returned with the worker, which must end what the dead one left running.
+/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is returned with the worker.
+/// That worker only has to end the processes that the dead one left running.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
@@ -135,7 +134,7 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
 
 struct Worker {
     pid: u32,
-    /// The worker reports its progress here, and notices the guardian's end.
+    /// Through this link the worker reports its progress and notices the guardian's end.
     link: UnixStream,
     handles_signals: bool,
 }
@@ -176,7 +175,7 @@ impl Worker {
         if std::env::var_os(name).is_none() {
             command.env(name, value);
         }
-        // The worker feeds systemd's watchdog in the guardian's place.
+        // The worker feeds systemd's watchdog in place of the guardian.
         command.env_remove("WATCHDOG_PID");
         command.fd_mappings(mappings.collect())?;
         let pid = command.spawn()?.id();
@@ -187,7 +186,7 @@ impl Worker {
         })
     }
 
-    /// Waits for the worker's end and passes signals on. `stopping` is called for each signal.
+    /// Waits for the worker's end, and passes signals on. Calls `stopping` for each signal.
     fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut(i32)) -> End {
         loop {
             match signals.recv() {
@@ -200,7 +199,7 @@ impl Worker {
                     stopping(signal);
                     self.pass_on(signal);
                 }
-                // The thread that sends them has panicked.
+                // The signal thread has panicked.
                 Err(_) => return End::Code(1),
             }
         }
@@ -252,8 +251,8 @@ fn reap(worker: Option<u32>) -> Option<End> {
     end
 }
 
-/// Lets the kernel kill nodes first when memory runs out, as the systemd unit does. Children
-/// inherit this. It works only with CAP_SYS_RESOURCE, and is skipped if a value was chosen already.
+/// Makes the kernel kill nodes first when memory runs out, as the systemd unit does. Children inherit this. It needs
+/// CAP_SYS_RESOURCE, and is skipped if the user has chosen a value.
 fn evade_oom_killer() {
     const SCORE: &str = "/proc/self/oom_score_adj";
     if std::fs::read_to_string(SCORE).is_ok_and(|score| score.trim() == "0") {

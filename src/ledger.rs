@@ -1,8 +1,8 @@
-//! The ledger: mirror and journal under one lock. A write is applied and given to the journal in
-//! one step, and its answer waits until it is [written](journal).
+//! The ledger: mirror and journal under one lock. A write is applied and passed to the journal in one step, and its
+//! answer waits until it is [written](journal).
 //!
-//! The lock also orders both against the takeover by a new incarnation: a reply of the old master
-//! that arrives after the state for the injection was taken is not acknowledged.
+//! The lock also orders writes and the start of a new incarnation. A reply of the old master is not acknowledged if it
+//! arrives after the state for the injection was taken.
 
 pub(crate) mod activity;
 mod answers;
@@ -51,8 +51,8 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// The answer does not count, because another incarnation has taken over or the mirror has changed
-/// since. The call must go to the master again.
+/// The answer is out of date: another incarnation has taken over, or the mirror has changed since. The call must go to
+/// the master again.
 #[derive(Debug)]
 pub struct Superseded;
 
@@ -65,7 +65,7 @@ pub(crate) struct Recorded {
     pub doubtful: bool,
 }
 
-/// The state that an injection starts from.
+/// The state from which an injection is planned.
 #[derive(Debug)]
 pub struct Basis {
     pub mirror: Master,
@@ -74,26 +74,26 @@ pub struct Basis {
     pub pending: Vec<Request>,
 }
 
-/// The mirror, the journal, and the state that keeps them together.
+/// Mirror, journal, and the state that keeps them consistent.
 pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
     stats: &'static Stats,
-    /// The last record that an answer need not wait for.
+    /// The last record that answers need not wait for.
     durable: watch::Sender<u64>,
-    /// Whether a sync that the disk was asked for is late.
+    /// Whether the disk is late with a sync.
     sync_is_late: AtomicBool,
     /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
     /// The last of this computer's records that the other computers have.
     agreed: watch::Sender<Agreed>,
-    /// See [`Ledger::set_lease`].
+    /// The time until which this computer may act as leader. See [`Ledger::set_lease`].
     lease: watch::Sender<Option<Instant>>,
-    /// The mirror's version in the last whole checkpoint that was attempted.
+    /// The mirror's version in the last complete checkpoint that was tried.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
-    /// Wakes the task that sends this computer's writes to the others.
+    /// Wakes the task that sends this computer's writes to the other computers.
     pub shared: Notify,
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
@@ -102,10 +102,10 @@ pub struct Ledger {
 
 struct Inner {
     mirror: Master,
-    /// The answers to getPid and getUri, which are not part of the state.
+    /// The answers to `getPid` and `getUri`, which are not part of the state.
     identity: (i32, String),
     session: Session,
-    /// None if no checkpoint could be opened: the state is unprotected.
+    /// `None` if no checkpoint could be opened. Then the state is unprotected.
     journal: Option<Journal>,
     shared: Shared,
     /// Changes whenever the mirror changes.
@@ -119,22 +119,22 @@ struct Inner {
     injecting: bool,
     /// Whether the present master may differ from the mirror and must be read again.
     doubted: bool,
-    /// Whether the present incarnation may still run a batch whose reply nobody awaits any more.
+    /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
-    /// What the present incarnation will hold once it has answered what it is late with.
+    /// The state of a late incarnation once it has answered its outstanding calls.
     behind: Option<Behind>,
-    /// The incarnation that was served last.
+    /// The incarnation that answered calls last.
     served: Option<u64>,
     /// Whether the mirror comes from a checkpoint and no master has been compared with it. A living
     /// master may be newer.
     unconfirmed: bool,
-    /// Whether the session has changed and the journal does not have its record yet.
+    /// Whether the session has changed and the change is not in the journal yet.
     session_unwritten: bool,
 }
 
 impl Ledger {
-    /// Creates a ledger of `mirror`, recorded in `store`. `pending` are writes that the incarnation
-    /// of `session` may not have run. `sync` tells when a record must be on the disk.
+    /// Creates a ledger of `mirror`, recorded in `store`. `pending` are writes that the incarnation of `session` may
+    /// not have run. `sync` says when a record must be on the disk.
     pub fn new(
         mirror: Master,
         session: Session,
@@ -200,17 +200,17 @@ impl Ledger {
         self.lock().unconfirmed = true;
     }
 
-    /// Sets the answers to getPid and getUri.
+    /// Sets the answers to `getPid` and `getUri`.
     pub fn set_identity(&self, pid: i32, uri: String) {
         self.lock().set_identity((pid, uri));
     }
 
-    /// The answer to getUri: rosrescue's own address.
+    /// The answer to `getUri`: rosrescue's own address.
     pub fn uri(&self) -> String {
         self.lock().identity.1.clone()
     }
 
-    /// Sets the answer to getPid.
+    /// Sets the answer to `getPid`.
     pub fn set_master_pid(&self, pid: i32) {
         let mut inner = self.lock();
         let (_, uri) = inner.identity.clone();
@@ -279,7 +279,7 @@ impl Ledger {
         let mut sources = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
         for (index, (answered, source)) in answered.into_iter().enumerate() {
-            // Then the mirror is known to differ: the master holds what cannot be read from it.
+            // Then mirror and master are known to differ: the master holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
@@ -289,7 +289,7 @@ impl Ledger {
                 }
                 recorded.doubtful = true;
                 if !answered.executed {
-                    // A refused call is in no journal.
+                    // No journal has a record of a refused call.
                     unrecorded = true;
                 }
             }
@@ -345,7 +345,7 @@ impl Ledger {
     pub fn doubt(&self) {
         let mut inner = self.lock();
         inner.doubted = true;
-        // A look that is under way may have come too early.
+        // An inspection that is running may have read the master too early.
         inner.version += 1;
         drop(inner);
         // Wakes the write queue, which reads the master.
@@ -362,16 +362,15 @@ impl Ledger {
         self.lock().version
     }
 
-    /// Sets the mirror to `state`, which the master holds. Returns the differences in a few
-    /// sentences without values.
+    /// Sets the mirror to `state`, which the master holds. Returns the differences as a few sentences without values.
     pub fn adopt(&self, state: Master) -> Vec<String> {
         let difference = self.lock().adopt(state);
         self.recorded();
         difference
     }
 
-    /// Like [`Self::adopt`], if `state` was read from the master of `incarnation` when the mirror
-    /// was at `version`.
+    /// Like [`Self::adopt`], but only if `state` was read from the master of `incarnation` while the mirror was at
+    /// `version`.
     pub fn adopt_if(
         &self,
         incarnation: u64,
@@ -403,7 +402,7 @@ impl Ledger {
 }
 
 impl Inner {
-    /// Applies `call`. `standing_in` collects its notifications; none if a master notifies nodes.
+    /// Applies `call`. `standing_in` collects its notifications. It is `None` if a master notifies the nodes.
     fn apply(
         &mut self,
         now: Instant,
@@ -452,7 +451,7 @@ impl Inner {
             self.version += 1;
         }
         let (unordered, old) = (self.mirror.is_unordered(), self.mirror.is_old());
-        // An equal state is replaced too, because it may be known more exactly.
+        // An equal state replaces the mirror too, because it may be known more exactly.
         self.mirror = state;
         self.mirror.set_unordered(unordered);
         self.mirror.set_old(old);
@@ -465,8 +464,7 @@ impl Inner {
 
     fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
-            // If the present incarnation comes back, the mirror's state replaces everything that it
-            // holds.
+            // If the present incarnation answers again, the mirror's state replaces everything in it.
             self.raise_incarnation();
             self.write_session();
         }
@@ -488,7 +486,7 @@ impl Inner {
 
     fn write_session(&mut self) {
         if std::mem::take(&mut self.session_unwritten) {
-            // The file does not contain what was not recorded.
+            // The file lacks what was not recorded.
             self.session.cluster_seq = match self.whole.is_due() {
                 true => 0,
                 false => self.cluster_seq(),
@@ -502,8 +500,7 @@ impl Inner {
         Token::new(&self.session.mark, self.session.incarnation)
     }
 
-    /// Notes that the mirror has changed without a journaled call, so that a whole checkpoint is
-    /// due.
+    /// Notes that the mirror has changed without a record. The next complete checkpoint is due.
     fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
         self.share_state();
@@ -514,7 +511,7 @@ impl Inner {
         self.last_seq().unwrap_or_default()
     }
 
-    /// Number of the journal's last record; none without a journal.
+    /// Number of the journal's last record. `None` without a journal.
     fn last_seq(&self) -> Option<u64> {
         self.journal.as_ref().map(Journal::seq)
     }
@@ -527,14 +524,14 @@ impl Inner {
         }
     }
 
-    /// Gives `entries` to the journal. The store keeps a failure, which does not fail the call.
+    /// Passes `entries` to the journal. A failure is kept in the store, and does not fail the call.
     fn append(&mut self, entries: Vec<Entry>) {
         self.append_from(entries, &[]);
     }
 
-    /// Like [`Self::append`], with the source of each call; missing sources mean this computer.
+    /// Like [`Self::append`], with the source of each call. Missing sources stand for this computer.
     fn append_from(&mut self, entries: Vec<Entry>, sources: &[&Source]) {
-        // Comes first, because the following entries belong to the incarnation that it names.
+        // The session's record comes first, because it names the incarnation of the following entries.
         self.write_session();
         self.share(&entries, sources);
         if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {

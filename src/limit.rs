@@ -1,24 +1,24 @@
-//! Rate limits for what could come by the thousand, such as log lines and files during a crash
-//! loop: a burst at first, then one from time to time.
+//! Rate limits for events that could come by the thousand, such as log lines and files in a crash loop. At first some
+//! pass at once, later one from time to time.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
-/// Number of times that are allowed at once.
+/// How many events may pass at once.
 const BURST: u32 = 10;
-/// Time after which one more is allowed: some 300 a day.
+/// Time after which one more event may pass: some 300 a day.
 const REFILL: Duration = Duration::from_secs(300);
 
-/// Permission to do the limited thing now.
+/// Permission for one event.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Pass {
-    /// Number of times that were left out before this one; none if there were none.
+    /// Number of events left out before this one. `None` if there were none.
     pub(crate) left_out: Option<u64>,
 }
 
-/// A rate limit for one thing.
+/// A rate limit for one kind of event.
 #[derive(Debug)]
 pub(crate) struct Limit(Mutex<Bucket>);
 
@@ -35,7 +35,7 @@ impl Limit {
         Self(Mutex::new(Bucket::FULL))
     }
 
-    /// Whether the thing may be done at `now`; none if it must be left out.
+    /// Permission for an event at `now`. `None` if it must be left out.
     pub(crate) fn pass(&self, now: Instant) -> Option<Pass> {
         let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         bucket.pass(now)
@@ -71,14 +71,14 @@ impl Bucket {
     }
 }
 
-/// A rate limit for an alarm and its all-clear: both are logged, or neither.
+/// A rate limit for an alarm and its all-clear. Either both are logged or neither.
 #[derive(Debug)]
 pub(crate) struct Pair(Mutex<Episode>);
 
 #[derive(Debug)]
 struct Episode {
     bucket: Bucket,
-    /// Whether an alarm was logged since the last all-clear; none if there was no alarm.
+    /// Whether an alarm was logged since the last all-clear. `None` if there was no alarm.
     told: Option<bool>,
 }
 
@@ -102,8 +102,8 @@ impl Pair {
         passed
     }
 
-    /// Like [`Limit::pass`], for the all-clear. It passes if an alarm passed since the last
-    /// all-clear. Without an alarm it is limited like any other line.
+    /// Like [`Limit::pass`], for the all-clear. It passes if an alarm passed since the last all-clear. Without an alarm
+    /// it is limited like any other line.
     pub(crate) fn all_clear(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         match episode.told.take() {
@@ -112,15 +112,14 @@ impl Pair {
         }
     }
 
-    /// Notes that another log line has reported the same trouble, so that the all-clear is logged
-    /// as well.
+    /// Notes that another log line has reported the same trouble, so that the all-clear is logged as well.
     pub(crate) fn told(&self) {
         self.lock().told = Some(true);
     }
 }
 
-/// Logs like the `tracing` macro of that level, but [rate-limited](self). The rest is logged at
-/// level debug.
+/// Logs like the `tracing` macro of that level, but [rate-limited](self). Lines above the limit are logged at level
+/// debug.
 macro_rules! rarely {
     ($level:ident, $($line:tt)+) => {{
         static LIMIT: $crate::limit::Limit = $crate::limit::Limit::new();
@@ -158,7 +157,7 @@ pub(crate) use all_clear;
 mod tests {
     use super::*;
 
-    /// The result of a limit that allows it, after `left_out` refusals.
+    /// A permission after `left_out` refusals.
     fn passed(left_out: Option<u64>) -> Option<Pass> {
         Some(Pass { left_out })
     }
@@ -202,7 +201,7 @@ mod tests {
         }
         let later = now + REFILL;
         assert_eq!(pair.alarm(later), passed(Some(5)), "so many were left out");
-        // The same trouble continues, and is not logged again.
+        // The same trouble continues and is not logged again.
         assert_eq!(pair.alarm(later), None);
         assert_eq!(pair.all_clear(later), passed(None));
     }
@@ -211,7 +210,7 @@ mod tests {
     fn an_all_clear_follows_whatever_line_has_told_of_the_trouble() {
         let pair = Pair::new();
         let now = Instant::now();
-        // Without an alarm, as at the start, it is a line like any other.
+        // Without an alarm, as at the start, the all-clear is an ordinary line.
         let alone = (0..20).filter(|_| pair.all_clear(now).is_some()).count();
         assert_eq!(alone, 10);
         assert_eq!(pair.alarm(now), None);

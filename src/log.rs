@@ -14,9 +14,8 @@ pub struct Stderr {
 }
 
 impl Stderr {
-    /// Finds out whether journald reads standard error. `stream` is the value of `JOURNAL_STREAM`:
-    /// device and inode of the stream that systemd gave us. Standard error may have been redirected
-    /// since.
+    /// Finds out whether journald reads standard error. `stream` is the value of `JOURNAL_STREAM`: device and inode of
+    /// the stream that systemd created. Standard error may have been redirected since.
     pub fn of(stream: Option<&str>) -> Self {
         let own = fstat(io::stderr()).ok();
         let own = own.map(|file| format!("{}:{}", file.st_dev, file.st_ino));
@@ -74,7 +73,7 @@ fn is_unsafe(c: char) -> bool {
     turns || c.is_control() && c != '\n'
 }
 
-/// Escapes such characters in JSON `text` without changing its meaning.
+/// Escapes unsafe characters in JSON `text` without changing its meaning.
 pub(crate) fn plain_json(text: &str) -> String {
     let mut plain = String::with_capacity(text.len());
     for c in text.chars() {
@@ -86,8 +85,8 @@ pub(crate) fn plain_json(text: &str) -> String {
     plain
 }
 
-/// Replaces characters in `text` that a terminal would take for commands or for a change of the
-/// writing direction. Names come from the network, so they may contain any.
+/// Replaces characters in `text` that a terminal would take for commands or for a change of the writing direction.
+/// Names come from the network and may contain any character.
 pub(crate) fn plain(text: &str) -> String {
     let safe = |c: char| if is_unsafe(c) { REPLACEMENT } else { c };
     text.chars().map(safe).collect()

@@ -26,7 +26,7 @@ use tracing_subscriber::{
     Layer, filter::Targets, fmt, layer::SubscriberExt, util::SubscriberInitExt,
 };
 
-/// How long threads may still run after all work is done.
+/// How long threads may still run after everything else has ended.
 const LAST_JOBS: Duration = Duration::from_millis(500);
 /// A signal to all processes named rosrescue, as sent by killall, reaches a worker twice: directly
 /// and through its guardian. A second signal within this time counts as the first one.
@@ -43,7 +43,7 @@ fn main() -> ExitCode {
         }
     };
     if sockets.is_some() {
-        // The worker is started as /proc/self/exe, and would otherwise be listed as `exe`.
+        // The worker is started as /proc/self/exe, so without this its name would be `exe`.
         let _ = rustix::thread::set_name(c"rosrescue");
     }
     let cli = Cli::read();
@@ -123,17 +123,15 @@ fn start(
 }
 
 fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
-    // One thread: with more threads each call wakes others, which costs a third more CPU time. One
-    // thread answers tens of thousands of reads per second, and slow work goes elsewhere
-    // (`block_in_place`, `spawn_blocking`).
+    // One thread: with more, each call wakes other threads, which costs a third more CPU time. One thread answers tens
+    // of thousands of reads per second. Slow work runs elsewhere (`block_in_place`, `spawn_blocking`).
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));
-    // The closing checkpoint is on the disk and newer than any write still under way. A thread may
-    // still wait for a name server that never answers. Ending the process does not wait for it, but
-    // dropping the runtime would.
+    // The closing checkpoint is on the disk and newer than any write that still runs. A thread may be waiting for a
+    // dead name server. Dropping the runtime would wait for it; ending the process does not.
     runtime.shutdown_timeout(LAST_JOBS);
     ended
 }
@@ -173,7 +171,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
     Ok(())
 }
 
-/// Prints a line. A closed stdout is no reason to stop.
+/// Prints a line. A closed stdout is not an error.
 fn say(line: &str) {
     let mut stdout = std::io::stdout();
     let colour = stdout.is_terminal() && colour_is_welcome();

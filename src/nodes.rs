@@ -1,4 +1,4 @@
-//! Watches the nodes, and knows what is not in their registrations.
+//! Watches the nodes, and keeps what their registrations do not tell.
 
 pub(crate) mod client;
 pub(crate) mod health_check;
@@ -43,18 +43,18 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// How long the master must be away before rosrescue sends the notifications that it may not have
-/// sent. Most masters that only closed an idle connection are back by then.
+/// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most masters
+/// that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
-/// Delay after which a new worker sends nodes what its predecessor may not have sent. By then an
-/// adopted master has sent its own notifications, unless it has a long backlog.
+/// Delay before a new worker sends nodes the notifications that its predecessor may not have sent. By then an adopted
+/// master has sent its own, unless it has a long backlog.
 const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
-/// Most nodes that are remembered for not answering `paramUpdate`.
+/// Most nodes that are remembered because they do not answer `paramUpdate`.
 const MUTE_MOST: usize = 1024;
 
-/// The state of the nodes beyond their registrations.
+/// What rosrescue knows of the nodes beyond their registrations.
 pub struct Nodes {
     ledger: Arc<Ledger>,
     gate: gate::Rx,
@@ -67,15 +67,15 @@ pub struct Nodes {
     liveness: Liveness,
     new: New,
     unreachable: Mutex<Unreachable>,
-    /// Ports of nodes that do not answer `paramUpdate` but answer other calls.
+    /// Ports of nodes that answer other calls but not `paramUpdate`.
     mute: Mutex<HashSet<String>>,
     pub(crate) removed: Removed,
-    /// Whether this computer is cut off from the others.
+    /// Whether this computer is cut off from the other computers.
     alone: AtomicBool,
     served: Served,
-    /// Number of recoveries whose health check has not ended.
+    /// Number of recoveries whose health check is still running.
     checks: AtomicUsize,
-    /// Number of nodes that have not been asked or have not answered yet.
+    /// Number of nodes that have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
@@ -112,13 +112,13 @@ impl Nodes {
         }
     }
 
-    /// Sets whether this computer is cut off from the others.
+    /// Sets whether this computer is cut off from the other computers.
     pub(crate) fn set_alone(&self, alone: bool) {
         self.alone.store(alone, Ordering::Relaxed);
     }
 
-    /// Whether the node at `port` may be notified. A computer that is cut off does not notify nodes
-    /// of other computers, because they get the state of the leader.
+    /// Whether the node at `port` may be notified. A computer that is cut off does not notify nodes of other computers,
+    /// because they get the leader's state.
     pub(super) async fn may_tell(&self, port: &str) -> bool {
         !self.alone.load(Ordering::Relaxed)
             || self.served.has(port)
@@ -139,7 +139,7 @@ impl Nodes {
         self.mute.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the node at `port` does not answer `paramUpdate` but answers other calls.
+    /// Whether the node at `port` answers other calls but not `paramUpdate`.
     fn is_mute(&self, port: &str) -> bool {
         self.lock_mute().contains(port)
     }
@@ -155,7 +155,7 @@ impl Nodes {
 
     /// The names of the unreachable nodes.
     pub fn unreachable(&self) -> Vec<String> {
-        // Never hold both locks here.
+        // The two locks must never be held together here.
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes();
@@ -170,15 +170,14 @@ impl Nodes {
     pub(super) fn mark_unreachable(&self, port: &str) {
         let now = Instant::now();
         let new = self.lock().add(port, now);
-        // This node may be due before the others.
+        // This node may be due before all others.
         self.changed.notify_one();
         if !new {
             return;
         }
         tracing::debug!(port, "a node does not answer");
         if self.update_notifying() {
-            // The master may be about to notify this very node of recent changes, before all
-            // others.
+            // The master may be about to notify this node of recent changes before all others.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
             self.ledger.outbox_changed.notify_one();
@@ -194,10 +193,10 @@ impl Nodes {
         was
     }
 
-    /// Decides whether rosrescue notifies nodes in addition to the master: while a node is
-    /// unreachable or a check is under way. Returns whether that begins now.
+    /// Decides whether rosrescue notifies nodes in addition to the master: while a node is unreachable or a check is
+    /// running. Returns whether that begins now.
     fn update_notifying(&self) -> bool {
-        // The locks are nested only here: otherwise an older result could be stored last.
+        // The locks are nested only here. Otherwise an older result could be stored last.
         let unreachable = self.lock();
         let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger
@@ -205,8 +204,8 @@ impl Nodes {
             && notifying
     }
 
-    /// Lets rosrescue notify nodes in addition to the master until the result is dropped, because
-    /// it is not known yet which nodes are unreachable.
+    /// Makes rosrescue notify nodes in addition to the master until the result is dropped. Until then it is unknown
+    /// which nodes are unreachable.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
         nodes.update_notifying();
@@ -224,8 +223,8 @@ impl Drop for CheckUnderWay {
     }
 }
 
-/// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again,
-/// identifies new nodes, and runs the regular health check.
+/// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again, identifies new nodes,
+/// and runs the regular health check.
 pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
@@ -291,8 +290,8 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
     }
 }
 
-/// Takes the notifications that a master lost at `outage` may not have sent, as topics and
-/// parameters. Also begins to shut down nodes that it may not have told.
+/// Takes the notifications that a master lost at `outage` may not have sent, as topics and parameters. Also begins to
+/// shut down displaced nodes that it may not have told.
 fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
     let owed = nodes
         .ledger
@@ -313,9 +312,9 @@ pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     topics
 }
 
-/// Sends nodes, after a second, what a rosrescue that died may not have sent. Returns the topics.
+/// Sends the notifications that a rosrescue that died may not have sent, after a second. Returns their topics.
 ///
-/// The master lives and may still have notifications to send, so the present state goes last.
+/// The master lives and may still be sending notifications, so the present state goes last.
 pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let (mut topics, params) = take_owed(nodes, outage);
     let at = Instant::now() + ADOPTED_AFTER;

@@ -1,5 +1,4 @@
-//! Child processes: finds, starts and ends rosmaster and rosout. It reports what happens and never
-//! decides.
+//! Child processes: finds, starts and stops rosmaster and rosout. It reports what happens and decides nothing.
 
 use std::{
     ffi::OsStr,
@@ -38,7 +37,7 @@ use pid_file::PidFile;
 pub(crate) use rosout::Rosout;
 pub(crate) use stat::Stat;
 
-/// How long a process may take to end after SIGINT, and again after SIGTERM.
+/// How long a process may take to end after SIGINT, and then again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
 /// The PATH that systemd gives to services.
 pub(crate) const SERVICE_PATH: &str =
@@ -73,8 +72,8 @@ pub(crate) struct Rosmaster {
     config: SupervisedConfig,
     /// Stdout and stderr of the last rosmaster.
     output: Output,
-    /// The logging configuration for rosmaster; none if the user has one, or if the kernel lacks
-    /// such files.
+    /// The logging configuration for rosmaster. `None` if the user has one, or if the kernel does not support sealed
+    /// files in memory.
     log_config: Option<LogConfig>,
     /// PID file of the last rosmaster.
     pid_file: PidFile,
@@ -82,7 +81,7 @@ pub(crate) struct Rosmaster {
 }
 
 impl Rosmaster {
-    /// Finds the program. Its files are created next to `checkpoint`.
+    /// Finds the rosmaster program. Its output and PID files are created next to `checkpoint`.
     pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
         Ok(Self {
             program: find_rosmaster(config.rosmaster.as_deref())?,
@@ -94,7 +93,7 @@ impl Rosmaster {
         })
     }
 
-    /// Whether it is ROS's own program rather than a program that the user chose.
+    /// Whether this is ROS's own rosmaster, and not a program that the user chose.
     pub(crate) fn is_own(&self) -> bool {
         self.config.rosmaster.is_none()
     }
@@ -214,15 +213,15 @@ pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop
-/// cannot interrupt it, because nobody would know of the new process.
+/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop does not interrupt
+/// it: the new process would then be unknown.
 fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }
 
-/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`, which its programs
-/// need to find modules and libraries. In a shell `setup.bash` sets them, but a service lacks them.
-/// `depth` is how many folders the program is below the installation.
+/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. Its programs need them to find modules
+/// and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders between the
+/// installation and the program.
 fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     let Some(prefix) = program
         .ancestors()
@@ -246,8 +245,8 @@ fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     }
 }
 
-/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with a pause after each. `ended` resolves
-/// when it has ended.
+/// Stops a process: sends SIGINT, SIGTERM, SIGKILL, with a pause after each. `ended` completes when the process has
+/// ended.
 pub(crate) async fn stop(pid: u32, ended: impl Future) {
     let mut ended = std::pin::pin!(ended);
     for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
@@ -263,7 +262,7 @@ pub(crate) async fn stop(pid: u32, ended: impl Future) {
     }
 }
 
-/// Sends a signal. A missing process is no error.
+/// Sends a signal. Does nothing if the process is gone.
 pub(crate) fn signal_process(pid: u32, signal: Signal) {
     if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
         let _ = kill_process(pid, signal);
@@ -278,8 +277,8 @@ pub(crate) fn is_alive(pid: u32) -> bool {
         .is_some_and(|pid| test_kill_process(pid).is_ok())
 }
 
-/// Whether the process `pid` runs a program of this name, according to its command line. A
-/// remembered process id may belong to another process by now.
+/// Whether the process `pid` runs a program with this name, according to its command line. A process id that was
+/// remembered may belong to another process by now.
 pub(crate) fn runs(pid: u32, name: &str) -> bool {
     let command_line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     command_line.split(|byte| *byte == 0).any(|argument| {
@@ -290,17 +289,17 @@ pub(crate) fn runs(pid: u32, name: &str) -> bool {
     })
 }
 
-/// Whether a rosrescue with this checkpoint started the process `pid`.
+/// Whether the process `pid` was started by a rosrescue with this checkpoint.
 pub(crate) fn is_of(pid: u32, checkpoint: &Path) -> bool {
     orphan::bears(pid, &orphan::owner(checkpoint))
 }
 
-/// Whether a rosrescue started the process `pid`.
+/// Whether the process `pid` was started by any rosrescue.
 pub(crate) fn is_of_any(pid: u32) -> bool {
     orphan::has_owner(pid) || parent_of(pid).is_some_and(is_rosrescue)
 }
 
-/// All visible processes.
+/// All processes that this one can see.
 pub(crate) fn all() -> impl Iterator<Item = u32> {
     let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
@@ -324,7 +323,7 @@ pub(crate) fn is_rosrescue(pid: u32) -> bool {
     name.as_encoded_bytes().starts_with(b"rosrescue")
 }
 
-/// Returns when the process `pid`, which is not our child, has ended.
+/// Waits until the process `pid` has ended. It need not be a child of this process.
 pub(crate) async fn ended(pid: u32) {
     if orphan::ended(pid).await.is_err() {
         while is_alive(pid) {
@@ -333,7 +332,7 @@ pub(crate) async fn ended(pid: u32) {
     }
 }
 
-/// How a process ended, in words.
+/// Describes how a process ended.
 pub(crate) fn describe(status: ExitStatus) -> String {
     use std::os::unix::process::ExitStatusExt;
     match (status.code(), status.signal()) {
@@ -343,8 +342,7 @@ pub(crate) fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// The output of `program`, if it ends within `limit`, in the form that roslaunch's `command=`
-/// would use.
+/// The output of `program`, if it ends within `limit`, trimmed as roslaunch's `command=` does.
 pub(crate) async fn output_of(
     program: &str,
     arguments: &[&str],
@@ -366,7 +364,7 @@ pub(crate) async fn output_of(
         .then(|| String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// The rosmaster that a process with this PATH finds.
+/// The rosmaster that a process with this PATH would find.
 pub(crate) fn find_rosmaster_on(path: &OsStr) -> Option<PathBuf> {
     find_program_on(path, "rosmaster", &["bin"])
 }
@@ -387,7 +385,7 @@ fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf
             .flatten()
             .map(|entry| entry.path())
             .collect();
-        // The last one by name wins, as in kinetic, melodic, noetic.
+        // The last name wins, so newer distributions come first: kinetic, melodic, noetic.
         distributions.sort();
         let candidates = distributions.iter().rev();
         let mut programs =
@@ -402,7 +400,7 @@ fn is_program(path: &Path) -> bool {
         .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
 }
 
-/// Whether rosmaster, which sets SO_REUSEADDR, could listen on this port.
+/// Whether rosmaster could listen on this port. It sets SO_REUSEADDR.
 fn is_free(port: u16) -> bool {
     bind_loopback(port).is_ok()
 }

@@ -1,4 +1,4 @@
-//! Watches the master and brings it back. This is the shell around [`crate::lifecycle`].
+//! Watches the master and restores it after a failure. This is the shell around [`crate::lifecycle`].
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
@@ -41,7 +41,7 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// Limits the log lines that masters keep dying and that the present one lives.
+/// Limits the log lines that masters keep dying, and that the present one keeps running.
 static CRASH_LOOP: Pair = Pair::new();
 
 /// The result of a step. At most one step runs at a time.
@@ -74,9 +74,9 @@ pub(crate) struct Driver {
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
-    /// Resolves when the sentinel's connection ends.
+    /// Completes when the sentinel's connection ends.
     ended: Option<Ended>,
-    /// Resolves when a thread of the master ends, once for each master.
+    /// Completes when a thread of the master ends. Used once for each master.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
@@ -88,8 +88,8 @@ pub(crate) struct Driver {
 }
 
 impl Driver {
-    /// Creates a driver that examines masters with `examiner` and starts them with `process`.
-    /// `slow` is notified when a master takes too long to answer a call.
+    /// Creates a driver that examines masters with `examiner` and starts them with `process`. `slow` signals that the
+    /// master takes too long to answer a call.
     pub(crate) fn new(
         examiner: Examiner,
         write_queue: WriteQueue,
@@ -126,15 +126,15 @@ impl Driver {
         }
     }
 
-    /// Like [`Self::start`], after another computer has had the master. `cause` tells why this
-    /// computer has it now.
+    /// Like [`Self::start`], after another computer has had the master. `cause` is the reason why this computer has it
+    /// now.
     pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
         self.outage.cause = cause;
         self.start(true)
     }
 
-    /// Lets the mirror stand in, if it may, and returns the first actions. `restored` tells whether
-    /// the mirror comes from a checkpoint whose session continues.
+    /// Lets the mirror stand in if the state is known, and returns the first actions. `restored` says whether the
+    /// mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
         let actions = self
@@ -144,7 +144,7 @@ impl Driver {
         actions
     }
 
-    /// Watches the master until `stop`, beginning with the actions that [`Self::start`] returned.
+    /// Watches the master until `stop`. Begins with the actions that [`Self::start`] returned.
     ///
     /// # Errors
     ///
@@ -196,7 +196,7 @@ impl Driver {
         }
     }
 
-    /// Samples the master's process, if the lifecycle needs that to decide.
+    /// Samples the master's process, if the lifecycle needs a sample for `input`.
     async fn sample_for(&mut self, input: Input) {
         let process = self.process.as_ref();
         let pid = process.and_then(MasterProcess::pid);
@@ -212,8 +212,8 @@ impl Driver {
         });
     }
 
-    /// Handles an input that ends the contact with the master: tells the lifecycle first whether
-    /// that master had answered, and drops the step under way.
+    /// Handles an input that ends the contact with the master. First tells the lifecycle whether that master had
+    /// answered, then drops the step in progress.
     fn end_contact(&mut self, input: Input) {
         if !matches!(
             input,
@@ -277,13 +277,12 @@ impl Driver {
         }
     }
 
-    /// Carries out `action`. Returns its result if it is known at once.
+    /// Carries out `action`. Returns its result if that is known at once.
     async fn carry_out(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
                 self.disconnect();
-                // Always prepared afresh, because the previous plan may have gone to a master that
-                // died meanwhile.
+                // The injection is always prepared again: a master that died meanwhile may have got the previous one.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));
@@ -294,7 +293,7 @@ impl Driver {
                         Ok(sentinel) => Arc::new(sentinel),
                         Err(error) => return Done::NotConnected(error),
                     };
-                    // This precedes the first call, because a stranger must not be given the state.
+                    // This comes before the first call, because another program at the port must not get the state.
                     match holder(new).await {
                         Holder::Stranger(pid) => Done::PortTaken(pid),
                         Holder::Master | Holder::Unknown => Done::Connected(sentinel),
@@ -319,7 +318,7 @@ impl Driver {
                 self.step = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
-                // A late probe continues, and its answer counts whenever it comes.
+                // A late probe continues, and its answer counts when it arrives.
                 self.probe_deadline =
                     Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
                 if self.step.is_none()
@@ -427,7 +426,7 @@ impl Driver {
             Done::Examined(sentinel, Ok(examination)) => {
                 let outcome = examination.outcome;
                 if outcome == Outcome::Resumed {
-                    // Another process may have written to the master directly.
+                    // Another program may have written to the master directly.
                     self.examiner.ledger.doubt();
                 } else {
                     self.thread_ended = thread_of(&sentinel, examination.pid);
@@ -444,7 +443,7 @@ impl Driver {
                 let input = error.as_input();
                 if input == Input::NotAMaster {
                     self.log_once(format!(
-                        "what answers at {master} is not a ROS master: {error}. Look at --master"
+                        "what answers at {master} is not a ROS master: {error}. Correct --master"
                     ));
                 } else {
                     self.log_once(format!(
@@ -461,7 +460,7 @@ impl Driver {
             // Another incarnation answers, although the connection to the previous one is still
             // open.
             Done::Probed(Err(VerifyError::OtherIncarnation)) => Some(Input::ConnectionLost),
-            // No answer. If the master has just died, the end of the older connection will show it.
+            // There was no answer. If the master has just died, the older connection will end and show that.
             Done::Probed(Err(_)) => None,
             Done::Probed(Ok(())) => {
                 self.probe_deadline = None;
@@ -478,7 +477,7 @@ impl Driver {
     }
 
     fn disconnect(&mut self) {
-        // An injection under way has failed.
+        // An injection in progress has failed.
         if !self.examiner.gate.state().is_open() {
             self.keep_shut();
         }
@@ -489,7 +488,7 @@ impl Driver {
         self.probe_deadline = None;
     }
 
-    /// Shuts the gate. The mirror stands in if it may.
+    /// Shuts the gate. The mirror stands in if the state is known.
     fn keep_shut(&self) {
         self.examiner.ledger.end_injection();
         self.examiner.gate.set(match self.lifecycle.may_stand_in() {
@@ -522,7 +521,7 @@ impl Driver {
                 "the master is away: nodes keep running, rosrescue answers in its place. Start the master if nothing else does"
             ),
         }
-        // The prepared injection is outdated.
+        // The prepared injection is out of date.
         self.prepared = None;
     }
 
@@ -530,7 +529,7 @@ impl Driver {
         self.said = None;
         self.examiner.open_gate();
         if let Some(number) = self.restored.take() {
-            // This comes last, so that calls need not wait for a copy of the state.
+            // This comes last, so that calls do not wait while the state is copied.
             self.rescues.keep(number, Instant::now());
         }
     }
@@ -550,13 +549,12 @@ impl Driver {
     }
 }
 
-/// Resolves when a thread of the master `pid` ends. None if the master runs elsewhere. Never
-/// resolves if the kernel cannot watch threads.
+/// Completes when a thread of the master `pid` ends. `None` if the master runs elsewhere. Never completes if the kernel
+/// cannot watch threads.
 fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     let id = u32::try_from(pid).ok().filter(|_| sentinel.is_local())?;
     Some(Box::pin(async move {
-        // Runs off the runtime, because the command line is read under the lock of the master's
-        // memory.
+        // The check blocks, because reading the command line needs the lock of the master's memory.
         let watched = spawn_blocking(move || process::runs(id, "rosmaster")).await;
         if let (Ok(true), Ok(ended)) = (watched, thread_exit::of(pid)) {
             ended.await;
@@ -566,7 +564,7 @@ fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     }))
 }
 
-/// Finds the process that listens at the port of a master just started. Runs off the runtime.
+/// Finds the process that listens at the port of a new master. Does not block the runtime.
 async fn holder(new: Option<(u32, u16, bool)>) -> Holder {
     let Some((pid, port, own)) = new else {
         return Holder::Unknown;

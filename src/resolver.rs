@@ -1,4 +1,4 @@
-//! Whether a node is on this computer.
+//! Finds out whether a node is on another computer.
 
 use std::time::Duration;
 
@@ -6,8 +6,8 @@ pub(crate) use lookup::{addresses, is_own};
 
 use crate::ros_env::MasterUri;
 
-/// Whether a node's `api` is on another computer. False if its host has no address, or if the
-/// lookup takes longer than `patience`.
+/// Whether a node's `api` is on another computer. False if its host has no address, or if the lookup takes longer than
+/// `patience`.
 pub(crate) async fn is_elsewhere(api: &str, patience: Duration) -> bool {
     let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
         return false;

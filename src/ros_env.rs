@@ -12,8 +12,7 @@ use thiserror::Error;
 /// The master's port if `ROS_MASTER_URI` contains none.
 pub const DEFAULT_MASTER_PORT: u16 = 11311;
 
-/// Looks up an environment variable. It is a parameter so that tests need not change the
-/// environment.
+/// Looks up an environment variable. Passed as a parameter, so that tests need not change the environment.
 pub type Lookup<'a> = &'a dyn Fn(&str) -> Option<String>;
 
 /// An invalid `ROS_MASTER_URI` or `--master`.
@@ -73,10 +72,9 @@ impl MasterUri {
         })
     }
 
-    /// Whether this address, which a node uses as its master, is the master at `own`. `addresses`
-    /// are the host's addresses as resolved here; `is_own` recognises this computer's own
-    /// addresses. A loopback address counts only if `node_is_here`, because it means the node's own
-    /// computer.
+    /// Whether this address, which a node uses as its master, is the master at `own`. `addresses` are the host's
+    /// addresses as resolved here. `is_own` recognises this computer's own addresses. A loopback address counts only if
+    /// `node_is_here`, because it means the node's own computer.
     pub(crate) fn names(
         &self,
         own: &Self,
@@ -126,7 +124,7 @@ pub fn address_override(env: Lookup<'_>) -> Option<String> {
         .filter(|address| !address.is_empty())
 }
 
-/// Name and value of the variable if [`address_override`] is invalid; none if it is valid or unset.
+/// Name and value of the variable, if [`address_override`] is invalid. `None` if it is valid or unset.
 pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     let host = address_override(env)?;
     // The scope of an address such as fe80::1%eth0 is not checked.
@@ -142,9 +140,8 @@ pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     Some((variable, host))
 }
 
-/// The addresses to listen on, chosen as a master does: all, or only loopback if the computer's own
-/// address is a loopback address. The first is tried first; an address family that the computer
-/// lacks may be left out.
+/// The addresses to listen on, chosen as a master does: all addresses, or loopback if this computer's own address is a
+/// loopback address. The first address is required. Others may be left out if the computer lacks their address family.
 pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     match address_override(env) {
         Some(address) if address.starts_with("127.") => {
@@ -164,8 +161,8 @@ pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     }
 }
 
-/// The host of this computer that is announced to others, chosen as rosgraph does: the override,
-/// else the host name unless it is a loopback name, else `local_address`.
+/// The announced host of this computer, chosen as rosgraph does. It is the override, else the host name unless that is
+/// a loopback name, else `local_address`.
 pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<IpAddr>) -> String {
     if let Some(address) = address_override(env) {
         return address;

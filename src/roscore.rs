@@ -1,4 +1,4 @@
-//! The duties of roscore besides the master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
+//! roscore's duties besides the master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
 
 use std::{
     path::PathBuf,
@@ -25,25 +25,25 @@ use crate::{
 
 /// Time limit for `rosversion`, which is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
-/// Pause before rosout is restarted, as with roslaunch's `respawn`. It doubles after each rosout
-/// that did not run for [`LONGEST_RESPAWN`].
+/// Pause before rosout is restarted, as with roslaunch's `respawn`. It doubles each time rosout ended before it had run
+/// for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 const ROSOUT: &str = "/rosout";
 
 pub(crate) struct Roscore {
-    /// Tells whether the parameters are set already.
+    /// The ledger, which knows whether the parameters are set already.
     pub ledger: Arc<Ledger>,
     pub write_queue: WriteQueue,
-    /// Tells whether calls pass to the master.
+    /// The gate, which tells whether calls pass to the master.
     pub gate: gate::Rx,
     /// The address that rosrescue serves.
     pub uri: String,
-    /// Path of the checkpoint, which distinguishes our rosout from others.
+    /// Path of the checkpoint. It marks the rosout of this rosrescue.
     pub checkpoint: PathBuf,
-    /// How long a node may take to answer.
+    /// Longest time for a node to answer.
     pub node_timeout: Duration,
-    /// Process id of our rosout; 0 if there is none.
+    /// Process id of the rosout of this rosrescue; 0 if there is none.
     pub rosout: AtomicU32,
 }
 
@@ -61,19 +61,18 @@ fn run_id(roscore: &Roscore) -> Request {
     set("/run_id", &roscore.ledger.session().id)
 }
 
-/// Sets the run id of a new session before there is a master. It is injected with the rest of the
-/// state, so no roslaunch ever sees a master without one. The run id stays unset if the master may
-/// already have one.
+/// Sets the run id of a new session before there is a master. It is injected with the rest of the state, so every
+/// roslaunch sees a master with a run id. Does nothing if the master may already have a run id.
 pub(crate) fn seed_run_id(roscore: &Roscore) {
     if !has(roscore, "/run_id") {
         roscore.ledger.seed(&run_id(roscore));
     }
 }
 
-/// Sets the versions and runs rosout once there is a master, until `stop`; then ends rosout.
+/// Sets the versions, and runs rosout once there is a master, until `stop`. Then it stops rosout.
 pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
     let duties = async {
-        // These are slow, so they run while the master starts.
+        // `rosversion` is slow, so it runs while the master starts.
         let versions = tokio::join!(
             version(&roscore, "/rosversion", "roslaunch"),
             version(&roscore, "/rosdistro", "-d"),
@@ -100,7 +99,7 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
         () = stop.cancelled() => {}
     }
     stop.cancelled().await;
-    // No rosout is started after this point. It can still unregister itself from the master.
+    // From now on no rosout is started. rosout can still unregister from the master.
     end_rosout(&roscore).await;
 }
 
@@ -108,8 +107,7 @@ async fn first_opening(roscore: &Roscore) {
     roscore.gate.clone().wait_for(gate::State::is_open).await;
 }
 
-/// The call that sets `key` to the output of `rosversion`, including the line feed, as
-/// `roscore.xml` does.
+/// The call that sets `key` to the output of `rosversion`, with the line feed that `roscore.xml` keeps.
 async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
     if has(roscore, key) {
         return None;
@@ -123,10 +121,10 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     version.map(|version| set(key, &version))
 }
 
-/// Limits the log lines that rosout has ended or cannot be started, and that it has been started.
+/// Limits the log lines that rosout has ended or cannot be started, and that it was started.
 static ENDED: Pair = Pair::new();
 
-/// Keeps one rosout running: ours, or one that exists already.
+/// Keeps one rosout running: that of this rosrescue, or one that exists already.
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!(
@@ -175,7 +173,7 @@ async fn keep_rosout(roscore: &Roscore) {
     }
 }
 
-/// Process id of the registered rosout; none if it does not answer.
+/// Process id of the registered rosout. `None` if it does not answer.
 async fn living_rosout(roscore: &Roscore) -> Option<u32> {
     let api = roscore
         .ledger
@@ -189,10 +187,10 @@ async fn living_rosout(roscore: &Roscore) -> Option<u32> {
 /// Time after which a new process shows its command line.
 const STARTED: Duration = Duration::from_millis(500);
 
-/// Ends rosout in order.
+/// Stops rosout cleanly.
 async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
-        // There may be an orphan that has not been found yet.
+        // An orphan may not have been found yet.
         0 => Rosout::find(&roscore.checkpoint)
             .and_then(|rosout| block_in_place(|| rosout.find_orphan())),
         pid => Some(pid),

@@ -1,4 +1,4 @@
-//! The side that clients talk to: listener, admission, calls and pages.
+//! The side of rosrescue that clients talk to: listener, admission, calls and pages.
 
 pub(crate) mod access;
 pub(crate) mod admission;
@@ -29,25 +29,24 @@ use self::{
 };
 use crate::status::stats::Stats;
 
-/// What every request needs.
+/// What every request handler needs.
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
     /// Who may call, and who may change something.
     pub(crate) access: Access,
-    /// Refused addresses that the log has named lately.
+    /// When each refused address was last logged.
     pub(crate) refused: Mutex<Said>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
-    /// Notified when a request by rosrescue itself arrives here: the master's address is
-    /// rosrescue's own.
+    /// Signals that a request of rosrescue itself has arrived: then the master's address is rosrescue's own.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,
-    /// Connections without a request.
+    /// Connections without a request in progress.
     pub idle: Idle,
     /// Largest body, in bytes.
     pub max_body: usize,
-    /// Memory for large bodies, in KiB.
+    /// Memory for large request bodies, in KiB.
     pub bodies: Semaphore,
     /// Memory for large answers.
     pub answers: Arc<Answers>,

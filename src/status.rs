@@ -41,15 +41,14 @@ pub struct Disk {
     /// Whether changes are recorded, and when this last changed.
     pub protected: bool,
     pub since: Instant,
-    /// When the checkpoint was last rewritten as a whole, and the journal's last record at that
-    /// time.
+    /// When the checkpoint was last rewritten as a whole, and the last record then.
     pub compacted: Option<(Instant, u64)>,
     /// Free bytes on the checkpoint's disk.
     pub free: Option<u64>,
 }
 
 impl Disk {
-    /// When recording stopped. It is noticed shortly after the failure.
+    /// When recording stopped. The failure itself is a little older.
     fn unprotected_since(&self) -> Instant {
         match self.protected {
             true => Instant::now(),
@@ -63,7 +62,7 @@ impl Disk {
 pub struct Facts {
     pub mode: Mode,
     pub started: Instant,
-    /// When the crash loop began; none while there is no crash loop.
+    /// When the crash loop began. `None` if there is none.
     pub crash_loop: Option<Instant>,
     /// When the last crash loop ended.
     pub calm_since: Option<Instant>,
@@ -84,7 +83,7 @@ pub struct Facts {
     /// computers.
     pub(crate) master_is_open: bool,
     pub disk: Disk,
-    /// What is known of the other computers; none without `--cluster`.
+    /// The facts about the other computers. `None` without `--cluster`.
     pub cluster: Option<cluster::ClusterFacts>,
 }
 
@@ -112,8 +111,7 @@ pub enum Guarded {
     Nobody,
     /// systemd, with a socket unit.
     Systemd,
-    /// The guardian process with this process id. `restarted`: whether something restarts the
-    /// guardian when it dies.
+    /// The guardian is the process `pid`. `restarted` says whether something restarts it when it dies.
     Guardian { pid: u32, restarted: bool },
     /// The guardian with this process id is stopped, as by Ctrl-Z. It does nothing until it is
     /// resumed.
@@ -180,7 +178,7 @@ impl Facts {
         }
     }
 
-    /// Since when everything has been in order, given that it is in order now and calls pass.
+    /// Since when everything has been in order. Call this only if it is in order now and calls pass.
     fn settled_since(&self) -> Instant {
         self.disk.since.max(self.calm_since.unwrap_or(self.started))
     }
@@ -197,7 +195,7 @@ impl Facts {
         }
     }
 
-    /// Continues the counts and reports of the session from before this process.
+    /// Adds the counts and reports of the session's earlier processes.
     pub(crate) fn go_on(&mut self, mut earlier: Earlier) {
         self.reports.extend(earlier.reports.drain(..));
         self.deaths = earlier.deaths;
@@ -205,7 +203,7 @@ impl Facts {
         self.earlier = earlier;
     }
 
-    /// Sets the number of masters that this process has seen die, in addition to those before it.
+    /// Sets how many masters have died under this process. Deaths counted by earlier processes are added.
     pub(crate) fn set_deaths(&mut self, deaths: u64) {
         self.deaths = self.earlier.deaths + deaths;
     }

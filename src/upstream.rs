@@ -38,10 +38,10 @@ use crate::{
 /// Largest accepted reply of the master, in bytes. The XML of a parameter tree of 64 MiB is
 /// smaller.
 const MAX_REPLY: usize = 512 << 20;
-/// Time limit for a connect, because a host that drops packets never answers.
+/// Time limit for connecting. A host that drops packets never answers.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
-/// Header in each request to the master, by which a proxy notices that it points at itself.
+/// Header in each request to the master. A rosrescue that receives its own value is its own master.
 pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 
 /// Why a connection could not be made.
@@ -50,12 +50,12 @@ pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 pub enum ConnectError {
     #[error("nothing listens at {master}")]
     Refused { master: String },
-    /// There is no route, or no answer.
+    /// The master's host gave no answer, or there is no route to it.
     #[error("cannot reach {master}: {source}")]
     Unreachable { master: String, source: io::Error },
 }
 
-/// Why a call got no reply. Whether the master may have run it decides what may follow.
+/// Why a call got no reply. The kinds differ in whether the master may have run the call.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CallError {
@@ -68,7 +68,7 @@ pub enum CallError {
     /// The master may have run the call.
     #[error("the master sent no reply: {0}")]
     MaybeSent(hyper::Error),
-    /// The reply may come from another incarnation.
+    /// The reply may be from another incarnation.
     #[error("the reply may come from another master: {0}")]
     Unverified(Box<VerifyError>),
     /// The reply's body ended early or exceeded a limit.
@@ -98,8 +98,8 @@ impl Default for Head {
 }
 
 impl RawReply {
-    /// Whether the connection may be used again. rosmaster does not read the body of a request
-    /// whose head it refuses, and would take it for the next request.
+    /// Whether the connection may be used again. rosmaster does not read the body of a request whose head it refuses,
+    /// and then takes that body for the next request.
     pub fn leaves_connection_usable(&self) -> bool {
         self.status.is_success() && self.keeps_alive
     }
@@ -107,17 +107,17 @@ impl RawReply {
 
 #[derive(Clone, Debug)]
 pub struct RawReply {
-    /// Whether the other end takes another request on the connection.
+    /// Whether the other end accepts another request on the connection.
     pub keeps_alive: bool,
     pub status: StatusCode,
-    /// The reason phrase, unless it is the usual one.
+    /// The reason phrase, unless it is the standard one.
     pub reason: Option<ReasonPhrase>,
     pub headers: HeaderMap,
     pub body: Bytes,
 }
 
 impl RawReply {
-    /// Whether the other end's dictionaries are ordered, as in every Python since 3.6.
+    /// Whether the other end keeps dictionaries in order, as every Python since 3.6 does.
     pub fn keeps_order(&self) -> bool {
         keeps_order(self.headers.get(SERVER).and_then(|it| it.to_str().ok()))
     }
@@ -135,7 +135,7 @@ fn keeps_order(server: Option<&str>) -> bool {
     python.is_none_or(|version| version >= (3, 6))
 }
 
-/// The version of Python in a `Server` header such as `BaseHTTP/0.3 Python/2.7.18`.
+/// The Python version in a `Server` header such as `BaseHTTP/0.3 Python/2.7.18`.
 fn python(server: &str) -> Option<(u32, u32)> {
     let mut words = server.split_whitespace();
     let version = words.find_map(|word| word.strip_prefix("Python/"))?;
@@ -143,22 +143,22 @@ fn python(server: &str) -> Option<(u32, u32)> {
     Some((numbers.next()??, numbers.next()??))
 }
 
-/// Makes connections to the master, wherever it is.
+/// Connects to the master, on this or another computer.
 #[derive(Debug)]
 pub struct Upstream {
     address: watch::Sender<MasterUri>,
     instance: HeaderValue,
     probe_timeout: Duration,
     probe_count: u32,
-    /// The master's addresses as they were last resolved.
+    /// The master's addresses from the last successful lookup.
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
     /// Number of connections for writes.
     writers: watch::Sender<usize>,
-    /// How calls are known to reach the served incarnation; none while no master is served.
+    /// How calls are verified to reach the present incarnation. `None` while calls do not pass.
     verification: Mutex<Option<Verification>>,
 }
 
-/// Counts a connection for writes until it ends.
+/// Counts a connection for writes until it is dropped.
 #[derive(Debug)]
 struct Writer(watch::Sender<usize>);
 
@@ -169,8 +169,8 @@ impl Drop for Writer {
 }
 
 impl Upstream {
-    /// Creates the connections to `address`. `instance` identifies this process. A connection ends
-    /// when the kernel's probes, with the same count and timeout, are not answered either.
+    /// Prepares connections to `address`. `instance` identifies this process. A connection also ends after the kernel's
+    /// probes were unanswered, with the count and timeout of rosrescue's own probes.
     pub fn new(
         address: MasterUri,
         instance: HeaderValue,
@@ -192,7 +192,7 @@ impl Upstream {
         self.address.borrow().clone()
     }
 
-    /// Changes the master's address; open connections stay as they are.
+    /// Changes the master's address. Open connections stay.
     pub fn relocate(&self, address: MasterUri) {
         self.address.send_replace(address);
     }
@@ -207,9 +207,9 @@ impl Upstream {
         self.connect_with(Some(Writer(self.writers.clone()))).await
     }
 
-    /// Returns when every connection for writes has ended.
+    /// Waits until all connections for writes have ended.
     pub async fn no_writers(&self) {
-        // This cannot fail: we hold a sender.
+        // This cannot fail: this value holds a sender.
         let _ = self.writers.subscribe().wait_for(|count| *count == 0).await;
     }
 
@@ -224,17 +224,17 @@ impl Upstream {
 
     async fn bounded_stream(&self) -> Result<(MasterUri, TcpStream), ConnectError> {
         let (address, stream) = self.stream().await?;
-        // Best effort: the connection also works without it.
+        // If this fails, the connection still works.
         let _ = self.silence().bound(&stream);
         Ok((address, stream))
     }
 
-    /// How calls are known to reach the served incarnation; none while no master is served.
+    /// How calls are verified to reach the present incarnation. `None` while calls do not pass.
     pub(crate) fn verification(&self) -> Option<Verification> {
         self.lock_verification().clone()
     }
 
-    /// Sets how calls are verified. The previous sentinel is closed when no call needs it any more.
+    /// Sets how calls are verified. The previous sentinel closes once no call needs it any more.
     pub(crate) fn set_verification(&self, verification: Option<Verification>) {
         *self.lock_verification() = verification;
     }
@@ -275,15 +275,15 @@ impl Upstream {
         }
     }
 
-    /// The addresses of the master. If its name cannot be resolved, the last known ones: a failing
-    /// name server must not cut off a living master.
+    /// Looks up the master's addresses. If that fails, returns the last known ones: a failing name server must not cut
+    /// off a living master.
     async fn find(&self, address: &MasterUri) -> io::Result<Vec<SocketAddr>> {
         if let Ok(ip) = address.host.parse() {
             return Ok(vec![SocketAddr::new(ip, address.port)]);
         }
         let (found, asked) = (self.found.clone(), address.clone());
-        // This runs in a task: a late answer serves the next connection, so a moved master is found
-        // however slow the name server is.
+        // The lookup runs in a task of its own, so that a late answer can serve the next connection. A moved master is
+        // found even with a slow name server.
         let lookup = tokio::spawn(async move {
             let addresses = resolver::addresses(&asked.host, asked.port).await?;
             found.send_replace(Some((asked, addresses)));
@@ -295,7 +295,7 @@ impl Upstream {
             found.map(|(_, addresses)| addresses.clone())
         };
         if known().is_some() {
-            // The rest of a probe's time is for the master itself.
+            // The rest of a probe's time is left for the master itself.
             let _ = timeout(self.probe_timeout / 4, lookup).await;
         } else {
             lookup.await.map_err(io::Error::other)??;
@@ -304,7 +304,7 @@ impl Upstream {
     }
 
     fn silence(&self) -> Silence {
-        // The kernel only takes whole seconds here.
+        // The kernel accepts only whole seconds here.
         let interval = self.probe_timeout.max(Duration::from_secs(1));
         Silence {
             interval,
@@ -313,10 +313,12 @@ impl Upstream {
     }
 }
 
-/// Ends connections to another computer after a silence: when its side has acknowledged nothing for
-/// a little longer than the probes take to find a dead master. The kernel of a hung master still
-/// acknowledges. After a cut cable, or in a router that has forgotten the connection, nothing is
-/// acknowledged, and TCP itself would take a quarter of an hour. On this computer it is not needed.
+/// Ends a connection to another computer if that computer's kernel has acknowledged nothing for a little longer than
+/// probes take to find a dead master.
+///
+/// The kernel of a hung master still acknowledges. After a cut cable, or if a router has forgotten the connection,
+/// nothing is acknowledged, and TCP itself would take a quarter of an hour to notice. Connections within this computer
+/// do not need this.
 #[derive(Clone, Copy, Debug)]
 struct Silence {
     interval: Duration,
@@ -333,13 +335,13 @@ impl Silence {
             .with_interval(self.interval);
         let socket = SockRef::from(stream);
         socket.set_tcp_keepalive(&probes)?;
-        // This limit, rather than a count, also ends the probes.
+        // This limit also ends the probes, instead of a count.
         socket.set_tcp_user_timeout(Some(self.limit))
     }
 }
 
-/// Connects to the first of `addresses` that accepts. A refusal is reported in preference to an
-/// unreachable address, because it shows more about the master.
+/// Connects to the first of `addresses` that accepts. If all fail, prefers to report a refusal, because it tells more
+/// about the master than an unreachable address.
 async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     let mut failure = io::Error::from(io::ErrorKind::NotFound);
     for address in addresses {
@@ -352,8 +354,7 @@ async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     Err(failure)
 }
 
-/// Whether the other end is, or seems to be, on this computer. The end of a tunnel is on this
-/// computer, too.
+/// Whether the other end seems to be on this computer. A tunnel's near end also counts.
 fn is_local(stream: &TcpStream) -> io::Result<bool> {
     let peer = stream.peer_addr()?.ip();
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())

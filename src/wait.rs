@@ -1,4 +1,4 @@
-//! Waiting for optional events, and for disks.
+//! Waits for optional events, and for disks.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ pub(crate) async fn until(deadline: Option<Instant>) {
     }
 }
 
-/// Waits for `future`, or forever if there is none. Cancel safe: the future stays with the caller.
+/// Waits for `future`, or forever if there is none. Cancel safe: the caller keeps the future.
 pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
     match future {
         Some(future) => future.await,
@@ -30,8 +30,8 @@ pub(crate) async fn tick(interval: &mut Option<tokio::time::Interval>) {
     }
 }
 
-/// Runs `work`, which may wait for a disk, in another thread. Returns none after `limit`; the work
-/// itself then continues.
+/// Runs `work`, which may wait for a disk, in another thread. `None` if it takes longer than `limit`; it then still
+/// continues.
 pub(crate) async fn within<T: Send + 'static>(
     limit: Duration,
     work: impl FnOnce() -> T + Send + 'static,

@@ -49,23 +49,23 @@ impl WriteQueue {
         let _ = self.items.send(item).await;
     }
 
-    /// When the unanswered batch was sent; none if there is none.
+    /// When the unanswered batch was sent. `None` if there is none.
     pub(crate) fn unanswered_since(&self) -> Option<Instant> {
         *self.sent.borrow()
     }
 
-    /// Makes a call by rosrescue itself, recorded like any other. None if there is no answer.
+    /// Makes a call for rosrescue itself, recorded like any other. `None` if there is no answer.
     pub async fn call(&self, call: Request) -> Option<Reply> {
         self.call_own(call, None).await
     }
 
-    /// Like [`Self::call`], but drops the call if `condition` no longer holds when it is due.
+    /// Like [`Self::call`], but drops the call if `condition` no longer holds when its turn comes.
     pub async fn call_if(&self, call: Request, condition: Condition) -> Option<Reply> {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes the calls of `ask`, except those that conflict with changes by others. None if there
-    /// is no answer.
+    /// Makes the calls of `ask`, except those that conflict with changes by other computers. `None` if there is no
+    /// answer.
     pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::Answer> {
         let (item, answered, judged) = merge::item(ask);
         self.items.send(item).await.ok()?;
@@ -89,24 +89,24 @@ impl WriteQueue {
         }
     }
 
-    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent
-    /// until the gate has changed. Called by the gate's only writer.
+    /// Waits until a batch was lost: the master may have run it, and may be dead. Nothing is sent until the gate has
+    /// changed. Called by the gate's only writer.
     pub async fn lost(&self) {
         self.signals.lost.notified().await;
     }
 
-    /// Returns when a write has waited for the [patience](Self::set_patience), and the mirror can
-    /// answer it and everything under way.
+    /// Waits until a write has waited for the [patience](Self::set_patience), if the mirror can answer it and all other
+    /// calls that the master has not answered.
     pub(crate) async fn late(&self) {
         self.signals.is_late.notified().await;
     }
 
-    /// Returns when the late master has answered what was under way.
+    /// Waits until the late master has answered its outstanding calls.
     pub(crate) async fn late_answered(&self) {
         self.signals.has_answered.notified().await;
     }
 
-    /// Sets how long writes wait for the master from now on.
+    /// Sets how long writes wait for the master.
     pub(crate) fn set_patience(&self, patience: Patience) {
         self.signals.patience.send_replace(patience);
     }
@@ -122,9 +122,9 @@ struct Signals {
     has_answered: Notify,
 }
 
-/// Creates a write queue and the worker to run. `resync_interval` is how often the master is
-/// compared with the mirror; none for never. `evicts` tells whether a node is unregistered when
-/// another node registers its port. `patience` is how long writes wait for the master.
+/// Creates a write queue and its worker. `resync_interval` is the pause between two comparisons of master and mirror;
+/// `None` for never. `evicts` says whether a node is unregistered when another node registers its port. `patience` is
+/// how long writes wait for the master.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,

@@ -29,7 +29,7 @@ pub(crate) struct SmallComputer {
 }
 
 impl SmallComputer {
-    /// Enters such a group. The error says why that is impossible: neither version of cgroups is writable.
+    /// Enters a group. The error says why that is impossible: no version of cgroups is writable.
     pub(crate) fn enter() -> Result<Self, String> {
         let (parent, own, version) = mount()?;
         let group = parent.join(format!("rosrescue-compare-{}", std::process::id()));

@@ -284,7 +284,7 @@ impl Cluster {
         lines.filter(|line| line.contains("ALONE:")).count()
     }
 
-    /// The time of the last takeover in seconds, as reported by the leading computer.
+    /// The duration of the last takeover in seconds, as the leading computer reports it.
     pub(crate) fn said(&self) -> f64 {
         let status = self.cluster_status(self.leader()).unwrap_or_default();
         let seconds = status["last_takeover"]["seconds"].as_f64();

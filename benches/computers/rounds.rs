@@ -43,12 +43,11 @@ pub(crate) struct Takeover {
     pub(crate) election: Election,
     /// Whether the etcd member that died with the computer was leading etcd.
     pub(crate) led_etcd: bool,
-    /// Whether a survivor was cut off in the meantime and answered alone, because etcd's own election took
-    /// longer.
+    /// Whether a survivor was cut off meanwhile and answered by itself, because etcd's own election took longer.
     pub(crate) alone: bool,
     pub(crate) round: Round,
-    /// The time on the status page of the next leader, in milliseconds: from the last sign of life of the
-    /// previous one.
+    /// The duration of the takeover according to the next leader's status, in milliseconds: from the last sign of life
+    /// of the previous leader.
     pub(crate) said: f64,
 }
 

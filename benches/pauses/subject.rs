@@ -19,7 +19,8 @@ use crate::shared::{
     },
 };
 
-/// The time in which pauses are observed. It is longer than any recovery, which is waited for in any case.
+/// The time in which pauses are observed. It is longer than any recovery, and the bench waits for the recovery in any
+/// case.
 const SPAN: Duration = Duration::from_millis(500);
 /// The parameter that the reader reads.
 const READ: &str = "/pauses/value";
@@ -159,7 +160,7 @@ impl Subject {
         self.master.kill();
     }
 
-    /// What the clients see while `event` takes place and as long as it has consequences.
+    /// What the clients observe while `event` takes place and as long as it has consequences.
     pub(crate) fn window(&mut self, event: impl FnOnce(&mut Self)) -> Window {
         let begin = Instant::now();
         event(self);
@@ -204,8 +205,8 @@ impl Subject {
         ms(begin.elapsed())
     }
 
-    /// What the clients see while there is no master for `away`. Also the time in milliseconds from the
-    /// registration of each publisher in the meantime until a subscriber knows it.
+    /// What the clients observe while there is no master for `away`. Also the times, in milliseconds, from each
+    /// publisher's registration during the outage until a subscriber knows it.
     pub(crate) fn outage(&mut self, away: Duration) -> (Window, Vec<f64>) {
         let client = self.master.client();
         let subscriber = FakeNode::start("/pauses_subscriber");

@@ -126,8 +126,8 @@ impl Robot {
         serde_json::from_slice(&page.body).expect("JSON")
     }
 
-    /// Makes the master notify every subscriber again, as it does in a life of hours: it keeps a connection
-    /// to each node that it has called, and closes all of them when it dies.
+    /// Makes the master notify every subscriber again, as it does over hours. It keeps a connection to each node that
+    /// it has called, and closes all of them when it dies.
     pub(crate) fn let_live(&self) {
         let (client, state) = (self.rescue.client(), self.state());
         let of = |table: &[(String, String)], key: &str| {
@@ -199,7 +199,7 @@ fn number(json: &Json) -> f64 {
     json.as_f64().expect("a number")
 }
 
-/// Starts rospy nodes, so many at a time that all make progress: each takes half a second of a core.
+/// Starts rospy nodes, a few at a time so that all make progress: each takes half a second of a core.
 fn real(scratch: &Scratch, port: u16, count: usize) -> Vec<Process> {
     let at_once = 2 * available_parallelism().map_or(2, usize::from);
     let mut nodes: Vec<Process> = Vec::new();

@@ -89,7 +89,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
     let Ok((mut store, Some(loaded))) = Store::open_on(memory.clone(), path) else {
         return;
     };
-    // No store ever counts this far. A state written after it could not be read again.
+    // No store ever counts this far. A state written with a higher number could not be read again.
     const END: u64 = u64::MAX / 2 - 2;
     if store.seq() > END || store.generation() > END {
         return;

@@ -9,7 +9,7 @@ use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_ca
 pub(crate) fn check(bytes: &[u8]) {
     if let Ok(call) = decode_call(bytes) {
         assert_eq!(decode_call(&encode_call(&call)), Ok(call.clone()));
-        // Whatever it is, the mirror has an answer, and the answer can be sent.
+        // The mirror has an answer to every call, and the answer can be sent.
         let request = Request::from(call);
         request.kind();
         request.is_answerable();
@@ -32,7 +32,7 @@ fn check_reply(reply: &Reply) {
     match reply {
         Reply::Fault { .. } => assert_eq!(again.as_ref(), Ok(reply)),
         Reply::Value(value) => {
-            // As a parameter it is encoded in our own form, which keeps everything.
+            // As a parameter the value is encoded in rosrescue's own form, which keeps everything.
             let call = Call::new("m", vec![value.clone()]);
             assert_eq!(decode_call(&encode_call(&call)), Ok(call));
             match form(value, 1) {

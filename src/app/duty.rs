@@ -1,4 +1,4 @@
-//! The duty of the computer that has the master: recovery, and the other duties of roscore.
+//! Runs the computer that has the master: recovery, and roscore's other duties.
 
 use std::{
     path::PathBuf,
@@ -40,7 +40,7 @@ pub(super) struct Parts {
     pub(super) supervision: Supervision,
     pub(super) probing: Probing,
     pub(super) probe_timeout: Duration,
-    /// Most space for kept rescue states, in bytes.
+    /// Most disk space for the checkpoints kept from rescues, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
     pub(super) checkpoint: PathBuf,
@@ -68,8 +68,7 @@ impl Parts {
         )
     }
 
-    /// Starts the other duties of roscore, until `stop`. `seeds` tells whether to set a run id if
-    /// there is none.
+    /// Starts roscore's other duties, until `stop`. If `seeds` is true and there is no run id, a new run id is set.
     pub(super) fn roscore(
         &self,
         rosout: bool,
@@ -91,11 +90,12 @@ impl Parts {
         tokio::spawn(roscore::run(roscore, rosout, stop))
     }
 
-    /// Creates the driver of a single computer, with its first actions. `rosmaster` starts masters,
-    /// the last of which was at `port`; none for an external master. `rosout` tells whether to run
-    /// rosout; none for none of roscore's other duties. `restored` tells whether the mirror comes
-    /// from a checkpoint whose session continues. When the first of `ends` is cancelled, rosout is
-    /// ended, and then the second is cancelled.
+    /// Creates the driver of a single computer, with its first actions.
+    ///
+    /// `rosmaster` starts masters; the last one was at `port`. It is `None` for an external master. `rosout` says
+    /// whether to run rosout; `None` skips all of roscore's other duties. `restored` says whether the mirror comes from
+    /// a checkpoint whose session continues. When the first token of `ends` is cancelled, rosout is stopped, and then
+    /// the second token is cancelled.
     pub(super) async fn alone(
         &self,
         rosmaster: Option<Rosmaster>,
@@ -132,9 +132,10 @@ impl Parts {
         (driver, first)
     }
 
-    /// Begins the duty of one computer among several, with a new master that gets the mirror's
-    /// state. `rosout` tells whether to run rosout; none for none of roscore's other duties.
-    /// `cause` is the reason for reports.
+    /// Starts recovery on one computer of several: a new master gets the mirror's state.
+    ///
+    /// `rosout` says whether to run rosout; `None` skips all of roscore's other duties. `cause` is the reason that
+    /// reports give.
     pub(super) fn begin(
         &self,
         process: MasterProcess,
@@ -155,7 +156,7 @@ impl Parts {
     }
 }
 
-/// The running duty of one computer among several.
+/// Recovery and roscore's other duties while this computer of several has the master.
 pub(super) struct Duty {
     driver: JoinHandle<Result<Option<MasterProcess>, ProcessError>>,
     roscore: Option<JoinHandle<()>>,
@@ -164,7 +165,7 @@ pub(super) struct Duty {
 }
 
 impl Duty {
-    /// Returns the error if the duty ends by itself. Cancel safe.
+    /// Waits until recovery fails by itself, and returns the error. Cancel safe.
     pub(super) async fn failed(&mut self) -> ProcessError {
         match (&mut self.driver).await {
             Ok(Err(error)) => error,
@@ -174,8 +175,7 @@ impl Duty {
         }
     }
 
-    /// Ends roscore's other duties while calls still pass to the master, because rosout unregisters
-    /// itself there.
+    /// Stops roscore's other duties while calls still pass to the master: rosout unregisters there when it stops.
     pub(super) fn end_roscore(&mut self) -> impl Future<Output = ()> + Send + 'static {
         self.roscore_stop.cancel();
         let roscore = self.roscore.take();
@@ -187,8 +187,8 @@ impl Duty {
         }
     }
 
-    /// Ends the duty and kills the master at once: another computer may lead, and no node may hear
-    /// from this computer's master any more. The returned future waits for the processes.
+    /// Stops everything and kills the master at once: another computer may lead, and no node may hear from this
+    /// computer's master any more. The returned future waits for the processes.
     pub(super) async fn end(self) -> impl Future<Output = ()> + Send + 'static {
         self.stop.cancel();
         let process = match self.driver.await {

@@ -1,4 +1,4 @@
-//! Takes over the checkpoint of an earlier version, in which every port had the same default file.
+//! Takes over the checkpoint of an earlier version, which used one default file for all ports.
 
 use std::{fs, io, path::Path};
 
@@ -9,8 +9,8 @@ use crate::{
     regular_file,
 };
 
-/// Copies the old default checkpoint if `config` uses the default of another port, that file does
-/// not exist, and the old one may belong to this port. The old file stays where it is.
+/// Copies the old default checkpoint to this port's default path. Does so only if `config` uses that path, nothing
+/// exists there, and the old checkpoint may belong to this port. The old file stays.
 pub(super) fn take_over(config: &Config) {
     let own = &config.checkpoint;
     if config.checkpoint_is_given || own.exists() || store::previous_of(own).exists() {
@@ -28,13 +28,13 @@ pub(super) fn take_over(config: &Config) {
         ),
         Err(error) => tracing::error!(
             %error, from = %old.display(), to = %own.display(),
-            "could not copy the checkpoint of an earlier version. If it is of this port, stop rosrescue, copy it, and \
+            "could not copy the checkpoint of an earlier version. If it belongs to this port, stop rosrescue, copy it, and \
              start rosrescue again"
         ),
     }
 }
 
-/// Whether no running rosrescue uses the checkpoint at `old`, and either an earlier version or a
+/// Whether the checkpoint at `old` may be copied: no running rosrescue uses it, and either an earlier version or a
 /// rosrescue at `port` wrote it.
 fn may_be_of(old: &Path, port: u16) -> bool {
     if store::holder_of(old).is_some() {

@@ -1,4 +1,4 @@
-//! Tells whether nodes of a recorded session are still alive.
+//! Checks whether nodes of a recorded session are still alive.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -11,7 +11,7 @@ use crate::{
     resolver,
 };
 
-/// How long nodes have to answer, including the time to resolve their hosts.
+/// How long nodes have to answer, including the lookup of their hosts.
 const LIFE_SIGN: Duration = Duration::from_secs(1);
 
 /// Whether any node of `state` answers. After a reboot of this computer (`same_boot` is false) only

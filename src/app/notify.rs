@@ -26,7 +26,7 @@ use crate::{
 /// Shortest time between two status messages to systemd.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Pause between two checks whether this computer has joined the others.
+/// Pause between two checks whether this computer has joined the cluster.
 const JOINING: Duration = Duration::from_millis(20);
 
 /// Pause between two checks whether the guardian is stopped.
@@ -35,8 +35,7 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Limits the log lines that the guardian is stopped and that it runs again.
 static STOPPED: Pair = Pair::new();
 
-/// Starts the reports to the guardian and systemd. The returned task ends after it has reported
-/// `stop`.
+/// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.
 pub(super) fn start(guard: Guard, parts: Arc<Parts>, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
@@ -78,9 +77,8 @@ impl Parts {
             .line()
     }
 
-    /// Checks whether the guardian `pid` is stopped, because a stopped guardian starts no worker.
-    /// Neither the link to the guardian nor its exit would show that. `guarded` is what applies
-    /// while it runs.
+    /// Checks whether the guardian `pid` is stopped. A stopped guardian starts no worker, and neither its link nor its
+    /// exit would show that. `guarded` is the state to report while it runs.
     fn see_guardian(&self, pid: u32, guarded: Guarded) {
         let now = match Stat::of(pid).is_some_and(Stat::is_stopped) {
             true => Guarded::Stopped(pid),
@@ -132,8 +130,8 @@ fn is_restarted(pid: u32) -> bool {
     pid == 1 || (std::env::var_os("INVOCATION_ID").is_some() && parent.is_some_and(of_systemd))
 }
 
-/// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended.
-/// `guarded` is what applies while it runs.
+/// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
+/// state to report while it runs.
 async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<Parts>) {
     let link = link
         .set_nonblocking(true)
@@ -176,9 +174,8 @@ async fn report_ready(parts: Arc<Parts>) {
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }
 
-/// Reports the status to systemd in one line and feeds the watchdog. Feeding needs the same things
-/// as a call: a timer, a runtime thread, and the locks of the board and the mirror. So it proves
-/// that calls work.
+/// Reports the status to systemd in one line and feeds the watchdog. Feeding needs what a call needs: a timer, a
+/// runtime thread, and the locks of status and mirror. So it proves that calls work.
 async fn report_status(parts: Arc<Parts>, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);

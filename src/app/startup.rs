@@ -28,16 +28,16 @@ const OPENING: Duration = Duration::from_secs(20);
 pub(super) struct Beginning {
     pub(super) mirror: Master,
     pub(super) session: Session,
-    /// Writes that the session's last master may not have run.
+    /// Recorded writes that the session's last master may not have run.
     pub(super) pending: Vec<Request>,
-    /// Nodes that may still need a `shutdown`.
+    /// Replaced nodes that may still need a `shutdown`.
     pub(super) displaced: Vec<Displaced>,
-    /// The store, before it has begun a generation.
+    /// The store, with no generation written yet.
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
-    /// Whether the session continues and its last process died without a reboot of this computer.
+    /// Whether the session continues after its last process died, without a reboot of this computer.
     pub(super) died: bool,
-    /// What happened at the start, in words for the operator.
+    /// What happened at the start, for the operator.
     pub(super) story: String,
 }
 
@@ -112,10 +112,9 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 beginning = Some((mirror, session, pending, displaced));
             }
             Decision::Fresh(why) => {
-                // A master that a crashed rosrescue left running is taken over.
+                // A crashed rosrescue may have left its master running. It is taken over.
                 master_uri = session.master_uri.filter(|_| !session.closed);
-                // With this token, a copy of the old checkpoint is recognised as older than the
-                // masters of this session.
+                // With a new token, masters of this session reveal a copy of the old checkpoint as older than they are.
                 token = (session.mark, session.incarnation);
                 let kept;
                 (store, kept) = set_aside(store).await;
@@ -169,8 +168,8 @@ fn say_silent(checkpoint: &Path) {
     );
 }
 
-/// Keeps the previous session's checkpoint under another name, and returns that name. Returns no
-/// store if the disk does not answer.
+/// Keeps the previous session's checkpoint under another name, and returns that name. The store is `None` if the disk
+/// does not answer.
 async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
     let Some(mut store) = store else {
         return (None, None);
@@ -193,7 +192,7 @@ async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
     }
 }
 
-/// Problems of the checkpoint's folder that the operator should know about.
+/// Problems of the checkpoint's folder.
 struct Folder<'a> {
     checkpoint: &'a Path,
     is_missing: bool,
@@ -210,7 +209,7 @@ impl<'a> Folder<'a> {
         }
     }
 
-    /// Logs the problems, once the checkpoint has been opened or has failed to open.
+    /// Logs the problems. `is_open` says whether the checkpoint could be opened.
     fn report(&self, is_open: bool) {
         let checkpoint = self.checkpoint.display();
         if self.is_missing && is_open {
@@ -230,7 +229,7 @@ impl<'a> Folder<'a> {
     }
 }
 
-/// Reads an id from the kernel. It is only compared, so a constant does if the kernel has none.
+/// Reads an id from the kernel, or returns a constant if there is none. Ids are only compared.
 pub(super) fn kernel_id(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }

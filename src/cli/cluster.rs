@@ -7,7 +7,7 @@ use hyper::http::uri::Authority;
 
 /// Heading of the options for several computers.
 const COMPUTERS: &str = "Options with --cluster";
-/// The robot's name if none is given.
+/// The robot's name in etcd if `--cluster` gives none.
 pub(crate) const ROBOT: &str = "robot";
 /// Longest name of a robot or a computer. It is part of each key in etcd.
 const NAME_MOST: usize = 128;
@@ -81,15 +81,15 @@ pub enum WhenCutOff {
     Refuse,
 }
 
-/// What `--cluster` says.
+/// The parsed value of `--cluster`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Members {
-    /// `http://HOST:PORT` or `https://HOST:PORT` each; all of them the same of both.
+    /// Each is `http://HOST:PORT` or `https://HOST:PORT`. All use the same scheme.
     pub endpoints: Vec<String>,
     pub robot: String,
 }
 
-/// `http://A:2379,http://B:2379,http://C:2379/ROBOT`. Those without `http://` are as the first one.
+/// Parses `http://A:2379,http://B:2379,http://C:2379/ROBOT`. Endpoints without a scheme get that of the first one.
 fn members(text: &str) -> Result<Members, String> {
     let mut first = None;
     let mut robot = ROBOT;
@@ -102,26 +102,26 @@ fn members(text: &str) -> Result<Members, String> {
         };
         if !["http", "https"].contains(&scheme) {
             return Err(format!(
-                "`{one}` is no endpoint of etcd: it begins with neither http:// nor https://"
+                "`{one}` is not an etcd endpoint: it must begin with http:// or https://"
             ));
         }
         let first = *first.get_or_insert(scheme);
         if scheme != first {
             return Err(format!(
-                "`{one}` begins with {scheme}://, the first one with {first}://; all need the same"
+                "`{one}` begins with {scheme}://, but the first endpoint with {first}://; use the same for all"
             ));
         }
         let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
         if !is_authority(authority) {
             return Err(format!(
-                "`{one}` is no endpoint of etcd; write {scheme}://HOST:PORT, as in \
+                "`{one}` is not an etcd endpoint; write {scheme}://HOST:PORT, as in \
                  {scheme}://10.0.0.7:2379"
             ));
         }
         if !path.is_empty() {
             if given.peek().is_some() {
                 return Err(format!(
-                    "`{one}`: the robot's name comes after the last endpoint, and after no other one"
+                    "`{one}`: write the robot's name only after the last endpoint"
                 ));
             }
             robot = path.trim_end_matches('/');
@@ -130,11 +130,11 @@ fn members(text: &str) -> Result<Members, String> {
     }
     Ok(Members {
         endpoints,
-        robot: name(robot).map_err(|why| format!("`{robot}` is no name of a robot: {why}"))?,
+        robot: name(robot).map_err(|why| format!("`{robot}` is not a valid robot name: {why}"))?,
     })
 }
 
-/// `HOST` or `HOST:PORT`, and nothing else.
+/// Whether `text` is `HOST` or `HOST:PORT`.
 fn is_authority(text: &str) -> bool {
     let Ok(authority) = text.parse::<Authority>() else {
         return false;
@@ -147,7 +147,7 @@ fn is_authority(text: &str) -> bool {
         }
 }
 
-/// A robot's or a computer's name. A slash would put one robot's keys among another's.
+/// Parses the name of a robot or a computer. It must not contain a slash: names are parts of etcd keys.
 pub(crate) fn name(text: &str) -> Result<String, &'static str> {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
     match !text.is_empty() && text.len() <= NAME_MOST && text.chars().all(is_plain) {
@@ -197,30 +197,30 @@ mod tests {
     #[test]
     fn what_are_no_members_is_said_with_the_operand() {
         for (text, said) in [
-            ("", "`` is no endpoint of etcd: it begins with neither"),
-            ("a:2379,http://b:2379", "`a:2379` is no endpoint"),
-            ("ftp://a:2379", "`ftp://a:2379` is no endpoint"),
+            ("", "`` is not an etcd endpoint: it must begin with"),
+            ("a:2379,http://b:2379", "`a:2379` is not an etcd endpoint"),
+            ("ftp://a:2379", "`ftp://a:2379` is not an etcd endpoint"),
             (
                 "http://",
-                "`http://` is no endpoint of etcd; write http://HOST:PORT",
+                "`http://` is not an etcd endpoint; write http://HOST:PORT",
             ),
-            ("http://:2379", "`http://:2379` is no endpoint"),
-            ("http://a:0", "`http://a:0` is no endpoint"),
-            ("http://a:70000", "`http://a:70000` is no endpoint"),
-            ("http://u:p@a:2379", "is no endpoint"),
-            ("http://::1:2379", "is no endpoint"),
-            ("http://a:2379,", "`` is no endpoint"),
+            ("http://:2379", "`http://:2379` is not an etcd endpoint"),
+            ("http://a:0", "`http://a:0` is not an etcd endpoint"),
+            ("http://a:70000", "`http://a:70000` is not an etcd endpoint"),
+            ("http://u:p@a:2379", "is not an etcd endpoint"),
+            ("http://::1:2379", "is not an etcd endpoint"),
+            ("http://a:2379,", "`` is not an etcd endpoint"),
             (
                 "https://a:1,http://b:1",
-                "`http://b:1` begins with http://, the first one with https://",
+                "`http://b:1` begins with http://, but the first endpoint with https://",
             ),
             (
                 "http://a:1/r,http://b:1",
-                "`http://a:1/r`: the robot's name comes after the last",
+                "`http://a:1/r`: write the robot's name only after the last",
             ),
-            ("http://a:1/fleet/r", "`fleet/r` is no name of a robot"),
-            ("http://a:1/r 7", "`r 7` is no name of a robot"),
-            ("http://a:1/r?x", "`r?x` is no name of a robot"),
+            ("http://a:1/fleet/r", "`fleet/r` is not a valid robot name"),
+            ("http://a:1/r 7", "`r 7` is not a valid robot name"),
+            ("http://a:1/r?x", "`r?x` is not a valid robot name"),
         ] {
             let error = members(text).expect_err(text);
             assert!(error.contains(said), "{error}");

@@ -7,7 +7,7 @@ use clap::Args;
 use super::{HideArgs, OutputArgs, TargetArgs};
 use crate::hide::Hide;
 
-/// The place of the checkpoints.
+/// Where the checkpoints are.
 #[derive(Args, Clone, Debug)]
 pub struct CheckpointArgs {
     /// The checkpoint in use; older ones are beside it [default: that of the rosrescue on this computer, else
@@ -17,7 +17,7 @@ pub struct CheckpointArgs {
     pub checkpoint: Option<PathBuf>,
 }
 
-/// How to read a checkpoint.
+/// Whether a damaged checkpoint may be read.
 #[derive(Args, Clone, Debug)]
 pub struct ReadArgs {
     #[command(flatten)]

@@ -79,13 +79,13 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// What `rosrescue wait` waits for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum For {
-    /// Calls are answered.
+    /// rosrescue answers calls.
     Answered,
-    /// They pass to a master.
+    /// Calls pass to a master.
     Master,
-    /// They do, and changes are recorded.
+    /// Calls pass to a master, and changes are recorded.
     Protected,
-    /// The node of this name is registered.
+    /// The node with this name is registered.
     Node(String),
 }
 

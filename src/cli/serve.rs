@@ -266,8 +266,8 @@ pub struct CommonArgs {
     pub log: Option<String>,
 }
 
-/// A network, or the one of a single address. An IPv4 network written as IPv6 (`::ffff:10.0.0.0/120`) is an
-/// IPv4 network.
+/// Parses a network, or an address as a network of one. An IPv4 network written as IPv6 (`::ffff:10.0.0.0/120`) becomes
+/// an IPv4 network.
 fn network(text: &str) -> Result<IpNet, &'static str> {
     let net = text.parse::<IpNet>();
     let net = net.or_else(|_| text.parse::<IpAddr>().map(IpNet::from));

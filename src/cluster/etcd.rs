@@ -1,4 +1,5 @@
-//! The robot's keys in etcd: the requests of the machine, as transactions on `leader` and `alive`.
+//! The robot's keys in etcd. Carries out the requests of the cluster's state machine as transactions on the keys
+//! `leader` and `alive`.
 
 use std::{
     ops::{Deref, Range},
@@ -16,12 +17,12 @@ use super::{
     machine::{Alive, Answer, Guard, Leader, Op, Settings, View},
 };
 
-/// Most robots that are looked for.
+/// Most robots that [`Etcd::robots`] lists.
 const ROBOTS_MOST: usize = 16;
-/// The keys of all robots are before it.
+/// Upper end of the key range with all robots: `0` follows `/` in ASCII.
 const ROBOTS_END: &str = "0";
 
-/// A client of etcd that knows the robot's keys.
+/// An etcd client that knows the robot's keys.
 #[derive(Clone, Debug)]
 pub struct Etcd(Client);
 
@@ -34,7 +35,7 @@ impl Deref for Etcd {
 }
 
 impl Etcd {
-    /// A client; connects when something is asked.
+    /// Creates a client. It connects at its first request.
     ///
     /// # Errors
     ///
@@ -43,11 +44,11 @@ impl Etcd {
         Client::new(options).map(Self)
     }
 
-    /// Carries out a request of the machine. `entry`: what a beat adds to the journal.
+    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal.
     ///
     /// # Errors
     ///
-    /// Why there is no answer. For the machine that is [`Answer::Silence`].
+    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
     pub async fn run(
         &self,
         keys: &Keys,
@@ -65,11 +66,11 @@ impl Etcd {
         view(keys, done.revision, done.gets.iter().flatten()).map(Answer::Is)
     }
 
-    /// Writes `puts`, one after the other, if `leader` has this term. Returns whether it has.
+    /// Writes `puts` one after the other, each only if `leader` still has this term. Returns whether it had.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether all were written.
+    /// Why it is unknown whether all were written.
     pub async fn put(
         &self,
         keys: &Keys,
@@ -86,11 +87,11 @@ impl Etcd {
         Ok(true)
     }
 
-    /// Deletes what is in `ranges`, if `leader` has this term. Returns whether it has.
+    /// Deletes `ranges` if `leader` still has this term. Returns whether it had.
     ///
     /// # Errors
     ///
-    /// Why it is not known.
+    /// Why it is unknown whether they were deleted.
     pub async fn delete(
         &self,
         keys: &Keys,
@@ -103,21 +104,21 @@ impl Etcd {
         Ok(done.succeeded)
     }
 
-    /// Both keys of the machine.
+    /// Reads the keys `leader` and `alive`.
     ///
     /// # Errors
     ///
-    /// Why they are not known.
+    /// Why they could not be read.
     pub async fn view(&self, keys: &Keys, limit: Duration) -> Result<View, EtcdError> {
         let done = self.txn(&look(keys), limit).await?;
         view(keys, done.revision, done.gets.iter().flatten())
     }
 
-    /// Writes a key that goes with `lease`.
+    /// Writes a key that etcd deletes when `lease` ends.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether it was written.
+    /// Why it is unknown whether the key was written.
     pub async fn put_with_lease(
         &self,
         put: &Put,
@@ -129,20 +130,20 @@ impl Etcd {
             .await
     }
 
-    /// Tries each endpoint on its own. Needs no majority.
+    /// Tries each endpoint on its own, so it needs no majority.
     pub async fn try_each(&self, keys: &Keys, limit: Duration) -> Vec<Tried> {
         self.0.try_each(&keys.leader(), limit).await
     }
 
-    /// The names of the robots that have a leader in this etcd, or had one; some of them, if there are many.
+    /// Names of the robots that have or had a leader in this etcd, up to [`ROBOTS_MOST`].
     ///
     /// # Errors
     ///
-    /// Why they are not known, such as a user who may read one robot's keys alone.
+    /// Why they are unknown; for example, the etcd user may read only one robot's keys.
     pub async fn robots(&self, limit: Duration) -> Result<Vec<String>, EtcdError> {
         let mut robots = Vec::new();
         let mut from = "/".to_owned();
-        // Not key by key: a robot may have a thousand.
+        // Jumps from robot to robot instead of reading each key: a robot may have a thousand.
         for _ in 0..ROBOTS_MOST {
             let key = self
                 .first_key(&(from..ROBOTS_END.to_owned()), limit)
@@ -163,7 +164,7 @@ impl Etcd {
     }
 }
 
-/// Both keys of the machine, of all keys below its prefix.
+/// Finds the keys `leader` and `alive` among all keys with the robot's prefix.
 ///
 /// # Errors
 ///
@@ -172,7 +173,7 @@ pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
     view(keys, found.revision, found.kvs.iter())
 }
 
-/// Brings a view up to date with a change of a key.
+/// Updates a view with a changed key.
 ///
 /// # Errors
 ///
@@ -200,7 +201,7 @@ struct AliveValue {
     beat: u64,
     seq: u64,
     released: Option<String>,
-    /// A version that does not write it settles the session when it leads.
+    /// Whether the session was settled. Versions before this field settle the session when they lead.
     #[serde(default = "settled_before")]
     settled: bool,
 }
@@ -217,7 +218,7 @@ fn write(put: &Put) -> TxnOp {
 }
 
 fn write_json(key: String, value: &impl Serialize) -> TxnOp {
-    // Cannot fail: texts and numbers.
+    // Texts and numbers always serialize.
     let value = serde_json::to_vec(value).unwrap_or_default();
     TxnOp::Put { key, value }
 }
@@ -226,7 +227,7 @@ fn both(keys: &Keys) -> Vec<TxnOp> {
     vec![TxnOp::Get(keys.leader()), TxnOp::Get(keys.alive())]
 }
 
-/// Both keys, read.
+/// A transaction that reads `leader` and `alive`.
 fn look(keys: &Keys) -> Txn {
     Txn {
         success: both(keys),
@@ -234,7 +235,7 @@ fn look(keys: &Keys) -> Txn {
     }
 }
 
-/// `changes`, if `leader` has this term.
+/// A transaction that makes `changes` only if `leader` has this term.
 fn guarded(keys: &Keys, term: u64, changes: Vec<TxnOp>) -> Txn {
     Txn {
         compare: vec![(keys.leader(), term)],
@@ -243,7 +244,7 @@ fn guarded(keys: &Keys, term: u64, changes: Vec<TxnOp>) -> Txn {
     }
 }
 
-/// The transaction of `op`, and the journal's last record after it.
+/// Builds the transaction of `op`. Also returns the number of the journal's last record after it.
 fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -> (Txn, u64) {
     let alive = |beat, seq, released: &Option<String>, settled| {
         let released = released.clone();
@@ -327,7 +328,7 @@ fn view<'a>(
     Ok(view)
 }
 
-/// Takes a key into a view, if it belongs there; none if it was deleted.
+/// Adds a key to a view, if it is one of the view's. `kv` is `None` if the key was deleted.
 fn absorb_key(view: &mut View, keys: &Keys, key: &str, kv: Option<&Kv>) -> Result<(), EtcdError> {
     if key == keys.leader() {
         view.leader = match kv {

@@ -1,4 +1,4 @@
-//! The robot's state in etcd: reading it, adding to it, and replacing a long journal by a snapshot.
+//! The robot's state in etcd: reads it, appends to the journal, and replaces a long journal by a snapshot.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use super::{
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
 
-/// How often reading starts over because a snapshot was replaced meanwhile.
+/// How often a read starts over because a snapshot was replaced meanwhile.
 const ATTEMPTS: usize = 5;
 
 #[derive(Debug, Error)]
@@ -30,39 +30,39 @@ pub enum ReplicaError {
     Short { found: u64, expected: u64 },
 }
 
-/// The state in etcd, as far as it was not known.
+/// The part of the state in etcd that was not known yet.
 #[derive(Debug)]
 pub struct Loaded {
-    /// The keys of the machine, at the same moment.
+    /// The keys `leader` and `alive`, read at the same moment.
     pub view: View,
-    /// The state that the records go on from; none if they go on from what was known.
+    /// The snapshot that the records follow. `None` if they follow the known state.
     pub checkpoint: Option<Checkpoint>,
     pub records: Vec<Record>,
-    /// What the computers say of themselves.
+    /// What each computer has written about itself.
     pub members: Vec<Kv>,
     pub progress: Progress,
 }
 
-/// The state of one robot.
+/// The state of one robot in etcd.
 #[derive(Clone, Debug)]
 pub struct Replica {
     pub client: Etcd,
     pub keys: Keys,
-    /// How long a request may take.
+    /// Longest time for one request.
     pub limit: Duration,
 }
 
 impl Replica {
-    /// Reads what follows on `known`. A watch goes on from the view's revision.
+    /// Reads what follows `known`. A watch can continue from the view's revision.
     ///
     /// # Errors
     ///
-    /// Why the state is not known.
+    /// Why the state is unknown.
     pub async fn load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
         let mut attempt = 1;
         loop {
             match self.try_load(known).await {
-                // The leader has just written a snapshot, and deleted what this read was about to read.
+                // The leader has just written a snapshot, and deleted what this was about to read.
                 Err(ReplicaError::Journal(_) | ReplicaError::Etcd(EtcdError::Compacted { .. }))
                     if attempt < ATTEMPTS =>
                 {
@@ -117,7 +117,7 @@ impl Replica {
         }
     }
 
-    /// The records of an entry of the journal.
+    /// Reads the records of a journal entry.
     ///
     /// # Errors
     ///
@@ -146,21 +146,22 @@ impl Replica {
         Ok(manifest.assemble(&self.keys, &parts)?)
     }
 
-    /// Writes the parts of a record, which may take seconds: before the machine is told that there is the
-    /// record, so that no beat waits for it. Returns whether this process still leads.
+    /// Writes the parts of a large record, which may take seconds. Call this before the state machine gets the record,
+    /// so that no heartbeat waits for it. Returns whether this process still leads.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether it was written.
+    /// Why it is unknown whether they were written.
     pub async fn prepare(&self, term: u64, parts: &[Put]) -> Result<bool, ReplicaError> {
         Ok(self.client.put(&self.keys, term, parts, self.limit).await?)
     }
 
-    /// Carries out a request of the machine. `entry`: what a beat adds to the journal, its parts prepared.
+    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal; its parts are
+    /// already written.
     ///
     /// # Errors
     ///
-    /// Why there is no answer. For the machine that is [`Answer::Silence`].
+    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
     pub async fn run(
         &self,
         settings: &Settings,
@@ -173,12 +174,12 @@ impl Replica {
             .await?)
     }
 
-    /// Writes a snapshot, and deletes what it replaces. `seq` of the checkpoint is the journal's record that
-    /// it holds last. Returns its size; none if this process no longer leads.
+    /// Writes a snapshot and deletes what it replaces. The checkpoint's `seq` is the last journal record in it. Returns
+    /// the snapshot's size, or `None` if this process no longer leads.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether it was written.
+    /// Why it is unknown whether it was written.
     pub async fn write_snapshot(
         &self,
         term: u64,
@@ -187,7 +188,7 @@ impl Replica {
         let seq = checkpoint.seq;
         let encoded = format::encode_checkpoint(checkpoint, 1).map_err(JournalError::Encode)?;
         let (mut puts, manifest) = journal::snapshot(&self.keys, seq, &encoded.bytes);
-        // Last: it says that all the others are there.
+        // The manifest comes last, because it declares the snapshot complete.
         puts.push(manifest);
         if !self.client.put(&self.keys, term, &puts, self.limit).await? {
             return Ok(None);

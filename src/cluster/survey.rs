@@ -1,6 +1,5 @@
-//! What is wrong with `--cluster`: each endpoint is tried on its own, and the robot's name compared with those in
-//! etcd. Judges alone: [`Etcd::try_each`](super::etcd::Etcd::try_each) and
-//! [`Etcd::robots`](super::etcd::Etcd::robots) ask.
+//! Judges the endpoints and the robot's name in `--cluster`. [`Etcd::try_each`](super::etcd::Etcd::try_each) and
+//! [`Etcd::robots`](super::etcd::Etcd::robots) gather the facts.
 
 use std::time::Duration;
 
@@ -10,17 +9,17 @@ use crate::cli::cluster::ROBOT;
 /// How long an endpoint may take to answer.
 pub const LIMIT: Duration = Duration::from_secs(3);
 
-/// One thing that is wrong.
+/// One problem with `--cluster`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Complaint {
     pub what: String,
-    /// What to do.
+    /// How to correct it.
     pub todo: String,
-    /// It may go away by itself: an etcd that does not answer may be starting.
+    /// Whether it may pass by itself: an etcd that does not answer may be starting.
     pub may_pass: bool,
 }
 
-/// What is wrong with the endpoints.
+/// The problems of the endpoints.
 pub fn complaints(tried: &[Tried]) -> Vec<Complaint> {
     let failed = tried.iter().filter_map(|one| {
         let error = one.cluster.as_ref().err()?;
@@ -63,7 +62,7 @@ fn complaint(endpoint: &str, error: &EtcdError) -> Complaint {
             error.to_string(),
             "check host and port of this address in --cluster: etcd serves clients at 2379",
         ),
-        // They say what to do.
+        // These errors say what to do.
         _ => (
             format!("{endpoint}: {error}"),
             "correct this, then restart rosrescue",
@@ -79,7 +78,7 @@ fn complaint(endpoint: &str, error: &EtcdError) -> Complaint {
     }
 }
 
-/// `robot` has no keys in etcd. `others`: robots that have.
+/// Warns if `robot` has no keys in etcd although the robots `others` have: its name may be misspelt.
 pub fn typo(robot: &str, others: &[String]) -> Option<Complaint> {
     if others.is_empty() || others.iter().any(|other| other == robot) {
         return None;

@@ -1,30 +1,31 @@
-//! Where calls go.
+//! Which computer answers calls.
 
 use crate::ros_env::MasterUri;
 
-/// Who answers calls now.
+/// The computer that answers calls now.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Way {
     /// This computer.
     Here {
-        /// In which it leads; none while it is alone. Calls of other computers are taken only if it leads.
+        /// The term in which this computer leads; `None` while it is cut off. Only a leader takes calls from other
+        /// computers.
         term: Option<u64>,
     },
-    /// The leader.
+    /// The leader, on another computer.
     Leader { uri: MasterUri, term: u64 },
-    /// Nobody: writes wait.
+    /// No computer. Writes wait.
     Nobody {
-        /// Whether the mirror holds the robot's state, and answers reads.
+        /// Whether the mirror holds the robot's state and answers reads.
         known: bool,
     },
 }
 
-/// A place in the journal of all computers. One of a later term is further: the leader of that term holds all that was
-/// committed before, and nothing else of the earlier terms will ever be in the journal.
+/// A position in the journal that all computers share. A later term is always further: its leader has everything that
+/// was committed before, and no other record of an earlier term will follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Place {
-    /// The term of the computer that leads.
+    /// The term in which the record was written.
     pub term: u64,
-    /// The number of a record.
+    /// The record's number.
     pub seq: u64,
 }

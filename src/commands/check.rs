@@ -1,6 +1,6 @@
-//! `rosrescue check`: what will trouble the robot, found before it drives.
+//! `rosrescue check`: finds problems in the robot's setup before it drives.
 //!
-//! [`facts`] gathers and judges nothing, [`judge`] judges and looks at nothing.
+//! [`facts`] gathers and does not judge; [`judge`] judges and does not gather.
 
 mod computers;
 mod facts;
@@ -54,26 +54,25 @@ fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, Failure> {
 #[serde(rename_all = "lowercase")]
 enum Severity {
     Ok,
-    /// Worth knowing.
+    /// Good to know.
     Note,
-    /// It may go wrong.
+    /// Something may go wrong.
     Warning,
-    /// It will go wrong.
+    /// Something will go wrong.
     Problem,
 }
 
-/// One thing that was looked at.
+/// One result of the check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct Finding {
     severity: Severity,
     subject: &'static str,
-    /// What was found.
     what: String,
-    /// What to do; empty if there is nothing to do.
+    /// What to do. Empty if nothing.
     todo: String,
 }
 
-/// All findings, the worst first.
+/// All findings, worst first.
 #[derive(Clone, Debug, Serialize)]
 struct Report {
     problems: usize,

@@ -1,4 +1,4 @@
-//! `rosrescue completions`: a completion script, made of the command line's own definition.
+//! `rosrescue completions`: prints a completion script made from the definition of the command line.
 
 use clap::CommandFactory;
 

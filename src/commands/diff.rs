@@ -1,4 +1,4 @@
-//! `rosrescue diff`: how two checkpoints differ, or a checkpoint and the running master.
+//! `rosrescue diff`: shows how two checkpoints differ, or a checkpoint and the running master.
 
 use std::fmt;
 

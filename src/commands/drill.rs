@@ -1,4 +1,4 @@
-//! `rosrescue drill`: kills on purpose, watches as a node would, and gives a verdict.
+//! `rosrescue drill`: kills processes on purpose, watches the robot as a node would, and gives a verdict.
 
 mod calls;
 mod kill;
@@ -39,11 +39,11 @@ use crate::{
 };
 
 const PREFIX: &str = history::DRILLS;
-/// How long the robot is watched before the first kill, and to choose topics.
+/// How long the drill watches the robot before the first kill, to choose topics and learn normal pauses.
 const BEFORE: Duration = Duration::from_secs(2);
-/// Topics that are watched if none is named.
+/// Number of topics that are watched if none is named.
 const TOPICS: usize = 3;
-/// How long tidying up may take.
+/// Longest time for cleaning up.
 const TIDY_LIMIT: Duration = Duration::from_secs(15);
 
 pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
@@ -77,7 +77,7 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
         _ = interrupt.recv() => Err(interrupted()),
         _ = terminate.recv() => Err(interrupted()),
     };
-    // Callers finish the call that they are at: nothing is registered after what follows.
+    // Each caller first finishes its present call, so nothing is registered after this.
     stop.cancel();
     let tidied = drill.tidy_up().await;
     let mut verdict = match ended {
@@ -100,7 +100,7 @@ fn interrupted() -> Failure {
     Failure::Failed("interrupted: no verdict. The drill has cleaned up".to_owned())
 }
 
-/// Says what will be killed, and asks.
+/// Says what will be killed, and asks for consent.
 async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
     target.refuse_others().await?;
     let kill = if args.hang { Victim::Master } else { args.kill };
@@ -135,12 +135,12 @@ struct Drill<'a> {
     target: Target,
     node: Node,
     topics: Vec<Topic>,
-    /// The callers, as long as they run.
+    /// The task of the callers, while they run.
     calls: Option<JoinHandle<Calls>>,
 }
 
 impl Drill<'_> {
-    /// What the callers found, once they have ended.
+    /// Waits for the callers to end, and returns what they found.
     async fn calls(&mut self) -> Calls {
         let calls = match &mut self.calls {
             Some(calls) => calls.await.unwrap_or_default(),
@@ -154,7 +154,7 @@ impl Drill<'_> {
         &self.node.name
     }
 
-    /// The whole drill, without what [`Self::tidy_up`] does.
+    /// Runs the whole drill, without [`Self::tidy_up`].
     async fn hold(
         &mut self,
         status: &Status,
@@ -165,7 +165,7 @@ impl Drill<'_> {
         let api = self.target.api.clone();
         self.remove_left_behind().await?;
         let before = Robot::read(&api).await.map_err(Failure::Failed)?;
-        // To all parameters: what others change is no failure of rosrescue.
+        // Subscribes to all parameters: changes by others are not failures of rosrescue.
         let subscribe = [self.node.api.as_str().into(), "/".into()];
         let subscribed = api.call("subscribeParam", &subscribe).await;
         subscribed.map_err(Failure::Failed)?;
@@ -222,7 +222,7 @@ impl Drill<'_> {
         Ok(verdict)
     }
 
-    /// Subscribes to the topics that are to be watched.
+    /// Subscribes to the topics to watch.
     async fn choose_topics(&mut self) -> Result<(), Failure> {
         let api = self.target.api.clone();
         if !self.args.topic.is_empty() {
@@ -262,8 +262,7 @@ impl Drill<'_> {
         Ok(())
     }
 
-    /// Deletes the parameters of drills that were killed themselves. Their registrations go with the next
-    /// health check.
+    /// Deletes the parameters of earlier drills that were killed. The next health check removes their registrations.
     async fn remove_left_behind(&self) -> Result<(), Failure> {
         let api = &self.target.api;
         let keys = api
@@ -280,7 +279,7 @@ impl Drill<'_> {
         Ok(())
     }
 
-    /// Takes everything back that the drill has left in the master.
+    /// Removes everything that the drill has left in the master.
     async fn tidy_up(&mut self) -> Result<(), String> {
         self.calls().await;
         let api = &self.target.api;

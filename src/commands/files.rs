@@ -1,4 +1,4 @@
-//! Finding and reading checkpoints. Nothing is locked and nothing is written, so it works beside a running rosrescue.
+//! Finds and reads checkpoints. It locks and writes nothing, so it works beside a running rosrescue.
 
 use std::{
     fs,
@@ -23,29 +23,29 @@ use crate::{
     ros_env::DEFAULT_MASTER_PORT,
 };
 
-/// A file that takes longer than a second to read, in bytes.
+/// A file of this size takes about a second to read, in bytes.
 const LARGE: u64 = 16 << 20;
 
-/// A checkpoint that was read.
+/// A checkpoint that was read from disk.
 pub(super) struct Opened {
     pub(super) path: PathBuf,
     pub(super) bytes: u64,
-    /// When it was last written to, by the wall clock.
+    /// Wall time of the last change.
     pub(super) written: i64,
-    /// The last record in the snapshot; none if there is no whole snapshot.
+    /// Number of the snapshot's last record. `None` if there is no complete snapshot.
     pub(super) snapshot_seq: Option<u64>,
-    /// The methods of the journal's calls; `session` for a change of the session.
+    /// Methods of the calls in the journal; `session` for a change of the session.
     pub(super) journal: Vec<String>,
     pub(super) session: Session,
     pub(super) state: Master,
     pub(super) pending: Vec<Request>,
-    /// Whether `state` is all that was recorded.
+    /// Whether `state` holds everything that was recorded.
     pub(super) exact: bool,
     pub(super) torn: Option<String>,
     pub(super) damage: Vec<String>,
 }
 
-/// The checkpoint in use, links resolved.
+/// The path of the checkpoint in use, with links resolved.
 pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     let env = |name: &str| std::env::var(name).ok();
     let running = match place.checkpoint {
@@ -60,14 +60,15 @@ pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     fs::canonicalize(&path).unwrap_or(path)
 }
 
-/// The rosrescue that the environment means.
+/// The rosrescue that the environment leads to.
 fn target() -> TargetArgs {
     TargetArgs {
         uri: std::env::var("ROSRESCUE_URI").ok(),
     }
 }
 
-/// The checkpoint of the rosrescue that runs on this computer. A service has another home than the user who asks.
+/// The checkpoint of the rosrescue that runs on this computer. A service runs as another user, with another home
+/// folder.
 async fn of_running() -> Option<PathBuf> {
     let running = Running::find(&target()).ok()?;
     if !is_here(&running.address).await {
@@ -76,7 +77,7 @@ async fn of_running() -> Option<PathBuf> {
     Some(running.status().await.ok()?.checkpoint.into())
 }
 
-/// The checkpoint that `file` means: a path, or a name or number of the history.
+/// The checkpoint that `file` stands for: a path, or a name or number from the history.
 pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
     match fs::canonicalize(file) {
         Ok(path) => return Ok(path),
@@ -102,15 +103,15 @@ pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf,
     })
 }
 
-/// A line of the history.
+/// An entry of the history.
 pub(super) struct Listed {
-    /// `present`, `session-3`, `rescue-7`.
+    /// Such as `present`, `session-3` or `rescue-7`.
     pub(super) name: String,
     pub(super) path: PathBuf,
     pub(super) written: i64,
 }
 
-/// The checkpoint at `present`, and what is kept beside it, the last ones first.
+/// The checkpoint at `present` and those kept beside it, newest first.
 pub(super) fn list(present: &Path) -> Vec<Listed> {
     let mut listed: Vec<_> = history::kept(present)
         .unwrap_or_default()
@@ -168,7 +169,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
     damage.extend(
         rebuilt
             .trouble
-            .map(|why| format!("the snapshot is no state of a master: {why}")),
+            .map(|why| format!("the snapshot is not a valid master state: {why}")),
     );
     Ok(Opened {
         path: path.to_owned(),
@@ -185,7 +186,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
     })
 }
 
-/// Reads the checkpoint that `file` means. Refuses a damaged one, unless that is asked for.
+/// Reads the checkpoint that `file` stands for. Refuses a damaged one without `--damaged`.
 pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure> {
     let opened = open(&find(file, &args.place).await?)?;
     let path = opened.path.display();
@@ -204,7 +205,7 @@ pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure
     Ok(opened)
 }
 
-/// A number of bytes for people.
+/// A number of bytes for people, such as `1.5 MiB`.
 pub(super) fn size(bytes: u64) -> String {
     match bytes {
         0..1_024 => format!("{bytes} B"),

@@ -1,4 +1,4 @@
-//! `rosrescue handover`: lets another computer lead.
+//! `rosrescue handover`: makes another computer the leader.
 
 use std::{fmt, time::Duration};
 
@@ -16,29 +16,29 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// The method of rosrescue that gives up leading: its parameters are the caller's id and who should lead,
-/// empty for anybody.
+/// rosrescue's own method that starts a handover. Its parameters are the caller's id and the computer that should lead;
+/// an empty text means any.
 const METHOD: &str = "rosrescue/handover";
-/// Who calls it.
+/// The caller's id in that call.
 const CALLER: &str = "/rosrescue_handover";
-/// Pause between two looks at who leads.
+/// Pause between two checks for the new leader.
 const PAUSE: Duration = Duration::from_millis(20);
-/// How often the wait is explained.
+/// Pause between two messages about the wait.
 const SAY_EVERY: Duration = Duration::from_secs(1);
 
-/// How it ended.
+/// The result of a handover.
 #[derive(Debug, Serialize)]
 struct Outcome {
     uri: String,
-    /// Whether another computer leads now: the one that was asked for, if one was.
+    /// Whether another computer leads now; if one was asked for, whether that one does.
     handed_over: bool,
-    /// Who led before.
+    /// The leader before the handover.
     from: String,
-    /// Who leads now; none if nobody does.
+    /// The leader now. `None` if there is none.
     to: Option<String>,
-    /// Who was asked for.
+    /// The computer that was asked for.
     wanted: Option<String>,
-    /// From the request until it was seen.
+    /// Seconds from the request until the result was seen.
     seconds: f64,
 }
 
@@ -67,7 +67,7 @@ impl fmt::Display for Outcome {
             }
             (Some(to), Some(wanted)) if to != from => write!(
                 f,
-                "{from} led, {to} leads now, and not {wanted}, after {seconds:.2} s"
+                "{from} led, {to} leads now instead of {wanted}, after {seconds:.2} s"
             ),
             (Some(_), _) => write!(
                 f,
@@ -117,7 +117,7 @@ async fn computers(running: &Running) -> Result<Computers, Failure> {
     })
 }
 
-/// The name of the computer that `--to` means.
+/// The name of the computer that `--to` stands for.
 fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, Failure> {
     now.find(given).ok_or_else(|| {
         let names: Vec<_> = now.computers.iter().map(|of| &*of.name).collect();
@@ -128,7 +128,7 @@ fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, Failure> {
     })
 }
 
-/// Who leads, and would give it up.
+/// The present leader. Fails if there is none to hand over from.
 fn leader(now: &Computers) -> Result<&Leader, Failure> {
     if now.role == Role::Alone {
         return Err(Failure::Failed(format!(
@@ -143,7 +143,7 @@ fn leader(now: &Computers) -> Result<&Leader, Failure> {
     })
 }
 
-/// Asks the leader to give up.
+/// Asks the leader to hand over.
 async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<(), Failure> {
     let limit =
         Duration::try_from_secs_f64(timeout).map_or(ANSWER_LIMIT, |limit| limit.max(ANSWER_LIMIT));
@@ -153,14 +153,14 @@ async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<()
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(1), ..] => Ok(()),
             [_, why, ..] => Err(refused(why.as_str().unwrap_or("it gives no reason"))),
-            _ => Err(refused("its answer is not understood")),
+            _ => Err(refused("its answer cannot be read")),
         },
-        Reply::Value(_) => Err(refused("its answer is not understood")),
+        Reply::Value(_) => Err(refused("its answer cannot be read")),
         Reply::Fault { text, .. } => Err(refused(&text)),
     }
 }
 
-/// Who leads after `from`, or at the end of the time.
+/// Waits for a leader other than `from`. Returns the present leader when the time is over.
 async fn next_leader(
     running: &Running,
     from: &Leader,
@@ -211,7 +211,13 @@ mod tests {
             ("a", Some("b"), None, true, "a led, b leads now, after"),
             ("a", Some("b"), Some("b"), true, "a led, b leads now, after"),
             ("a", Some("a"), Some("a"), true, "a leads already"),
-            ("a", Some("c"), Some("b"), false, "c leads now, and not b,"),
+            (
+                "a",
+                Some("c"),
+                Some("b"),
+                false,
+                "c leads now instead of b,",
+            ),
             ("a", Some("a"), None, false, "a still leads"),
             ("a", Some("a"), Some("b"), false, "a still leads"),
             ("a", None, None, false, "no computer leads"),

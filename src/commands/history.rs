@@ -1,4 +1,4 @@
-//! `rosrescue history`: the checkpoints that are kept.
+//! `rosrescue history`: lists the kept checkpoints.
 
 use std::fmt;
 
@@ -66,13 +66,13 @@ struct History {
     kept: Vec<Row>,
 }
 
-/// What the report of a rescue tells.
+/// The part of a rescue's report that the list shows.
 #[derive(Serialize)]
 struct Rescue {
     cause: String,
-    /// How the master before had ended, if that was seen.
+    /// How the previous master ended, if known.
     ended: Option<String>,
-    /// How long calls did not pass.
+    /// How long calls did not pass to the master, in milliseconds.
     total_ms: f64,
 }
 
@@ -94,12 +94,12 @@ struct Row {
     number: usize,
     name: String,
     what: &'static str,
-    /// None if there is no report of it.
+    /// `None` if there is no report.
     rescue: Option<Rescue>,
-    /// Last written to, by the wall clock.
+    /// Wall time of the last change.
     written: String,
     bytes: u64,
-    /// None if it cannot be read.
+    /// `None` if the checkpoint cannot be read.
     nodes: Option<usize>,
     parameters: Option<usize>,
     problem: Option<String>,

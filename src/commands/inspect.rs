@@ -1,4 +1,4 @@
-//! `rosrescue inspect`: what a checkpoint holds.
+//! `rosrescue inspect`: shows what a checkpoint contains.
 
 use std::{collections::BTreeMap, fmt};
 
@@ -35,23 +35,23 @@ pub(super) async fn run(args: &InspectArgs) -> Result<Exit, Failure> {
     Ok(Exit::Good)
 }
 
-/// What a checkpoint holds.
+/// The contents of a checkpoint.
 #[derive(Serialize)]
 struct Inspected {
     file: String,
     bytes: u64,
-    /// Whether this is all that was recorded.
+    /// Whether this is everything that was recorded.
     exact: bool,
     damage: Vec<String>,
-    /// Of the last append, if it was cut short.
+    /// The reason, if the last append is incomplete.
     torn: Option<String>,
-    /// Last written to, by the wall clock.
+    /// Wall time of the last change.
     written: String,
     session: Session,
     counts: Counts,
     nodes: Vec<Node>,
     topics: Vec<Topic>,
-    /// The values of some are hidden.
+    /// The parameters. Values that match `--hide-values` are masked.
     parameters: Struct,
     journal: Journal,
     /// Methods of the writes that no master has run yet.
@@ -62,7 +62,7 @@ struct Inspected {
 struct Session {
     id: String,
     started: String,
-    /// Stopped in order.
+    /// Whether rosrescue was stopped cleanly.
     closed: bool,
     master_uri: Option<String>,
 }
@@ -88,11 +88,11 @@ struct Topic {
 
 #[derive(Serialize)]
 struct Journal {
-    /// The last record in the snapshot.
+    /// Number of the snapshot's last record.
     snapshot: Option<u64>,
-    /// Records since then.
+    /// Number of records after the snapshot.
     records: usize,
-    /// How many of them, by method.
+    /// Number of those records for each method.
     calls: BTreeMap<String, usize>,
 }
 
@@ -204,9 +204,9 @@ impl fmt::Display for Inspected {
         match journal.snapshot {
             Some(seq) => writeln!(
                 f,
-                "journal     {calls} since the snapshot, which is of record {seq}"
+                "journal     {calls} since the snapshot, which ends with record {seq}"
             )?,
-            None => writeln!(f, "journal     {calls}; there is no whole snapshot")?,
+            None => writeln!(f, "journal     {calls}; there is no complete snapshot")?,
         }
         if !self.pending.is_empty() {
             writeln!(

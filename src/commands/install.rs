@@ -31,7 +31,7 @@ use crate::{
 };
 
 const UNITS: [&str; 2] = ["rosrescue.service", "rosrescue.socket"];
-/// The variables of ROS that concern a master.
+/// ROS's variables that concern the master.
 const SETTINGS: [&str; 5] = [
     "ROS_MASTER_URI",
     "ROS_IP",
@@ -39,10 +39,10 @@ const SETTINGS: [&str; 5] = [
     "ROS_HOME",
     "ROS_LOG_DIR",
 ];
-/// What a ROS in an unusual place needs as well. Its `setup.bash` sets them.
+/// Further variables that a ROS in an unusual place needs. Its `setup.bash` sets them.
 const PATHS: [&str; 4] = ["PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ROS_PACKAGE_PATH"];
 
-/// One change of the computer.
+/// One change to the computer.
 #[derive(Debug, Serialize)]
 #[serde(tag = "change", rename_all = "snake_case")]
 enum Change {
@@ -51,12 +51,12 @@ enum Change {
     Run { command: Vec<String> },
 }
 
-/// All changes in their order, and what a person should know.
+/// All changes in order, and notes for the operator.
 #[derive(Debug, Default, Serialize)]
 struct Plan {
     changes: Vec<Change>,
     notes: Vec<String>,
-    /// Reasons not to carry it out.
+    /// Reasons not to make the changes.
     obstacles: Vec<String>,
 }
 
@@ -70,9 +70,9 @@ pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, Failure> {
     carry_out(&uninstall(&place), &place, &args.scope)
 }
 
-/// Where the files are, and which systemd runs the service.
+/// Where the unit files go, and which systemd runs the service.
 struct Place {
-    /// A user's own service.
+    /// Whether it is a user's own service.
     user: bool,
     units: PathBuf,
 }
@@ -97,7 +97,7 @@ impl Place {
         Ok(Self { user, units })
     }
 
-    /// The units of the package: those of the computer, for the program of the package.
+    /// Whether the Debian package provides the units. It does so for the system's systemd and the package's program.
     fn is_packaged(&self, program: &Path) -> bool {
         let unit = Path::new("/usr/lib/systemd/system").join(UNITS[0]);
         !self.user && program == Path::new("/usr/bin/rosrescue") && unit.exists()
@@ -120,20 +120,20 @@ impl Place {
         words.map(|&word| word.to_owned()).collect()
     }
 
-    /// Whether systemctl says yes, such as to `is-active`.
+    /// Whether systemctl confirms `question`, such as `is-active`, for `unit`.
     fn is(&self, question: &str, unit: &str) -> bool {
         let command = self.systemctl(&[question, "--quiet", unit]);
         run_command(&command, Stdio::null()).is_ok_and(|status| status.success())
     }
 
-    /// Whether a systemd runs that can start the service.
+    /// Whether systemd runs and can start the service.
     fn systemd_runs(&self) -> bool {
         let run = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
         Path::new("/run/systemd/system").exists()
             && (!self.user || run.is_some_and(|run| run.join("systemd/private").exists()))
     }
 
-    /// The option that starts or stops a unit at once, where systemd runs.
+    /// The systemctl option that starts or stops a unit at once, if systemd runs.
     fn now(&self) -> &'static [&'static str] {
         if self.systemd_runs() { &["--now"] } else { &[] }
     }
@@ -233,7 +233,7 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
     let is_running = place.systemd_runs() && UNITS.iter().all(|unit| place.is("is-active", unit));
     let is_enabled = UNITS.iter().all(|unit| place.is("is-enabled", unit));
     if is_changed && is_running {
-        // Who runs what.
+        // The lines that say what runs, and as which user.
         let key = |text: &str| {
             let keys = ["User=", "ExecStart=/"];
             let lines = text.lines();
@@ -284,7 +284,7 @@ fn uninstall(place: &Place) -> Plan {
     plan
 }
 
-/// Shows the plan, asks, and does it.
+/// Shows the plan, asks, and makes the changes.
 fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Failure> {
     if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
         print(plan, &args.output)?;
@@ -326,7 +326,8 @@ impl Plan {
         self.changes.push(Change::Run { command });
     }
 
-    /// Looks at the units that start a master or roslaunch. Returns those to disable, and those to start after ours.
+    /// Handles other units that start a master or roslaunch. Returns those to disable, and those to start after
+    /// rosrescue.
     fn meet_others(&mut self, place: &Place, service: &Service) -> (Vec<String>, Vec<String>) {
         let (mut disabled, mut before) = (Vec::new(), Vec::new());
         let all = place.other_units().into_iter();
@@ -358,7 +359,7 @@ impl Plan {
     fn start(&mut self, place: &Place, service: &Service, port_will_be_free: bool) {
         let mut options = place.now().to_vec();
         if !service.runs_rosmaster && place.systemd_runs() {
-            // A proxy has started when its master is there, which can take long.
+            // A proxy counts as started once it has a master, which can take long.
             options.push("--no-block");
         }
         self.run(place.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
@@ -373,13 +374,13 @@ impl Plan {
         }
     }
 
-    /// Gives the running service its new files.
+    /// Makes the running service use its new files.
     fn renew(&mut self, place: &Place, restart: bool) {
         if restart {
             self.run(place.systemctl(&["stop", UNITS[1]]));
             self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
         } else {
-            // The next rosrescue takes the running master over. Calls wait for some 0.2 s.
+            // The next rosrescue adopts the running master. Calls wait for some 0.2 s.
             self.run(place.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }
@@ -397,7 +398,7 @@ impl Change {
             }
             Self::Remove { path } => {
                 let removed = fs::remove_file(path);
-                // Its folder may hold other drop-ins.
+                // The folder may hold drop-ins of others.
                 if let Some(folder) = path
                     .parent()
                     .filter(|it| it.extension().is_some_and(|end| end == "d"))
@@ -457,7 +458,7 @@ fn run_command(words: &[String], errors: Stdio) -> io::Result<system::ExitStatus
     command.stdout(Stdio::null()).stderr(errors).status()
 }
 
-/// The environment of the user who typed the command. sudo clears it, but sudo's own process still has it.
+/// The environment of the user who called sudo. sudo clears it, but sudo's own process still has it.
 fn caller_environment() -> BTreeMap<String, String> {
     let own = std::env::vars_os()
         .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
@@ -473,14 +474,14 @@ fn caller_environment() -> BTreeMap<String, String> {
         let (name, value) = std::str::from_utf8(pair).ok()?.split_once('=')?;
         Some((name.to_owned(), value.to_owned()))
     });
-    // Only our own environment has sudo's words about the caller.
+    // Only this process's environment has sudo's variables about the caller.
     let of_caller = own.iter().filter(|(name, _)| name.starts_with("SUDO_"));
     pairs
         .chain(of_caller.map(|(name, value)| (name.clone(), value.clone())))
         .collect()
 }
 
-/// The user that runs the service; none for a user's own.
+/// The user that runs the service. `None` for a user's own service.
 fn account(
     args: &InstallArgs,
     place: &Place,
@@ -500,7 +501,7 @@ fn account(
     };
     let user = args.run_as.clone().or_else(of_caller).ok_or_else(|| {
         Failure::Usage(
-            "name the user that runs the service, as in --run-as robot: only sudo tells it"
+            "name the user that runs the service, as in --run-as robot: without sudo, install cannot know it"
                 .to_owned(),
         )
     })?;
@@ -521,7 +522,7 @@ fn account(
         .ok_or_else(nobody)
 }
 
-/// Why the service of a computer must not run the program at this path: its owner could replace it.
+/// Why root's service must not run the program at this path: its owner could replace it.
 fn misplaced(program: &Path) -> Option<String> {
     let folders = ["/usr", "/opt", "/bin"];
     let is_safe = folders.iter().any(|folder| program.starts_with(folder));
@@ -534,16 +535,16 @@ fn misplaced(program: &Path) -> Option<String> {
     })
 }
 
-/// What the command of a service means.
+/// A parsed service command.
 struct Service {
     listen: Vec<SocketAddr>,
-    /// `core`, which starts the master itself.
+    /// Whether the command is `core`, which starts the master itself.
     runs_rosmaster: bool,
-    /// It has to find rosmaster on the PATH.
+    /// Whether it must find rosmaster on the PATH.
     searches_rosmaster: bool,
 }
 
-/// Reads the command of a service, which sees none of the caller's ROSRESCUE_ variables.
+/// Parses a service's command. The service gets none of the caller's ROSRESCUE_ variables.
 fn read_service(words: &[String], settings: &BTreeMap<String, String>) -> Result<Service, Failure> {
     let usage = |why: String| Failure::Usage(format!("`{}`: {why}", words.join(" ")));
     let command = Cli::command()

@@ -1,4 +1,4 @@
-//! The running master, by the calls that every node may make.
+//! Reads and changes the running master through ordinary Master API calls.
 
 use std::{fmt::Display, time::Duration};
 
@@ -14,9 +14,9 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// How long a connection may take.
+/// Longest time to connect.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
-/// How long an answer may take: `getParam('/')` of a million parameters takes rosmaster half a minute.
+/// Longest time for an answer. rosmaster needs half a minute for `getParam('/')` with a million parameters.
 const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 /// Largest answer, in bytes.
 const MAX_REPLY: usize = 512 << 20;
@@ -43,7 +43,7 @@ impl Live {
         };
         let connection = match timeout(CONNECT_LIMIT, connect).await {
             Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,
-            // A rosrescue that is stopped accepts no connection once its backlog is full.
+            // The backlog of a stopped rosrescue is full, so it accepts no connection.
             Err(_) => {
                 return Err(Failure::Silent {
                     uri,
@@ -54,10 +54,10 @@ impl Live {
         Ok(Self { connection, uri })
     }
 
-    /// What the master holds. Who watches parameters cannot be read, and is taken from `previous` for nodes that are
-    /// where they were.
+    /// Reads the master's state. Parameter subscriptions cannot be read. They are taken from `previous` for nodes whose
+    /// address is the same.
     pub(super) async fn state(&mut self, previous: &Master) -> Result<Master, Failure> {
-        // No master bears it.
+        // No master has this token.
         let token = Token::new("", 0);
         let uri = self.uri.clone();
         let failed =
@@ -78,7 +78,7 @@ impl Live {
             .unwrap_or_else(|_| Err(failed(&limit)))
     }
 
-    /// Makes `calls` in one multicall. Returns the message of each that was refused; none for one that succeeded.
+    /// Makes `calls` in one multicall. Each result is the error message, or `None` if the call succeeded.
     pub(super) async fn make(
         &mut self,
         calls: Vec<Request>,
@@ -95,12 +95,12 @@ impl Live {
                 Ok(results.iter().map(refusal).collect())
             }
             Reply::Fault { text, .. } => Err(failed(text)),
-            Reply::Value(_) => Err(failed("this is no master's answer".to_owned())),
+            Reply::Value(_) => Err(failed("the answer is not that of a ROS master".to_owned())),
         }
     }
 }
 
-/// Why an entry of a multicall has failed.
+/// The error message of a multicall's entry, if it failed.
 fn refusal(result: &Value) -> Option<String> {
     let answer = match result {
         Value::Array(one) => one.first().and_then(Value::as_array),
@@ -129,7 +129,7 @@ mod tests {
         listener.bind(&any.into()).unwrap();
         listener.listen(0).unwrap();
         let address = listener.local_addr().unwrap().as_socket().unwrap();
-        // Until the backlog is full.
+        // Connects until the backlog is full.
         let connect = || TcpStream::connect_timeout(&address, Duration::from_millis(500)).ok();
         let _waiting: Vec<_> = std::iter::from_fn(connect).collect();
         let address = MasterUri {

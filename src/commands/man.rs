@@ -1,4 +1,4 @@
-//! `rosrescue man`: manual pages, made of the command line's own definition.
+//! `rosrescue man`: prints manual pages made from the definition of the command line.
 
 use std::fs;
 
@@ -9,7 +9,7 @@ use crate::cli::{Cli, ManArgs};
 
 pub(super) async fn run(args: &ManArgs) -> Result<Exit, Failure> {
     let mut command = Cli::command();
-    // Names the commands' pages `rosrescue-core`, …
+    // Gives the pages names such as `rosrescue-core`.
     command.build();
     match &args.folder {
         None => {

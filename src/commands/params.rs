@@ -1,4 +1,4 @@
-//! `rosrescue params`: the parameters of a checkpoint, for `rosparam load`.
+//! `rosrescue params`: prints the parameters of a checkpoint, for `rosparam load`.
 
 use std::{
     fmt,
@@ -27,7 +27,7 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
     } else {
         for name in OF_THE_SESSION {
             if tree.shift_remove(name.trim_start_matches('/')).is_some() {
-                left_out.push(format!("left out {name}: it belongs to that session"));
+                left_out.push(format!("left out {name}: it belongs to that session only"));
             }
         }
         let (yaml, not_carried) =
@@ -46,7 +46,7 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
     Ok(Exit::Good)
 }
 
-/// The tree without hidden parameters: a placeholder would be loaded.
+/// The tree without hidden parameters. A masked value would be loaded as it is.
 fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -> Struct {
     let mut kept = Struct::new();
     for (key, value) in tree {

@@ -1,4 +1,4 @@
-//! `rosrescue report`: the report of a rescue, from the files beside the checkpoint.
+//! `rosrescue report`: prints the report of a rescue, from the files beside the checkpoint.
 
 use super::{Exit, Failure, files, print};
 use crate::{cli::ReportArgs, recovery::report_file};

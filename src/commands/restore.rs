@@ -1,5 +1,5 @@
-//! `rosrescue restore`: sets the parameters of a running robot to those of a checkpoint, by ordinary calls. So the
-//! master, the mirror, the journal and the nodes all hear of it.
+//! `rosrescue restore`: sets the parameters of a running robot to those of a checkpoint. It uses ordinary calls, so the
+//! master, the mirror, the journal and the nodes all get the changes.
 
 use std::{
     fmt,
@@ -21,7 +21,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Most calls, and about the most bytes of values, in one multicall: other callers have their turn in between.
+/// Most calls in one multicall; its size is limited as well. Other callers get their turn between two multicalls.
 const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 
@@ -47,18 +47,18 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
             return Err(Failure::Failed("changed nothing".to_owned()));
         }
         restored.failed = set(&params, &mut live).await?;
-        // The master's own words about what it refused say more.
+        // If the master refused calls, its messages explain the rest.
         if restored.failed.is_empty() {
             let now = live.state(&file.state).await?;
             let left = Params::between(file.state.params(), now.params(), args.exact);
             let changed = left
                 .set
                 .iter()
-                .map(|(name, ..)| format!("{name} has another value again"));
+                .map(|(name, ..)| format!("{name} was changed again meanwhile"));
             let back = left
                 .delete
                 .iter()
-                .map(|name| format!("{name} is there again"));
+                .map(|name| format!("{name} was set again meanwhile"));
             restored.failed = changed.chain(back).collect();
         }
         restored.done = restored.failed.is_empty();
@@ -76,7 +76,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Asks at the terminal, unless the output is `json` for a program.
+/// Asks at the terminal. Fails without asking if the output is `json`.
 fn agreed(json: bool) -> Result<bool, Failure> {
     if json || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         let why = "cannot ask here: --plan shows the changes, --yes makes them";
@@ -131,9 +131,9 @@ struct Restored {
     file: String,
     master: String,
     plan: Plan,
-    /// Whether the parameters were set and read back.
+    /// Whether all parameters were set and read back.
     done: bool,
-    /// What was refused or has changed again.
+    /// Calls that were refused, and parameters that have changed again.
     failed: Vec<String>,
 }
 
@@ -166,7 +166,7 @@ impl Plan {
 #[derive(Serialize)]
 struct Set {
     name: String,
-    /// The value now; none if it is not set.
+    /// The present value. `None` if the parameter is not set.
     from: Option<String>,
     to: String,
 }

@@ -1,4 +1,4 @@
-//! Finding and asking the running rosrescue.
+//! Finds and asks the running rosrescue.
 
 use std::{io, time::Duration};
 
@@ -25,19 +25,19 @@ use crate::{
     xmlrpc::{self, Call, Reply, Value},
 };
 
-/// How long it may take to answer. It answers in milliseconds, and waits for nobody.
+/// Longest time for rosrescue to answer. It needs only milliseconds, because it waits for no other process.
 pub(super) const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 /// Largest page that is read, in bytes.
 const MAX_PAGE: usize = 64 << 20;
 
-/// A rosrescue that has been found by its address, and may or may not answer.
+/// A rosrescue at a known address. It may not answer.
 #[derive(Clone, Debug)]
 pub(super) struct Running {
     pub(super) address: MasterUri,
 }
 
 impl Running {
-    /// The one that `target` means.
+    /// The rosrescue that `target` stands for.
     pub(super) fn find(target: &TargetArgs) -> Result<Self, Failure> {
         let of = |variable: &str, uri: &str| {
             MasterUri::parse(uri).map_err(|error| Failure::Usage(format!("{variable}: {error}")))
@@ -53,7 +53,7 @@ impl Running {
         Ok(Self { address })
     }
 
-    /// The page at `path`, as a program gets it.
+    /// Gets the page at `path`.
     pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), Failure> {
         let request = Request::get(path)
             .header(HOST, self.address.authority())
@@ -62,9 +62,9 @@ impl Running {
             .await
     }
 
-    /// How it is.
+    /// Gets the status.
     pub(super) async fn status(&self) -> Result<Status, Failure> {
-        /// What every version has.
+        /// The field that all versions have.
         #[derive(Deserialize)]
         struct Versioned {
             schema: u32,
@@ -73,7 +73,7 @@ impl Running {
         let (_, json) = self.get("/status.json").await?;
         let at = &self.address;
         let versioned = serde_json::from_slice(&json).map_err(|_| {
-            self.silent("something else answers there, a bare rosmaster perhaps".to_owned())
+            self.silent("another program answers there, perhaps a bare rosmaster".to_owned())
         })?;
         let Versioned { schema, version } = versioned;
         if schema > SCHEMA {
@@ -83,12 +83,11 @@ impl Running {
                 env!("CARGO_PKG_VERSION")
             )));
         }
-        serde_json::from_slice(&json).map_err(|error| {
-            Failure::Failed(format!("the status of {at} is not understood: {error}"))
-        })
+        serde_json::from_slice(&json)
+            .map_err(|error| Failure::Failed(format!("cannot read the status of {at}: {error}")))
     }
 
-    /// Its answer to a call, within `limit`.
+    /// Makes a call within `limit`, and returns the answer.
     pub(super) async fn call(
         &self,
         method: &str,
@@ -152,7 +151,7 @@ async fn try_exchange(
     Ok((head.status, body))
 }
 
-/// Whether a connection to `address` ends on this computer.
+/// Whether `address` leads to this computer.
 pub(super) async fn is_here(address: &MasterUri) -> bool {
     let connect = async {
         let addresses = resolver::addresses(&address.host, address.port).await?;

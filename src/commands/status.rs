@@ -1,4 +1,4 @@
-//! `rosrescue status`: how the running one is.
+//! `rosrescue status`: shows the status of the running rosrescue.
 
 use super::{Exit, Failure, print, running::Running};
 use crate::cli::StatusArgs;

@@ -1,4 +1,4 @@
-//! The terminal as a picture that is drawn again and again.
+//! Draws a text on the terminal again and again.
 
 use std::{
     io::{self, IsTerminal, Read, Write, stdout},
@@ -11,27 +11,27 @@ use rustix::termios::{
 };
 use tokio::sync::mpsc;
 
-/// The other screen, without a cursor; and back.
+/// Switches to the alternate screen and hides the cursor.
 const ENTER: &str = "\x1b[?1049h\x1b[?25l";
 const LEAVE: &str = "\x1b[?25h\x1b[?1049l";
-/// The size of a terminal that does not say.
+/// Columns and rows of a terminal that does not report its size.
 const USUAL: (usize, usize) = (80, 24);
 
-/// The terminal's settings before, until they are restored.
+/// The terminal's original settings, until they are restored.
 static BEFORE: Mutex<Option<Termios>> = Mutex::new(None);
 
-/// Is restored on drop, and before a panic's message.
+/// A terminal in raw mode. Dropping this restores it, and so does a panic, before its message.
 pub(super) struct Terminal(());
 
 impl Terminal {
-    /// Takes over the terminal; none if standard output is none.
+    /// Takes over the terminal. `None` if standard output is not a terminal.
     pub(super) fn enter() -> Option<Self> {
         if !stdout().is_terminal() {
             return None;
         }
         let before = tcgetattr(stdout()).ok()?;
         let mut raw = before.clone();
-        // Ctrl-C stays a signal; to be stopped would leave the shell on the other screen.
+        // Ctrl-C remains a signal. Ctrl-Z is off: a stopped program would leave the shell on the alternate screen.
         raw.local_modes
             .remove(LocalModes::ICANON | LocalModes::ECHO);
         raw.special_codes[SpecialCodeIndex::VSUSP] = 0;
@@ -55,7 +55,7 @@ impl Terminal {
         let lines: Vec<String> = lines
             .map(|line| line.chars().take(columns).collect())
             .collect();
-        // Each line is cleared behind its end, and the rest below: that does not flicker.
+        // Clearing each line behind its end, and the rest below, avoids flicker.
         put(&format!("\x1b[H{}\x1b[K\x1b[J", lines.join("\x1b[K\r\n")));
     }
 }
@@ -87,7 +87,7 @@ pub(super) fn size() -> (usize, usize) {
     }
 }
 
-/// What is typed, byte by byte.
+/// Receives typed bytes.
 pub(super) fn keys() -> mpsc::Receiver<u8> {
     let (to, keys) = mpsc::channel(16);
     thread::spawn(move || {

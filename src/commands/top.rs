@@ -1,4 +1,4 @@
-//! `rosrescue top`: what goes on, once a second.
+//! `rosrescue top`: shows calls, callers, nodes and rescues, once a second.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -30,10 +30,10 @@ use crate::{
 };
 
 const SECOND: Duration = Duration::from_secs(1);
-/// Rescues shown.
+/// Number of rescues shown.
 const RESCUES: usize = 5;
 
-/// One caller in the last second, and since the start.
+/// Calls of one caller in the last second and since the start.
 #[derive(Debug, Serialize)]
 struct Row {
     caller: String,
@@ -44,10 +44,10 @@ struct Row {
     longest_at: Option<f64>,
 }
 
-/// What is shown.
+/// One picture of `rosrescue top`.
 #[derive(Debug, Serialize)]
 struct Top {
-    /// Seconds since 1970, by the clock of rosrescue's computer.
+    /// Seconds since 1970, from the clock of rosrescue's computer.
     at: f64,
     uri: String,
     condition: Condition,
@@ -59,16 +59,16 @@ struct Top {
     unreachable: Vec<String>,
     dead_nodes: Vec<String>,
     cluster: Option<Computers>,
-    /// The busiest first, then the slowest.
+    /// Callers, busiest first, then slowest first.
     callers: Vec<Row>,
     rescues: u64,
     last_rescues: Vec<Report>,
-    /// Lines of the terminal.
+    /// Number of lines of the terminal.
     #[serde(skip)]
     height: usize,
 }
 
-/// Calls so far, to count those of a second.
+/// Numbers of calls so far. Two samples give the calls per second.
 struct Sample {
     at: Instant,
     calls: u64,
@@ -86,7 +86,7 @@ impl Sample {
     }
 }
 
-/// What to show of `status`, which was asked for at `now`.
+/// Builds the picture of `status`, which was read at `now`.
 fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> Top {
     let calls = status.counter("calls");
     let seconds = before.map(|before| now.duration_since(before.at).as_secs_f64().max(0.1));
@@ -210,7 +210,7 @@ impl fmt::Display for Top {
         for report in self.last_rescues.iter().rev().take(RESCUES) {
             writeln!(foot, "{}", report.line())?;
         }
-        // An empty line and the table's own head.
+        // One empty line and the table's heading.
         let taken = head.lines().count() + foot.lines().count() + 2;
         write!(f, "{head}\n{:<32}", "CALLER")?;
         writeln!(
@@ -235,7 +235,7 @@ impl fmt::Display for Top {
     }
 }
 
-/// What ends it.
+/// The signals that end the command.
 struct Ends(Vec<Signal>);
 
 impl Ends {
@@ -265,7 +265,7 @@ impl Ends {
 
 pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
     let running = Running::find(&args.target)?;
-    // Before the terminal is taken over: if nobody is there, that is all there is to say.
+    // Before the terminal is taken over, so that an error is printed normally.
     let mut status = running.status().await;
     if let Err(failure) = status {
         return Err(failure);
@@ -303,7 +303,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
                 };
                 None
             }
-            // It may be started again this very moment.
+            // rosrescue may be restarting.
             Err(failure) => Some(failure),
         };
         match (&terminal, &failed) {

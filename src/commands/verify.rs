@@ -1,4 +1,4 @@
-//! `rosrescue verify`: whether a checkpoint is whole, and what can be used of one that is not.
+//! `rosrescue verify`: checks a checkpoint for damage, and shows what can still be used.
 
 use std::fmt;
 
@@ -30,16 +30,16 @@ pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, Failure> {
 #[derive(Serialize)]
 struct Verified {
     file: String,
-    /// Whether nothing is damaged.
+    /// Whether the file is undamaged.
     whole: bool,
-    /// Whether all that was recorded can be used, if need be with the generation before.
+    /// Whether everything recorded can be used, if necessary from the previous generation.
     exact: bool,
-    /// The last record in the snapshot that can be used; none if there is none.
+    /// Number of the usable snapshot's last record. `None` if no snapshot is usable.
     snapshot: Option<u64>,
-    /// Records after it that can be used.
+    /// Number of usable records after it.
     records: usize,
     usable: Counts,
-    /// Of the last append, if it was cut short.
+    /// The reason, if the last append is incomplete.
     torn: Option<String>,
     damage: Vec<String>,
 }

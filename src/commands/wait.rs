@@ -1,4 +1,4 @@
-//! `rosrescue wait`: until calls are answered, for start scripts.
+//! `rosrescue wait`: waits until calls are answered, for start scripts.
 
 use std::{fmt, time::Duration};
 
@@ -19,15 +19,15 @@ use crate::{
 /// Pause between two tries.
 const PAUSE: Duration = Duration::from_millis(250);
 
-/// How the waiting ended.
+/// The result of waiting.
 #[derive(Debug, Serialize)]
 struct Waited {
     uri: String,
-    /// Whether all of it is so.
+    /// Whether all conditions are met.
     met: bool,
-    /// The condition that is not met yet.
+    /// The conditions that are not met yet.
     missing: Vec<String>,
-    /// Why, in a sentence.
+    /// Why they are not met.
     why: Option<String>,
     seconds: f64,
 }
@@ -83,7 +83,7 @@ pub(super) async fn run(args: &WaitArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// What of `wanted` is not so, and why.
+/// The conditions in `wanted` that are not met, and why.
 async fn missing(
     running: &Running,
     wanted: &[For],

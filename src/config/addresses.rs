@@ -1,12 +1,12 @@
-//! The addresses to serve, and the address announced to others.
+//! Parses the addresses to serve, and derives the announced address.
 
 use std::net::{IpAddr, SocketAddr};
 
 use super::UsageError;
 use crate::ros_env::{self, Lookup};
 
-/// The host name or address announced to others. Unless the environment sets one, a single served
-/// address is used, because nothing listens at the others.
+/// The announced host name or address. Unless the environment sets one, it is the only served address, because
+/// rosrescue listens at no other.
 pub(super) fn advertised_host(
     listen: &[SocketAddr],
     env: Lookup<'_>,
@@ -32,7 +32,7 @@ pub(super) fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, Us
     }
 }
 
-/// Parses `ADDR:PORT`, `ADDR`, `:PORT`, `PORT`, or no option.
+/// Parses `ADDR:PORT`, `ADDR`, `:PORT`, `PORT`, or a missing option.
 pub(super) fn listen_addresses(
     given: Option<&str>,
     env: Lookup<'_>,

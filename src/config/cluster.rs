@@ -16,7 +16,7 @@ use crate::{
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 
-/// How this computer takes part in a cluster.
+/// The cluster configuration of this computer.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ClusterConfig {
     /// The addresses of the etcd servers, each as `http://HOST:PORT` or `https://HOST:PORT`.
@@ -25,8 +25,7 @@ pub struct ClusterConfig {
     pub robot: String,
     /// This computer's name, unique within the robot.
     pub name: String,
-    /// The host name, if the computer's name is derived from host name and address; none if the
-    /// name was given.
+    /// The host name, if it is part of the computer's name. `None` if the name was given.
     pub(super) hostname: Option<String>,
     /// Address at which other computers reach this rosrescue.
     pub advertised: MasterUri,
@@ -34,9 +33,9 @@ pub struct ClusterConfig {
     pub ttl: Duration,
     /// When a write is answered.
     pub sync: ClusterSync,
-    /// What happens to writes while this computer is cut off.
+    /// What to do with writes while this computer is cut off.
     pub alone: WhenCutOff,
-    /// PEM files: the certificate of etcd's authority, and this computer's own certificate and key.
+    /// PEM file with the certificate of etcd's authority.
     pub ca: Option<PathBuf>,
     pub cert: Option<PathBuf>,
     pub key: Option<PathBuf>,
@@ -78,7 +77,7 @@ pub enum ClusterError {
     Password { path: PathBuf, why: String },
 }
 
-/// Leaves out the password.
+/// Hides the password.
 impl fmt::Debug for ClusterConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ClusterConfig")
@@ -92,8 +91,8 @@ impl fmt::Debug for ClusterConfig {
 }
 
 impl ClusterConfig {
-    /// The cluster configuration from `args` on the computer `hostname`, whose rosrescue is reached
-    /// at `usual`; none without `--cluster`. Reads the password file.
+    /// Builds the cluster configuration of the computer `hostname`, whose rosrescue is reached at `usual`. `None`
+    /// without `--cluster`. Reads the password file.
     pub(crate) fn new(
         args: &ClusterArgs,
         usual: &MasterUri,
@@ -158,7 +157,7 @@ impl ClusterConfig {
         }))
     }
 
-    /// Replaces the default address `before` by `now`, wherever the user has not set another one.
+    /// Replaces the default address `before` by `now`, unless the user has set another one.
     pub(super) fn follow(&mut self, before: &MasterUri, now: &MasterUri) {
         if self.advertised.host == before.host {
             self.advertised.host.clone_from(&now.host);
@@ -174,9 +173,10 @@ impl ClusterConfig {
     }
 }
 
-/// The default name of the computer `hostname` that is reached at `advertised`. Copies of a disk
-/// share the host name and `/etc/machine-id`, so the address is part of the name, as in
-/// `arm-10.0.0.2`. An advertised host name is used alone. A port other than 11311 is appended.
+/// The default name of the computer `hostname` that is reached at `advertised`, such as `arm-10.0.0.2`.
+///
+/// The address is part of the name because copies of a disk share the host name and `/etc/machine-id`. An advertised
+/// host name is used alone. A port other than 11311 is appended.
 fn default_name(hostname: &str, advertised: &MasterUri) -> Option<String> {
     let host = &advertised.host;
     let is_address = host.parse::<IpAddr>().is_ok() || host == "localhost";
@@ -279,7 +279,7 @@ mod tests {
             ("robot", "10.0.0.2", 11311, "robot-10.0.0.2"),
             ("robot", "10.0.0.2", 11312, "robot-10.0.0.2-11312"),
             ("robot", "fd00::2", 11311, "robot-fd00--2"),
-            // Others find it by that name.
+            // Other computers use that name to find it.
             ("robot", "robot", 11311, "robot"),
             ("robot-0", "robot-0.fleet", 11311, "robot-0.fleet"),
             ("localhost", "10.0.0.1", 11311, "10.0.0.1"),

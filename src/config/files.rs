@@ -1,4 +1,4 @@
-//! File descriptors: how many client connections may use.
+//! Limits client connections so that enough file descriptors remain.
 
 use super::Config;
 

@@ -1,10 +1,9 @@
-//! Listening sockets inherited at the start, by systemd's LISTEN_FDS protocol (`sd_listen_fds(3)`),
-//! and who passed them.
+//! Listening sockets that this process has inherited by systemd's LISTEN_FDS protocol (`sd_listen_fds(3)`), from
+//! systemd or from the guardian.
 //!
-//! In the protocol LISTEN_PID is the process that the sockets are meant for. A guardian cannot know
-//! its worker's process id before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. The
-//! last of its sockets is not a listener but one end of a pair, the *link*. Through it the worker
-//! reports its progress and notices the end of the guardian.
+//! In the protocol, LISTEN_PID is the process that the sockets are meant for. A guardian cannot know its worker's
+//! process id before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. Its last socket is not a listener
+//! but one end of a pair, the *link*. Through it the worker reports its progress and notices the end of the guardian.
 
 use std::{
     io::{self, Write},
@@ -33,17 +32,17 @@ pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
 /// Environment variable with the number of workers that have died before this one.
 pub(super) const RESTARTS: &str = "ROSRESCUE_WORKER_RESTARTS";
-/// Memory settings of the worker, unless the user has set others: one heap, with large pieces apart
-/// from it. The memory of a large call then goes back to the system. By default glibc keeps most of
-/// it, in a heap for each thread.
+/// Memory settings of the worker, unless the user has set others: a single heap, with large blocks outside of it. Then
+/// the memory of a large call goes back to the system. By default glibc uses a heap for each thread and keeps most of
+/// it.
 pub const TUNABLES: (&str, &str) = (
     "GLIBC_TUNABLES",
     "glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=131072:glibc.malloc.trim_threshold=131072",
 );
 
-/// Sent by a worker once it handles signals. Before that, a signal would kill it.
+/// A worker sends this once it handles signals. Before that, a signal would kill it.
 pub(super) const HANDLES_SIGNALS: u8 = b'h';
-/// Sent by a worker once it answers calls.
+/// A worker sends this once it answers calls.
 pub const SERVES: u8 = b's';
 
 /// Why inherited sockets cannot be served. The exit status is 1.
@@ -64,11 +63,11 @@ pub enum HandoverError {
 pub struct Sockets {
     /// The listening sockets, in non-blocking mode.
     pub listeners: Vec<TcpListener>,
-    /// Who else keeps the sockets open.
+    /// What keeps the sockets open when this process ends.
     pub guard: Guard,
 }
 
-/// Who keeps the sockets and restarts rosrescue when it dies.
+/// The supervisor that keeps the sockets and restarts rosrescue when it dies.
 #[derive(Debug)]
 pub enum Guard {
     /// There is no known supervisor.
@@ -83,8 +82,7 @@ pub enum Guard {
 }
 
 impl Sockets {
-    /// The sockets that this process has inherited; none if there are none. Must be called once,
-    /// before anything else.
+    /// The sockets that this process has inherited, or `None`. Must be called once, before anything else.
     ///
     /// # Errors
     ///
@@ -154,15 +152,15 @@ impl Guard {
     }
 }
 
-/// Who passes sockets to a process.
+/// The process that passed the sockets.
 #[derive(Debug, PartialEq, Eq)]
 enum Giver {
     Systemd,
     Guardian(u32),
 }
 
-/// Who passed the sockets, according to the environment `env`; none if they are not meant for the
-/// process `own`, whose parent is `parent`.
+/// Finds out which process passed the sockets, from the environment `env`. `None` if they are not meant for the process
+/// `own`, whose parent is `parent`.
 fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     let number = |name: &str| env(name)?.parse::<u32>().ok();
     number(LISTEN_FDS).filter(|count| *count > 0)?;

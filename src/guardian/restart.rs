@@ -1,4 +1,4 @@
-//! Decides what to do after the end of a worker. Pure: the time is an argument.
+//! Decides whether and when to start the next worker.
 
 use std::{
     collections::VecDeque,
@@ -6,11 +6,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Number of workers in a row that may fail before they serve and are still restarted at once. Also
-/// the number of deaths within [`SPAN`] that are not yet reported as repeated.
+/// How many workers in a row may fail before they answer calls and still be replaced at once. Also the number of deaths
+/// within [`SPAN`] from which on they are reported as repeated.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
-/// The first pause. Each further one is twice as long.
+/// The first pause. Each following one is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
 /// The longest pause.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
@@ -18,10 +18,10 @@ pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 /// Exit status of a Rust program that panicked.
 const PANIC: i32 = 101;
 
-/// How a worker ended.
+/// The way a worker ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// It ended by itself, with this exit status.
+    /// The worker ended by itself, with this exit status.
     Code(i32),
     Signal(i32),
 }
@@ -47,9 +47,9 @@ impl fmt::Display for End {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// End with this status.
+    /// rosrescue ends with this status.
     Exit(i32),
-    /// Start another worker.
+    /// Another worker is started.
     Restart {
         pause: Duration,
         /// Whether more than five workers have died within a minute.
@@ -62,19 +62,18 @@ pub enum Next {
 pub struct Restarts {
     /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
     deaths: VecDeque<Instant>,
-    /// Number of workers that have failed since the last one that served.
+    /// Number of failed workers since the last one that answered calls.
     failures: usize,
-    /// Whether any worker has served.
+    /// Whether any worker has answered calls.
     served: bool,
     /// The signal that asked rosrescue to stop.
     stop: Option<i32>,
-    /// Whether the present worker was started only to end what a killed one left running.
+    /// Whether the present worker only has to end the processes that a killed one left running.
     cleaning: bool,
 }
 
 impl Restarts {
-    /// Notes a stop signal. After it no worker is restarted, except to end what a killed one left
-    /// running.
+    /// Notes a stop signal. From now on a worker is only started to end the processes that a killed one left running.
     pub fn stop(&mut self, signal: i32) {
         self.stop = Some(signal);
     }
@@ -84,7 +83,7 @@ impl Restarts {
         self.stop
     }
 
-    /// Whether a worker that was to stop died instead, and may have left its master running.
+    /// Whether a worker died while it was stopping. It may have left its master running.
     fn died_stopping(&self, end: End) -> bool {
         match end {
             End::Signal(signal) => self.stop.is_some_and(|stop| stop != signal),
@@ -92,13 +91,11 @@ impl Restarts {
         }
     }
 
-    /// Decides what follows the end of a worker at `now`. `served` tells whether it had answered
-    /// calls.
+    /// Decides what to do after a worker ended at `now`. `served` says whether it had answered calls.
     ///
-    /// Before any worker has served, an exit status is an error of the start, such as a missing
-    /// rosmaster. Later the same error may be temporary. A worker that has served is replaced at
-    /// once, because calls wait. Only workers that fail before they serve would keep the processor
-    /// busy for nothing.
+    /// Before any worker has answered calls, an exit status is an error of the start, such as a missing rosmaster.
+    /// Later the same error may be temporary. A worker that has answered calls is replaced at once, because calls wait.
+    /// Only workers that fail earlier could keep the processor busy without use, so they are delayed.
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
         self.failures = match served {
@@ -194,7 +191,7 @@ mod tests {
         assert_eq!(restarts.ended(End::Code(1), false, now), Next::Exit(1));
         assert_eq!(restarts.ended(KILLED, false, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(PANIC), false, now), AT_ONCE);
-        // No worker has served yet.
+        // No worker has answered calls yet.
         assert_eq!(restarts.ended(End::Code(2), false, now), Next::Exit(2));
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(1), false, now), AT_ONCE);

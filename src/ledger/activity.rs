@@ -14,14 +14,14 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// A dead master may not have sent the notifications of changes in this time before the outage,
-/// because unreachable nodes can hold up its three notifier threads.
+/// How long before an outage a change may be whose notifications the dead master has not sent. Unreachable nodes can
+/// hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
-/// Time it may take to tell a node to shut down, including all retries.
+/// Longest time to tell a node to shut down, with all retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// Most remembered topics, most remembered parameters of one node, and most changes in the outbox.
+/// Limit for three lists: topics, parameters of one node, and changes in the outbox.
 const NOTICES: usize = 4096;
-/// Most bytes of names in a lost registration that is remembered.
+/// Most bytes of names in a remembered registration.
 const LOST_MOST: usize = 1024;
 /// Most nodes that are remembered after they unregistered.
 const NODES: usize = 1024;
@@ -42,21 +42,21 @@ pub struct Owed {
     pub topics: Vec<String>,
     /// Parameters, each as the address of a subscriber and a key.
     pub params: Vec<(String, Arc<str>)>,
-    /// Nodes that must shut down.
+    /// Nodes that must shut down because another node has their name.
     pub displaced: Vec<Displaced>,
 }
 
 /// Notifications collected since the outbox was last taken.
 #[derive(Debug, Default)]
 pub struct Outbox {
-    /// Nodes that must shut down.
+    /// Nodes that must shut down because another node has their name.
     pub displaced: Vec<Displaced>,
-    /// Changes that the master also sends, but perhaps late.
+    /// Changes that a master also sends notifications for, perhaps late.
     pub changes: IndexSet<Change>,
 }
 
-/// Numbers of the last calls that changed a node's registrations. Each call has a higher number
-/// than the one before, so an equal number means no change.
+/// Numbers of the last calls that changed a node's registrations. Numbers only grow, so an equal number means no
+/// change.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LastCalls {
     /// Number of the last call that registered something.
@@ -65,17 +65,17 @@ pub struct LastCalls {
     pub unregistered: u64,
 }
 
-/// A topic that a node had registered and that was then unregistered.
+/// A topic registration that was removed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Lost {
     node: String,
     api: String,
-    /// Whether the node published the topic; otherwise it subscribed to it.
+    /// Whether the node published the topic. Otherwise it subscribed to it.
     publishes: bool,
     topic: String,
 }
 
-/// A process id seen behind a node's port.
+/// The process id that answered at a node's port.
 #[derive(Clone, Debug)]
 struct Pid {
     api: String,
@@ -86,8 +86,7 @@ struct Pid {
 #[derive(Clone, Copy, Debug)]
 struct Noted {
     at: Instant,
-    /// Whether rosrescue itself has notified the nodes, instead of a master that may have died
-    /// before it could.
+    /// Whether rosrescue has notified the nodes itself. Otherwise a master did, and may have died before it finished.
     told: bool,
 }
 
@@ -99,30 +98,29 @@ pub struct Activity {
     /// Changed parameters, by subscriber address and key.
     params: IndexMap<(String, Arc<str>), Noted>,
     last_calls: HashMap<String, LastCalls>,
-    /// Unregistered nodes are forgotten when `last_calls` grows longer than this.
+    /// Unregistered nodes are dropped when `last_calls` grows longer than this.
     prune_at: usize,
     pids: HashMap<String, Pid>,
-    /// Nodes that have not been asked for their process id since they registered, with the time of
-    /// the registration.
+    /// Nodes whose process id is not known since they registered, with the time of the registration.
     unidentified: IndexMap<String, Instant>,
     /// The latest topic registrations that any client has removed.
     lost: VecDeque<Lost>,
-    /// Nodes that a master had to shut down, and when.
+    /// Nodes that a master had to shut down, with the time.
     displaced: Vec<(Instant, Displaced)>,
-    /// All recently displaced nodes, with the time. The next start cannot know whether they were
-    /// told to shut down.
+    /// All nodes that were displaced recently, with the time. The next start cannot know whether they were told to shut
+    /// down.
     lately: Vec<(Instant, Displaced)>,
-    /// Displaced nodes from a checkpoint, which does not tell whether they were told to shut down.
+    /// Displaced nodes from a checkpoint. They may not have been told to shut down.
     restored: Vec<Displaced>,
-    /// Whether changes that a master sends are collected.
+    /// Whether changes are collected that a master notifies nodes of.
     notifying: bool,
     outbox: Outbox,
 }
 
-/// A notification that no master sends: receiver, subject, and call.
+/// A notification that rosrescue must send because there is no master: receiver, subject, and call.
 type Unsent = (String, Subject, Arc<Call>);
 
-/// The nodes to be notified of a call.
+/// The nodes that must be notified of a call.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
@@ -130,7 +128,7 @@ pub(super) struct Noticed {
     subscribers: usize,
     /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,
-    /// Whether the mirror stands in, so that no master sends the notifications.
+    /// Whether the mirror stands in, so that rosrescue sends the notifications.
     standing_in: bool,
     /// The notifications to send while the mirror stands in.
     calls: Vec<Unsent>,
@@ -138,7 +136,7 @@ pub(super) struct Noticed {
 }
 
 impl Noticed {
-    /// Creates an empty set. `standing_in`: no master sends notifications.
+    /// Creates an empty set. If `standing_in` is true, rosrescue sends the notifications itself.
     pub(super) fn new(standing_in: bool) -> Self {
         Self {
             standing_in,
@@ -156,7 +154,7 @@ impl Noticed {
         }
     }
 
-    /// Takes the notifications that no master sends; none if a master sends them.
+    /// Takes the notifications that rosrescue must send. `None` if a master sends them.
     pub(super) fn take_calls(&mut self) -> Option<Vec<Unsent>> {
         self.standing_in.then(|| std::mem::take(&mut self.calls))
     }
@@ -192,8 +190,8 @@ impl NoticeSink for Noticed {
 }
 
 impl Activity {
-    /// Notes an applied call and its notifications. `registered` tells whether the mirror knows a
-    /// node. Returns whether the outbox has something new.
+    /// Notes an applied call and its notifications. `registered` says whether the mirror knows a node. Returns whether
+    /// the outbox has grown.
     pub(super) fn applied(
         &mut self,
         now: Instant,
@@ -249,7 +247,7 @@ impl Activity {
         changed
     }
 
-    /// The present holders of the node names that `call` would take over.
+    /// The nodes that `call` displaces, because it registers their names at another address.
     pub(super) fn displaced_by(&self, mirror: &Master, call: &Request) -> Vec<Displaced> {
         let found = call.calls().into_iter().filter_map(|call| {
             let displaced = mirror.displaced_by(call)?;
@@ -291,8 +289,7 @@ impl Activity {
         }
     }
 
-    /// Whether `node` at `api` had registered this topic with the master and has unregistered it
-    /// since.
+    /// Whether `node` at `api` had registered this topic and then unregistered it.
     pub fn has_lost(&self, node: &str, api: &str, publishes: bool, topic: &str) -> bool {
         self.lost.iter().any(|lost| {
             lost.publishes == publishes
@@ -335,9 +332,8 @@ impl Activity {
         self.last_calls.get(node).copied().unwrap_or_default()
     }
 
-    /// Takes all changes of which rosrescue has not notified nodes: recent ones before `now`, which
-    /// a master that died then may not have sent, and all later ones. They count as sent
-    /// afterwards.
+    /// Takes all changes of which rosrescue has not notified nodes. These are the recent ones before `now`, which a
+    /// master that died then may not have sent, and all later ones. Afterwards they count as sent.
     pub fn take_owed(&mut self, now: Instant) -> Owed {
         fn take<K: Clone>(noted: &mut IndexMap<K, Noted>, now: Instant) -> Vec<K> {
             let untold = noted.iter_mut().filter(|(_, noted)| !noted.told);
@@ -358,8 +354,7 @@ impl Activity {
         }
     }
 
-    /// Marks recent changes as not sent, because a master that continues may send outdated
-    /// notifications.
+    /// Marks recent changes as not sent, because a master that continues may send outdated notifications.
     pub fn tell_again(&mut self) {
         let params = self.params.values_mut();
         for noted in self.topics.values_mut().chain(params) {
@@ -367,8 +362,7 @@ impl Activity {
         }
     }
 
-    /// Starts or stops collecting changes that a master sends. Returns whether this changed the
-    /// setting.
+    /// Starts or stops collecting changes that a master notifies nodes of. Returns whether that changed anything.
     pub fn set_notifying(&mut self, notifying: bool) -> bool {
         if !notifying {
             self.outbox.changes.clear();
@@ -380,7 +374,7 @@ impl Activity {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Stores the `displaced` nodes of the journal until [`Self::notice_all`].
+    /// Keeps the `displaced` nodes of the journal until [`Self::notice_all`].
     pub fn restore_displaced(&mut self, displaced: Vec<Displaced>) {
         self.restored = displaced;
     }
@@ -394,8 +388,8 @@ impl Activity {
         all.into_values().cloned().collect()
     }
 
-    /// Treats everything that nodes subscribe to as changed now, and the journal's displaced nodes
-    /// as displaced now. `mirror` must equal the master: a node that has taken its name back stays.
+    /// Treats all that nodes subscribe to as changed now, and the journal's displaced nodes as displaced now. `mirror`
+    /// must equal the master: a node that has taken its name back is not displaced.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,
@@ -413,7 +407,7 @@ impl Activity {
         self.displaced.extend(displaced);
     }
 
-    /// Collects again the changes that the master may not have sent by `now`.
+    /// Collects again the changes of which the master may not have notified nodes by `now`.
     pub fn repeat_changes(&mut self, now: Instant) {
         let recent = |noted: &Noted| is_recent(noted.at, now);
         let topics = self.topics.iter().filter(|(_, noted)| recent(noted));
@@ -423,8 +417,8 @@ impl Activity {
         self.outbox.changes.extend(topics.chain(params));
     }
 
-    /// Notes that process `pid` is behind `api`, where `node` is registered. `registered` is the
-    /// number of the node's last registration when it was asked.
+    /// Notes that process `pid` answers at `api`, where `node` is registered. `registered` is the number of the node's
+    /// last registration when it was asked.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
         if self.last_calls(node).registered == registered {
             self.unidentified.shift_remove(node);
@@ -438,20 +432,19 @@ impl Activity {
         }
     }
 
-    /// The process id last seen behind `api`, where `node` is registered, and whether the node has
-    /// registered since. A new process that takes an old port under the same name registers again.
+    /// The process id that last answered at `api`, where `node` is registered, and whether the node has registered
+    /// since. A new process that takes an old port under the same name registers again.
     pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
         let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
         Some((pid.pid, pid.registered != self.last_calls(node).registered))
     }
 
-    /// The earliest registration of a node that has not been asked for its process id since.
+    /// The earliest registration of a node whose process id is not known since.
     pub fn next_unidentified(&self) -> Option<Instant> {
         self.unidentified.values().min().copied()
     }
 
-    /// Takes the nodes whose last registration was at `before` or earlier and that have not been
-    /// asked for their process id since.
+    /// Takes the nodes that registered at `before` or earlier and whose process id is not known since.
     pub fn take_unidentified(&mut self, before: Instant) -> Vec<String> {
         let ripe = |_: &String, at: &mut Instant| *at <= before;
         let mut taken = Vec::new();

@@ -1,4 +1,4 @@
-//! The mirror's answers: for the master, in parallel with it, and while it is away.
+//! The mirror's answers: predictions while there is a master, and answers in its place.
 
 use std::{sync::Arc, time::Instant};
 
@@ -11,35 +11,33 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Up to this many pending writes, unregistrations without effect on the mirror are also kept as
-/// pending.
+/// Up to this many pending writes, an unregistration that changes nothing in the mirror also becomes pending.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
-/// Most memory for the answers to the reads of one multicall, in bytes. A few short reads of a
-/// large state could otherwise need any amount; larger ones wait for the master.
+/// Most memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a large
+/// state could need any amount. Larger multicalls wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
-/// The same limit while there is a master, which then answers larger multicalls.
+/// The same limit while there is a master. It then answers larger multicalls.
 const EXACT_ANSWER_MOST: usize = 1 << 20;
 
 impl Ledger {
-    /// The master's predicted answer to a read; none for a multicall whose answer would be too
-    /// large.
+    /// The master's predicted answer to a read. `None` for a multicall with too large an answer.
     pub fn answer(&self, read: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let fits = mirror.fits(read, ANSWER_MOST);
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
-    /// The result of a read, if the present master would answer the same bytes. It includes every
-    /// acknowledged write.
+    /// The result of a read, if the present master would answer with the same bytes. It includes every acknowledged
+    /// write.
     pub fn exact_answer(&self, read: &Request) -> Option<Value> {
         let mut inner = self.lock();
         if inner.doubted || !inner.mirror.fits(read, EXACT_ANSWER_MOST) {
             return None;
         }
         if *read.method() == Method::GetParamNames {
-            // Working on the parameters alone walks the whole tree, but copying it costs nothing.
+            // Most reads concern parameters alone. Copying that tree is cheap, but walking it is not.
             let mut params = inner.mirror.with_params_only();
             drop(inner);
             return params.exact_answer(read);
@@ -47,10 +45,11 @@ impl Ledger {
         inner.mirror.exact_answer(read)
     }
 
-    /// Like [`Self::answer`], for a write that changes nothing; none if it changes something. Nodes
-    /// are notified as by a master. Also returns the mark of the last record, because the earlier
-    /// write that made this one redundant may be that recent. None as well if the master may notify
-    /// the caller of something newer before the answer arrives.
+    /// Like [`Self::answer`], for a write that changes nothing. Notifies nodes as a master would.
+    ///
+    /// Also returns the mark of the last record: it may belong to the earlier write that made this one redundant.
+    /// `None` if the write changes something, or if the master may notify the caller of newer changes before the answer
+    /// arrives.
     pub(crate) fn answer_if_unchanged(
         self: &Arc<Self>,
         now: Instant,
@@ -58,7 +57,7 @@ impl Ledger {
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
         let concern = Concern::of(Some(write));
         let mut inner = self.lock();
-        // An unregistration may concern a registration that is still on its way to the master.
+        // An unregistration may concern a registration that the master has not run yet.
         let idle = !inner.doubted
             && !inner.unconfirmed
             && !inner.is_elsewhere()
@@ -71,7 +70,7 @@ impl Ledger {
         }
         let number = inner.order.begin(now, heard);
         let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
-        // Refusals are left to the master, which has its own words for them.
+        // The master refuses calls with its own messages.
         let refused = match &reply {
             Reply::Value(value) => {
                 let code = value.as_array().and_then(<[Value]>::first);
@@ -91,19 +90,19 @@ impl Ledger {
         model.apply_telling(call, &mut ())
     }
 
-    /// Answers a call as an absent master would: applies it, records its changes as pending, and
-    /// notifies nodes. Also returns the mark of the last record: this call's, or if it changes
-    /// nothing, that of the call that made it redundant.
+    /// Answers a call as an absent master would: applies it, records its changes as pending, and notifies nodes. Also
+    /// returns the mark of the last record. That is this call's record, or if it changes nothing, the record that made
+    /// it redundant.
     ///
-    /// None during an injection, if another computer has the master, or if the call also reads too
-    /// much. The call then has to wait.
+    /// `None` during an injection, if another computer has the master, or if the call also reads too much. Then the
+    /// call has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
         Some((reply, mark))
     }
 
-    /// Like [`Self::stand_in`], for a client's call with this concern, whose answer is under way.
+    /// Like [`Self::stand_in`], for a client's call whose answer the order tracks as `concern`.
     pub(crate) fn stand_in_for(
         self: &Arc<Self>,
         now: Instant,
@@ -127,21 +126,20 @@ impl Ledger {
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
-        // Comes first, because the caller may be notified of what its own call changes.
+        // This comes first, because the call may notify its own caller.
         let heard = concern.heard();
         let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // The writes were applied, but the answer could not be encoded. A call that was refused
-            // is refused again.
+            // The writes were applied, but the answer cannot be encoded. A retry changes nothing and fails again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()
             }
             Reply::Value(_) => {
                 let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
-                // A master that is newer than the mirror may have what the mirror cannot delete.
+                // A master that is newer than the mirror may hold parameters that the mirror lacks.
                 let may_be_set =
                     |call: &Request| inner.unconfirmed && *call.method() == Method::DeleteParam;
                 let counts = accepted
@@ -151,10 +149,10 @@ impl Ledger {
             }
         };
         if !changes {
-            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue
-            // that died before the reply, or any state if the checkpoint is older than the master.
-            // Parameter subscriptions are not kept, because they cannot be read from the master and
-            // loggers repeat them all the time.
+            // Such a call still becomes pending, because the master may hold what the mirror lacks: a registration that
+            // it ran for a rosrescue that died before the reply, or any state if the checkpoint is older than the
+            // master. Parameter subscriptions are left out: they cannot be read from the master, and loggers repeat
+            // them all the time.
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             let unsure = |call: &Request| {
                 is_unregistration(call)
@@ -165,7 +163,7 @@ impl Ledger {
         if writes.is_empty() {
             return Some((reply, inner.mark(), number));
         }
-        // Invalidates an inspection under way, which could restore what this call removes.
+        // Outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| Entry::Call {
@@ -183,7 +181,7 @@ impl Ledger {
     }
 }
 
-/// Whether a call, other than a multicall, is an unregistration.
+/// Whether a call is an unregistration. Multicalls are not.
 fn is_unregistration(call: &Request) -> bool {
     *call.method() != Method::Multicall && call.kind() == Kind::Unregister
 }

@@ -1,7 +1,6 @@
-//! Maintains the checkpoint: syncs the journal, checks that the file at its path is unchanged, and
-//! writes new generations. After a disk failure, or after another process moved or changed the
-//! file, it starts recording again. It runs in parallel with traffic. A call waits for it only with
-//! `--sync always`, or if no journal holds the call's effect.
+//! Maintains the checkpoint: syncs the journal, checks that the file is unchanged, and writes new generations. It
+//! starts recording again after a disk failure, and after another process has moved or changed the file. It runs in
+//! parallel with traffic. A call waits for it only with `--sync always`, or if no journal has the call's effect.
 
 use std::{
     path::{Path, PathBuf},
@@ -25,14 +24,14 @@ use crate::{
 
 /// Longest time between two checks of the file, so that tampering is noticed well within a second.
 const LOOK: Duration = Duration::from_millis(500);
-/// Pause between attempts to record again after a failure.
+/// Pause between two attempts to record again after a failure.
 const AGAIN: Duration = Duration::from_secs(1);
-/// The journal is compacted after this time without a new record.
+/// Time without a new record after which the journal is compacted.
 const QUIET: Duration = Duration::from_secs(2);
-/// Shortest time between two compactions, because memory cards wear out.
+/// Shortest time between two compactions. Each wears out memory cards.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// Limits the log lines that the state is not recorded and that it is again.
+/// Limits the log lines that the state is not recorded, and that it is recorded again.
 static UNPROTECTED: Pair = Pair::new();
 
 pub(crate) struct Checkpointer {
@@ -49,10 +48,9 @@ pub(crate) struct Checkpointer {
 }
 
 impl Checkpointer {
-    /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be
-    /// answered before this, because no journal would hold it. Later the file is synced every
-    /// `sync_interval`, unless the ledger's policy differs. Waits for the disk for
-    /// [`DISK_PATIENCE`] at most.
+    /// Writes the first generation of the checkpoint of `ledger` at `path`. Before that, no write may be answered,
+    /// because no journal would have it. Later the file is synced every `sync_interval`, unless the ledger's policy
+    /// differs. Waits for the disk for [`DISK_PATIENCE`] at most.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,
@@ -60,7 +58,7 @@ impl Checkpointer {
         sync_interval: Duration,
     ) -> Self {
         let opened = ledger.seen_store().is_some();
-        // A failure to open was logged when the checkpoint was opened.
+        // If the checkpoint could not be opened, that was logged then.
         let said = ledger.unprotected().filter(|_| !opened);
         let mut checkpointer = Self {
             seq: 0,
@@ -129,8 +127,7 @@ impl Checkpointer {
             self.open_again().await;
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
-        // This precedes the repair below, so that a failure is logged even if it is repaired at
-        // once.
+        // Comes before the repair below, so that a failure is logged even if it is repaired at once.
         self.voice.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
@@ -138,8 +135,8 @@ impl Checkpointer {
         self.voice.say_protection();
     }
 
-    /// The result of `work`, however long the disk takes. Calls `silent` when the disk has been
-    /// silent for too long.
+    /// Waits for the result of `work`, however long the disk takes. Calls `silent` when the disk has been silent for
+    /// too long.
     async fn waited_for<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
         let mut work = std::pin::pin!(work);
         match timeout(DISK_PATIENCE, &mut work).await {
@@ -206,7 +203,7 @@ impl Checkpointer {
             .compacted_at
             .is_none_or(|at| now.duration_since(at) >= BETWEEN);
         let quiet = now.duration_since(self.recorded_at) >= QUIET;
-        // On a full disk, not every round may write a whole snapshot.
+        // A full disk must not cause a write of the whole snapshot in each round.
         let failed = self
             .failed_at
             .is_some_and(|at| now.duration_since(at) < AGAIN);
@@ -249,8 +246,8 @@ impl Checkpointer {
         }
     }
 
-    /// Tries to open a checkpoint that could not be opened at the start. Its state is not restored,
-    /// because the state in memory is newer. The file is kept, because its contents are unknown.
+    /// Tries again to open a checkpoint that could not be opened at the start. The file is kept, because its contents
+    /// are unknown. Its state is not used, because the state in memory is newer.
     async fn open_again(&self) {
         let path = self.path.clone();
         let opened = spawn_blocking(move || Store::open_over(&path)).await;
@@ -265,7 +262,7 @@ struct Voice {
     ledger: Arc<Ledger>,
     board: Arc<Board>,
     path: PathBuf,
-    /// The failure that was logged last.
+    /// The last failure that was logged.
     said: Mutex<Option<String>>,
 }
 
@@ -277,8 +274,8 @@ impl Voice {
         }
     }
 
-    /// Logs once that the state is no longer recorded and once that it is again. Also logs where a
-    /// file was kept that was found at the checkpoint's path.
+    /// Logs once that the state is no longer recorded, and once that it is again. Also logs under which name a foreign
+    /// file at the checkpoint's path was kept.
     fn say_protection(&self) {
         let path = self.path.display();
         if let Some(kept) = self.ledger.take_kept() {

@@ -1,5 +1,5 @@
-//! Answers on their way to nodes, and the work that waits for them: the [order](crate::order), kept
-//! with the mirror.
+//! Answers on their way to nodes, and the work that waits for them: the [order](crate::order), combined with the
+//! mirror.
 
 use std::{sync::Arc, time::Instant};
 
@@ -11,9 +11,9 @@ use crate::{
     order::{Next, Order, heard_by_read},
 };
 
-/// An answer on its way to its caller. It is dropped when it has been written or never will be.
+/// An answer on its way to its caller. It is dropped once it was written or cannot be written any more.
 pub(crate) struct Delivery {
-    /// None in simulations, which have their own time.
+    /// `None` in simulations, which have their own time.
     ledger: Option<Arc<Ledger>>,
     number: u64,
 }
@@ -25,8 +25,7 @@ impl std::fmt::Debug for Delivery {
 }
 
 impl Delivery {
-    /// The answer with this number in the [`Order`] of `ledger`. It must not be dropped under the
-    /// ledger's lock.
+    /// Tracks the answer with this number in the [`Order`] of `ledger`. It must not be dropped under the ledger's lock.
     pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
         let ledger = Some(ledger.clone());
         Self { ledger, number }
@@ -60,7 +59,7 @@ impl Drop for Delivery {
     }
 }
 
-/// The read has to wait, because what the master is doing now may concern its caller.
+/// The read has to wait: the master may be notifying its caller of a change right now.
 #[derive(Debug)]
 pub(crate) struct Held;
 
@@ -78,7 +77,7 @@ impl Ledger {
         result
     }
 
-    /// Changes when something may have ended that others [wait](Order) for.
+    /// Signals that answers or notifications that others [wait](Order) for may have ended.
     pub(crate) fn order_changed(&self) -> watch::Receiver<()> {
         self.order_changed.subscribe()
     }
@@ -89,7 +88,7 @@ impl Ledger {
         }
     }
 
-    /// Begins the answer to a read; none if nodes are not notified of what it shows.
+    /// Begins the answer to a read. `None` if nodes are not notified of what it shows.
     pub(crate) fn begin_read(
         self: &Arc<Self>,
         now: Instant,
@@ -106,7 +105,7 @@ impl Ledger {
         Ok(begun?.map(|number| Delivery::new(self, number)))
     }
 
-    /// Like [`Self::begin_read`], but without waiting for the master.
+    /// Like [`Self::begin_read`], but never has to wait for the master.
     pub(crate) fn begin_read_now(self: &Arc<Self>, read: &Request) -> Option<Delivery> {
         let begun = self.with_order(|order, mirror| {
             let heard = heard_by_read(read, mirror);
@@ -115,19 +114,18 @@ impl Ledger {
         Some(Delivery::new(self, begun?))
     }
 
-    /// Notes that the master has no unanswered calls left.
+    /// Notes that the master has answered all calls.
     pub(crate) fn settled_calls(&self) {
         let awaited = self.lock().order.settled();
         self.report(awaited);
     }
 
-    /// The next notification for the node at `port`, or how long to wait.
+    /// The next notification for the node at `port`, or how long to wait for it.
     pub(crate) fn next_notification(&self, port: &str) -> Next {
         self.with_order(|order, mirror| order.next(Instant::now(), port, mirror))
     }
 
-    /// Notes that the delivery of the notification with this number has ended, whether the node
-    /// took it or not.
+    /// Notes that the delivery of the notification with this number has ended, with or without success.
     pub(crate) fn notification_ended(&self, number: u64) {
         let awaited = self.lock().order.taken(number);
         self.report(awaited);

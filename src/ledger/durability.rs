@@ -1,4 +1,4 @@
-//! The ledger's interface to the checkpointer, and how calls wait for the disk.
+//! The part of the ledger that the checkpointer uses, and how calls wait for the disk.
 
 use std::{
     path::PathBuf,
@@ -24,9 +24,9 @@ use crate::checkpoint::{
 /// Identifies a record that an answer may have to wait for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Mark {
-    /// The record's number in this computer's journal; none without a journal.
+    /// The record's number in this computer's journal. `None` without a journal.
     pub(super) disk: Option<u64>,
-    /// The record's place among the writes that other computers receive.
+    /// The record's place among the writes that the other computers receive.
     pub(super) shared: Option<Agreed>,
 }
 
@@ -43,11 +43,11 @@ impl Mark {
 /// Progress of whole checkpoints, in versions of the mirror.
 #[derive(Debug, Default)]
 pub(super) struct Whole {
-    /// The version after the last change that no journal holds.
+    /// The version after the last change that has no record.
     pub(super) unrecorded: u64,
-    /// The version in the last checkpoint that was taken.
+    /// The version of the last checkpoint that was taken.
     taken: u64,
-    /// The version in the last checkpoint that was written.
+    /// The version of the last checkpoint that was written.
     written: u64,
     /// Why the last checkpoint could not be written.
     failure: Option<String>,
@@ -65,8 +65,8 @@ impl Ledger {
         self.lock().mark()
     }
 
-    /// What must be safe before a call whose last record is at `mark` may be answered; none if
-    /// nothing must.
+    /// What must be safe before a call whose last record is at `mark` may be answered. `None` if it can be answered at
+    /// once.
     pub fn to_await(&self, mark: Mark) -> Option<Mark> {
         let mark = Mark {
             disk: mark.disk.filter(|seq| *self.durable.borrow() < *seq),
@@ -75,10 +75,9 @@ impl Ledger {
         (mark != Mark::default()).then_some(mark)
     }
 
-    /// Returns when the records up to `mark` are safe: written to the file, with `--sync always`
-    /// also synced, and replicated to the other computers. A disk that fails or is silent for
-    /// [`DISK_PATIENCE`] is not waited for. False if another computer leads by now and may not have
-    /// the records.
+    /// Waits until the records up to `mark` are safe: written to the file, with `--sync always` also synced, and
+    /// replicated to the other computers. Does not wait for a disk that fails or is silent for [`DISK_PATIENCE`]. False
+    /// if another computer leads by now and may not have the records.
     pub async fn durable(&self, mark: Mark) -> bool {
         if let Some(seq) = mark.disk {
             self.write();
@@ -95,14 +94,14 @@ impl Ledger {
         }
     }
 
-    /// Writes the pending records. Other tasks continue meanwhile, however long the disk takes.
+    /// Writes the queued records. Other tasks continue meanwhile, however long the disk takes.
     fn write(&self) {
         if let Some(worker) = self.worker() {
             block_in_place(|| worker.work());
         }
     }
 
-    /// Has another thread write the records.
+    /// Writes the records in another thread.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
             spawn_blocking(move || worker.work());
@@ -113,8 +112,8 @@ impl Ledger {
         self.lock().journal.as_ref().map(Journal::worker)
     }
 
-    /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded before the
-    /// next whole checkpoint.
+    /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded until the next complete
+    /// checkpoint.
     pub(super) fn give_up_disk(&self) {
         if let Some(journal) = &mut self.lock().journal {
             journal.give_up();
@@ -122,14 +121,14 @@ impl Ledger {
         self.disk_silent.notify_one();
     }
 
-    /// Sets whether a sync is late.
+    /// Notes whether the disk is late with a sync.
     pub(super) fn set_sync_is_late(&self, late: bool) {
         self.sync_is_late.store(late, Ordering::Relaxed);
         self.disk_silent.notify_one();
     }
 
-    /// The version to wait for with [`Self::attempted`] until the file holds the present state of
-    /// the mirror. None if it already does, or if the file cannot be written.
+    /// The version to wait for with [`Self::attempted`] until the file holds the mirror's present state. `None` if it
+    /// already does, or if the file cannot be written.
     pub fn unwritten(&self) -> Option<u64> {
         let inner = self.lock();
         let journal = inner.journal.as_ref();
@@ -138,8 +137,8 @@ impl Ledger {
         (works && whole.failure.is_none() && whole.is_due()).then_some(whole.unrecorded)
     }
 
-    /// Returns when a whole checkpoint of this or a later version of the mirror has been written,
-    /// or has failed. A disk that is silent for [`DISK_PATIENCE`] has failed.
+    /// Waits until a complete checkpoint of this or a later version has been written or has failed. A disk that is
+    /// silent for [`DISK_PATIENCE`] counts as failed.
     pub async fn attempted(&self, version: u64) {
         let mut attempted = self.attempted.subscribe();
         let attempt = attempted.wait_for(|reached| *reached >= version);
@@ -148,7 +147,7 @@ impl Ledger {
         }
     }
 
-    /// Notes the result of the whole checkpoint that was taken last.
+    /// Notes the result of the last complete checkpoint.
     pub fn set_attempted(&self, result: Result<(), &StoreError>) {
         let mut inner = self.lock();
         let whole = &mut inner.whole;
@@ -161,8 +160,7 @@ impl Ledger {
         raise(&self.attempted, taken);
     }
 
-    /// Runs `work` on the store, after everything recorded so far. None without a store. Waits for
-    /// the disk.
+    /// Runs `work` on the store after everything recorded so far. `None` without a store. Waits for the disk.
     pub async fn on_store<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -172,7 +170,7 @@ impl Ledger {
         result.await.ok()
     }
 
-    /// Like [`Self::on_store`], for `work` that writes a checkpoint of this moment.
+    /// Like [`Self::on_store`], for `work` that writes a checkpoint of the present state.
     pub async fn on_store_whole<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
@@ -187,12 +185,12 @@ impl Ledger {
         result.await.ok()
     }
 
-    /// State of the store after its last job; none without a store.
+    /// The store's state after its last job. `None` without a store.
     pub(crate) fn seen_store(&self) -> Option<Seen> {
         Some(self.lock().journal.as_ref()?.seen())
     }
 
-    /// Takes the name under which a file found at the checkpoint's path was kept.
+    /// Takes the name under which a foreign file at the checkpoint's path was kept.
     pub(super) fn take_kept(&self) -> Option<PathBuf> {
         self.lock().journal.as_ref()?.take_kept()
     }
@@ -208,12 +206,12 @@ impl Ledger {
         self.lock().checkpoint()
     }
 
-    /// Whether the mirror has changed without a journaled call since the last checkpoint.
+    /// Whether the mirror has changed without a record since the last checkpoint.
     pub fn checkpoint_due(&self) -> bool {
         self.lock().whole.is_due()
     }
 
-    /// Why the state is not recorded; none if it is.
+    /// Why the state is not recorded. `None` if it is.
     pub fn unprotected(&self) -> Option<String> {
         let inner = self.lock();
         let Some(journal) = &inner.journal else {

@@ -7,10 +7,10 @@ use crate::{checkpoint::store::history, limit::Limit};
 
 pub(crate) struct Rescues {
     ledger: Arc<Ledger>,
-    /// Most space for all kept states, in bytes; 0 keeps none.
+    /// Most disk space for all kept states, in bytes; 0 keeps none.
     bytes_most: u64,
-    /// The masters of a crash loop die every few seconds with the same state, and memory cards wear
-    /// out.
+    /// Limits how often a state is kept. In a crash loop masters die every few seconds with the same state, and memory
+    /// cards wear out.
     limit: Limit,
 }
 
@@ -23,14 +23,14 @@ impl Rescues {
         }
     }
 
-    /// Keeps the present state, to which a new master has just been brought, as that of rescue
-    /// `number`. It is written in parallel with traffic.
+    /// Keeps the present state, which a new master now holds, as that of rescue `number`. It is written in parallel
+    /// with traffic.
     pub(crate) fn keep(&self, number: u64, now: Instant) {
         let bytes_most = self.bytes_most;
         if bytes_most == 0 || self.limit.pass(now).is_none() {
             return;
         }
-        // A full or broken disk gets no unnecessary writes.
+        // Spares a full or broken disk unnecessary writes.
         let fits = |store: &Seen| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
         let Some(Seen { path, .. }) = self.ledger.seen_store().filter(fits) else {
             tracing::debug!(
@@ -38,7 +38,7 @@ impl Rescues {
             );
             return;
         };
-        // The checkpoint is taken now, because the health check is about to unregister dead nodes.
+        // The checkpoint is taken now: the health check will soon unregister dead nodes.
         let checkpoint = self.ledger.checkpoint();
         tokio::task::spawn_blocking(move || {
             let kept = history::keep_rescue(&path, number, checkpoint);

@@ -4,8 +4,7 @@ use super::{Basis, Ledger};
 use crate::{master::Master, replay::Token};
 
 impl Ledger {
-    /// Freezes the mirror until [`Self::end_injection`]. Returns what the injection is planned
-    /// from.
+    /// Freezes the mirror until [`Self::end_injection`]. Returns the state from which the injection is planned.
     pub fn begin_injection(&self) -> Basis {
         let mut inner = self.lock();
         inner.injecting = true;
@@ -33,8 +32,8 @@ impl Ledger {
         (inner.version, inner.mirror.clone(), token)
     }
 
-    /// Notes that the checkpoint is older than the master, which is incarnation `number`. The
-    /// checkpoint's pending writes have reached a master since.
+    /// Notes that the checkpoint is older than the master, which is incarnation `number`. So a master has run the
+    /// checkpoint's pending writes.
     pub fn catch_up(&self, number: u64) {
         let mut inner = self.lock();
         inner.pending.forget_restored();
@@ -42,20 +41,19 @@ impl Ledger {
         inner.session_unwritten = true;
     }
 
-    /// Starts the next incarnation, so that replies of the previous one no longer count. Returns
-    /// the new token.
+    /// Starts the next incarnation, so that replies of the previous one no longer count. Returns the new token.
     ///
-    /// The journal has the new number when the master has it. A rosrescue that is started in
-    /// between finds a master with a higher number, or one that lacks the pending writes.
+    /// The journal records the new number once the master has it. A rosrescue that starts in between finds a master
+    /// with a higher number, or a master without the pending writes.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.raise_incarnation();
-        // Injection brings either side to the other's state, so there is no doubt left.
+        // The injection makes both sides equal, so no doubt remains.
         (inner.doubted, inner.abandoned) = (false, false);
         inner.token()
     }
 
-    /// Notes that the present incarnation holds the mirror's state: no write is pending.
+    /// Notes that the present incarnation holds the mirror's state, so no write is pending.
     pub fn delivered(&self) {
         let mut inner = self.lock();
         if !inner.pending.calls().is_empty() {
@@ -69,8 +67,8 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// Serves the present incarnation from now on, so the mirror may change again. Returns the
-    /// incarnation's number.
+    /// Lets calls pass to the present incarnation and allows the mirror to change again. Returns the incarnation's
+    /// number.
     pub fn serve(&self) -> u64 {
         let mut inner = self.lock();
         inner.injecting = false;
@@ -80,7 +78,7 @@ impl Ledger {
         incarnation
     }
 
-    /// Whether the present incarnation has been served; none if none ever was.
+    /// Whether calls have passed to the present incarnation. `None` if calls have never passed.
     pub fn has_served_present(&self) -> Option<bool> {
         let inner = self.lock();
         inner.served.map(|of| of == inner.session.incarnation)
@@ -91,14 +89,14 @@ impl Ledger {
         self.lock().injecting = false;
     }
 
-    /// Notes that the connection to the present incarnation ended with a batch in flight, which the
-    /// master may still run.
+    /// Notes that the connection to the present incarnation ended before the answer to a batch. The master may still
+    /// run it.
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
     }
 
-    /// Notes that the present incarnation cannot be running an earlier call any more.
+    /// Notes that the present incarnation no longer runs an earlier call.
     pub fn settled(&self) {
         self.lock().abandoned = false;
     }

@@ -1,6 +1,5 @@
-//! Runs the jobs on the checkpoint's files in the order in which they were given. One thread at a
-//! time runs them, and never under the ledger's lock, so a disk that hangs stops neither calls nor
-//! the mirror.
+//! Runs the jobs on the checkpoint's files in the order in which they were queued. One thread at a time runs them,
+//! never under the ledger's lock, so a disk that hangs delays neither calls nor the mirror.
 
 use std::{
     collections::VecDeque,
@@ -19,25 +18,25 @@ use crate::{
     cli::SyncPolicy,
 };
 
-/// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and
-/// a few can queue up. Calls that are not answered stop a robot.
+/// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and several can queue
+/// up. A robot stops if calls are not answered.
 pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Why nothing is recorded after such a silence.
+/// Why nothing is recorded after [`DISK_PATIENCE`].
 pub(crate) const SILENT: &str = "the disk has not answered for 5 s";
 
-/// Most jobs that wait for a disk: about one for each client that waits for an answer.
+/// Most jobs that wait for the disk: about one for each client that waits for an answer.
 const JOBS_MAX: usize = 2048;
 
 type Job = Box<dyn FnOnce(&mut Store) + Send>;
 
-/// The store as the ledger sees it. No method waits for a disk.
+/// The ledger's access to the store. No method waits for the disk.
 pub(super) struct Journal {
     shared: Arc<Shared>,
-    /// Number of the last record, whether it was recorded or not.
+    /// Number of the last entry, recorded or not.
     seq: u64,
-    /// Whether records are passed to the store. After a silence of the disk they are not, until the
-    /// next whole checkpoint.
+    /// Whether entries are passed to the store. After a silence of the disk they are not, until the next complete
+    /// checkpoint.
     gives: bool,
 }
 
@@ -46,33 +45,33 @@ pub(super) struct Shared {
     jobs: Mutex<VecDeque<Job>>,
     store: Mutex<Store>,
     seen: Mutex<Seen>,
-    /// The last record that an answer need not wait for.
+    /// The last record that answers need not wait for.
     durable: watch::Sender<u64>,
     sync: SyncPolicy,
 }
 
-/// State of the store after its last job.
+/// The store's state after its last job.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seen {
     pub path: PathBuf,
-    /// Number of the last record, whether it was recorded or not.
+    /// Number of the last entry, recorded or not.
     pub seq: u64,
     pub journal_bytes: u64,
     pub snapshot_bytes: u64,
-    /// Why nothing is recorded; none if records are written.
+    /// Why nothing is recorded. `None` if records are written.
     pub unprotected: Option<String>,
     /// Whether the journal has grown enough for a new generation.
     pub outgrown: bool,
-    /// Where a file found at the checkpoint's path was kept.
+    /// The name under which a foreign file at the checkpoint's path was kept.
     kept: Option<PathBuf>,
-    /// Number of times records were withheld from the store.
+    /// How many times records were withheld from the store.
     gaps: u64,
-    /// Number of these times that a whole checkpoint has followed.
+    /// How many of these gaps a complete checkpoint has closed.
     gaps_over: u64,
 }
 
 impl Shared {
-    /// Runs all jobs, unless another thread is doing so already. May take as long as the disk does.
+    /// Runs all jobs, unless another thread is doing so. Takes as long as the disk does.
     pub(super) fn work(&self) {
         loop {
             let mut store = match self.store.try_lock() {
@@ -84,7 +83,7 @@ impl Shared {
                 job(&mut store);
             }
             drop(store);
-            // A job that came before the lock was free is left to this thread.
+            // This thread also runs a job that was queued before it released the lock.
             if self.jobs().is_empty() {
                 return;
             }
@@ -118,7 +117,7 @@ impl Shared {
             seen.unprotected = unprotected.map(str::to_owned);
         }
         drop(seen);
-        // No answer waits for a disk that has failed.
+        // No answer waits for a failed disk.
         let waits = self.sync == SyncPolicy::Always && store.unprotected().is_none();
         self.reach(if waits {
             store.synced_seq()
@@ -133,8 +132,8 @@ impl Shared {
 }
 
 impl Journal {
-    /// The journal of `store`. `durable` is raised to the last record that an answer need not wait
-    /// for, given `sync`.
+    /// Creates the journal of `store`. It raises `durable` to the last record that answers need not wait for under
+    /// `sync`.
     pub(super) fn new(store: Store, durable: watch::Sender<u64>, sync: SyncPolicy) -> Self {
         let seq = store.seq();
         let seen = Seen {
@@ -157,27 +156,27 @@ impl Journal {
         }
     }
 
-    /// Runs the jobs.
+    /// The handle with which a thread runs the jobs.
     pub(super) fn worker(&self) -> Arc<Shared> {
         Arc::clone(&self.shared)
     }
 
-    /// Number of the last record, whether it was recorded or not.
+    /// Number of the last entry, recorded or not.
     pub(super) fn seq(&self) -> u64 {
         self.seq
     }
 
-    /// State of the store after its last job.
+    /// The store's state after its last job.
     pub(super) fn seen(&self) -> Seen {
         self.shared.seen().clone()
     }
 
-    /// Takes the name under which a file found at the path was kept.
+    /// Takes the name under which a foreign file at the checkpoint's path was kept.
     pub(super) fn take_kept(&self) -> Option<PathBuf> {
         self.shared.seen().kept.take()
     }
 
-    /// Records `entries`. The store keeps any failure.
+    /// Records `entries`. A failure is kept in the store.
     pub(super) fn append(&mut self, entries: Vec<Entry>) {
         self.seq += entries.len() as u64;
         if !self.gives {
@@ -193,7 +192,7 @@ impl Journal {
         }
     }
 
-    /// Runs `work` after all earlier jobs. None if too many jobs already wait for the disk.
+    /// Runs `work` after all earlier jobs. `None` if too many jobs already wait for the disk.
     pub(super) fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -213,8 +212,8 @@ impl Journal {
         })
     }
 
-    /// Like [`Self::run`], for `work` that writes the whole `checkpoint` of this moment. The store
-    /// receives records again from now on.
+    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on the store
+    /// receives records again.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
         checkpoint: Checkpoint,
@@ -225,7 +224,7 @@ impl Journal {
         let shared = Arc::clone(&self.shared);
         let given = self.run(move |store| {
             if shared.seen().gaps_over < gaps {
-                // Records are missing in its file.
+                // The file lacks records.
                 store.give_up(SILENT);
                 shared.seen().gaps_over = gaps;
             }
@@ -237,8 +236,8 @@ impl Journal {
         given
     }
 
-    /// Gives up on a silent disk: answers no longer wait for it, and it gets no records before the
-    /// next whole checkpoint.
+    /// Gives up on a silent disk: answers no longer wait for it, and the store gets no records until the next complete
+    /// checkpoint.
     pub(super) fn give_up(&mut self) {
         if std::mem::take(&mut self.gives) {
             let mut seen = self.shared.seen();

@@ -1,4 +1,4 @@
-//! What a late master has missed while the mirror answered in its place.
+//! The writes that a late master has missed because the mirror answered them.
 
 use std::time::Instant;
 
@@ -10,22 +10,22 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// What a late master will hold once it has answered.
+/// The state of a late master once it has answered its outstanding calls.
 pub(super) struct Behind {
     state: Master,
     /// Number of pending writes that it will have run by then.
     ran: usize,
-    /// Subjects that it may notify nodes of because of the late writes.
+    /// Subjects of the notifications that the outstanding writes may cause.
     tells: Vec<Subject>,
     answered: bool,
 }
 
-/// What a late master must be given.
+/// How to bring a late master up to date.
 #[derive(Debug)]
 pub(crate) enum CatchUp {
     /// It has missed nothing.
     Nothing,
-    /// It must run what it missed.
+    /// It must run the writes that it has missed.
     Run(Box<Missed>),
 }
 
@@ -35,15 +35,15 @@ pub(crate) struct Missed {
     /// The state that the master holds.
     pub(crate) behind: Master,
     pub(crate) writes: Vec<Request>,
-    /// The state that the master holds after it has run what it missed.
+    /// The state that the master holds after it has run the missed writes.
     pub(crate) mirror: Master,
     pub(crate) before: Token,
     pub(crate) token: Token,
 }
 
 impl Ledger {
-    /// Notes that the mirror has answered what the present incarnation is late with, and nothing
-    /// after it. `tells` are the subjects that the late writes may notify nodes of.
+    /// Notes that the mirror has answered the calls that the present incarnation is late with, and nothing after them.
+    /// `tells` are the subjects that these calls may notify nodes of.
     pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
         let mut inner = self.lock();
         inner.behind = Some(Behind {
@@ -54,8 +54,7 @@ impl Ledger {
         });
     }
 
-    /// Notes that the present incarnation has answered what it was late with. It may notify nodes
-    /// only now.
+    /// Notes that the present incarnation has answered its outstanding calls. It may notify nodes only now.
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
         let Inner {
@@ -80,13 +79,11 @@ impl Ledger {
         self.outbox_changed.notify_one();
     }
 
-    /// What to give the present incarnation, which was late and has answered. Freezes the mirror
-    /// until [`Self::end_injection`] or [`Self::serve`], and begins a new incarnation if anything
-    /// is given.
+    /// Decides what the present incarnation needs after it was late and has answered. Freezes the mirror until
+    /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation if the master gets any writes.
     ///
-    /// None if the master must be examined instead: it has not answered, or a node would have to
-    /// shut down, or a node would hear of the same subject twice and get the older news after the
-    /// newer.
+    /// `None` if the master must be examined instead. That is so if it has not answered, if a node would have to shut
+    /// down, or if a node would be notified twice of one subject and get the older value last.
     pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
         let mut inner = self.lock();
         let behind = inner.behind.take().filter(|behind| behind.answered)?;
@@ -115,8 +112,8 @@ impl Ledger {
     }
 }
 
-/// The subjects that the master notifies nodes of when it runs `writes`, each with its number of
-/// nodes. None if it notifies of a subject more than once.
+/// The subjects that the master notifies nodes of when it runs `writes`, each with its number of nodes. `None` if it
+/// would notify nodes of one subject more than once.
 fn once(behind: &Behind, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
     let mut heard = BySubject::default();
     for subject in &behind.tells {

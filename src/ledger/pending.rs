@@ -7,7 +7,7 @@ const COUNT_MAX: usize = 10_000;
 /// Most memory of the pending writes in bytes, approximately.
 const BYTES_MAX: usize = 16 << 20;
 
-/// There are too many pending writes to decide what in a master's state is newer than the mirror.
+/// There are too many pending writes to tell which parts of a master's state are newer than the mirror.
 #[derive(Debug)]
 pub(super) struct TooMany;
 
@@ -25,7 +25,7 @@ impl PendingWrites {
     ///
     /// # Errors
     ///
-    /// If there are too many: all are dropped.
+    /// If there are too many. Then all pending writes are dropped.
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,
@@ -50,11 +50,11 @@ impl PendingWrites {
     pub(super) fn forget_restored(&mut self) {
         let calls = self.calls.split_off(self.restored);
         self.clear();
-        // This cannot fail, as there are fewer than before.
+        // This cannot fail, because there are fewer writes than before.
         let _ = self.extend(calls);
     }
 
-    /// Whether this process has added `call`. Calls from a checkpoint may still be dropped.
+    /// Whether this process has added `call`. Calls from a checkpoint do not count.
     pub(super) fn contains(&self, call: &Request) -> bool {
         let added = self.calls.get(self.restored..).unwrap_or_default();
         added.contains(call)

@@ -1,5 +1,4 @@
-//! Replication: the writes that other computers receive from this one, and the ones that it
-//! follows.
+//! Replication: the writes that the other computers get from this one, and those that this one gets from the leader.
 
 use std::{collections::VecDeque, sync::Arc, time::Instant};
 
@@ -17,14 +16,14 @@ const RECENT_MOST: usize = 4096;
 /// Most bytes of these changes, approximately.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
-/// Whose writes the ledger holds.
+/// The role of this ledger among the robot's computers.
 #[derive(Debug)]
 pub(super) enum Shared {
-    /// There are no other computers.
+    /// This is the only computer.
     Nobody,
-    /// Another computer has the master: its records are followed, and nothing else is recorded.
+    /// Another computer has the master. Only its records are applied and recorded.
     Elsewhere,
-    /// This computer has the master, and the others receive its writes.
+    /// This computer has the master, and the other computers get its writes.
     Here {
         /// Number of the last write.
         last: Agreed,
@@ -33,29 +32,29 @@ pub(super) enum Shared {
     },
 }
 
-/// Where a recorded call comes from.
+/// The origin of a recorded call.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Source {
     /// A node of this computer, or rosrescue itself.
     #[default]
     Here,
-    /// Another computer, which makes the call again elsewhere if it gets no answer.
+    /// Another computer forwarded the call. It repeats the call elsewhere if it gets no answer.
     Forwarded,
-    /// A computer that was cut off and sends what it answered meanwhile, all under this name.
+    /// A computer that was cut off sent the writes that it had answered meanwhile, all under this name.
     Merge(Arc<str>),
 }
 
 /// Recent changes, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct Recent {
-    /// All changes after this record are in the list.
+    /// Number of the record after which all changes are in the list.
     after: u64,
     changes: VecDeque<(u64, Source, Vec<Subject>)>,
     bytes: usize,
 }
 
 impl Recent {
-    /// An empty list that will hold all changes after record `seq`.
+    /// Creates an empty list for all changes after record `seq`.
     fn from(seq: u64) -> Self {
         Self {
             after: seq,
@@ -75,8 +74,7 @@ impl Recent {
         }
     }
 
-    /// The changes after record `seq` that were not made by `merge`. None if they are no longer all
-    /// known.
+    /// The changes after record `seq`, without those that `merge` made. `None` if some of them were dropped.
     fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
         if seq < self.after {
             return None;
@@ -96,7 +94,7 @@ fn bytes_of(subjects: &[Subject]) -> usize {
     subjects.iter().map(Subject::size).sum()
 }
 
-/// A place in the journal of all computers: the count of this computer's terms, and the number of a
+/// A position in the journal that all computers share: how often this computer has begun a term, and the number of a
 /// record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
@@ -104,11 +102,11 @@ pub(crate) struct Agreed {
     seq: u64,
 }
 
-/// A change that the other computers must receive.
+/// A change that the other computers must get.
 #[derive(Clone, Debug)]
 pub(crate) enum Change {
     Call(Record, Source),
-    /// Record `seq` replaced the state as a whole.
+    /// Record `seq` replaced the whole state.
     State {
         seq: u64,
         state: Box<Master>,
@@ -116,7 +114,7 @@ pub(crate) enum Change {
 }
 
 impl Change {
-    /// Number of the change in the journal of all computers.
+    /// Number of the change in the shared journal.
     pub(crate) fn seq(&self) -> u64 {
         match self {
             Self::Call(record, _) => record.seq,
@@ -135,9 +133,9 @@ impl Shared {
 }
 
 impl Ledger {
-    /// Notes that another computer has the master, or may have it: from now on only what
-    /// [`Self::follow`] is given is recorded. Calls whose records the others lack are not
-    /// acknowledged. No node is notified, because the other computer does that.
+    /// Notes that another computer has the master, or may have it. From now on only the records given to
+    /// [`Self::follow`] are recorded. Calls whose records the other computers lack are not acknowledged. No node is
+    /// notified, because the other computer does that.
     pub fn leave(&self) {
         let mut inner = self.lock();
         inner.shared = Shared::Elsewhere;
@@ -151,9 +149,8 @@ impl Ledger {
         });
     }
 
-    /// Notes that this computer has the master: the others receive its records, numbered after
-    /// `seq`. `held` is the state that they hold; if this computer's differs, they receive it as a
-    /// whole.
+    /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is
+    /// the state that they hold; if this computer's state differs, they get it as a whole.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let times_led = self.agreed.borrow().times_led;
@@ -166,18 +163,17 @@ impl Ledger {
             inner.share_state();
         }
         drop(inner);
-        // The others have these records. A write that changes nothing waits only for the last of
-        // them.
+        // The other computers have these records. A write that changes nothing waits only for the last of them.
         self.agree(seq);
         self.shared.notify_one();
     }
 
-    /// Whether this computer's own calls are recorded, and not another computer's.
+    /// Whether this computer records its own calls, instead of another computer's.
     pub fn records_here(&self) -> bool {
         !self.lock().is_elsewhere()
     }
 
-    /// Takes the changes that the others have not been given yet.
+    /// Takes the changes that the other computers have not got yet.
     pub(crate) fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {
             Shared::Here { changes, .. } => std::mem::take(changes),
@@ -185,8 +181,8 @@ impl Ledger {
         }
     }
 
-    /// Takes the same changes as one change: the state that they have led to. None if this computer
-    /// does not have the master.
+    /// Takes the same changes as a single one: the state that they have led to. `None` if this computer does not have
+    /// the master.
     pub(crate) fn take_as_state(&self) -> Option<Change> {
         let mut inner = self.lock();
         let state = Box::new(inner.mirror.clone());
@@ -198,9 +194,9 @@ impl Ledger {
         Some(Change::State { seq, state })
     }
 
-    /// Tells what would become of `calls`, which a computer answered while it was cut off, if they
-    /// were made now. The computer sends them under the name `merge` and knows the others' changes
-    /// up to record `seq`. None if the changes after that are no longer known.
+    /// Judges `calls`, which a computer answered while it was cut off, as if they were made now. The computer sends
+    /// them under the name `merge`, and knows the other computers' changes up to record `seq`. `None` if some of the
+    /// changes after that were dropped.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
         let Shared::Here { recent, .. } = &inner.shared else {
@@ -212,12 +208,12 @@ impl Ledger {
         Some(verdicts.collect())
     }
 
-    /// The last record of this term that the others have, or need not have.
+    /// The last record of this term that the other computers have or do not need.
     pub fn last_agreed(&self) -> u64 {
         self.agreed.borrow().seq
     }
 
-    /// Notes that the others have the records up to `seq`, or need not have them.
+    /// Notes that the other computers have the records up to `seq`, or do not need them.
     pub fn agree(&self, seq: u64) {
         self.agreed.send_if_modified(|agreed| {
             let more = seq > agreed.seq;
@@ -226,13 +222,12 @@ impl Ledger {
         });
     }
 
-    /// Sets until when no other computer can lead; none if that does not matter. After that no call
-    /// is given to this computer's master and no node is notified, because another leader may have
-    /// acknowledged newer writes while this process stood still.
+    /// Sets until when no other computer can lead. `None` if there is no limit. After that time no call goes to this
+    /// computer's master and no node is notified: another leader may have acknowledged newer writes while this process
+    /// stood still.
     pub fn set_lease(&self, until: Option<Instant>) {
         self.lease.send_if_modified(|lease| {
-            // Extending a lease wakes nobody: readers see it anyway, and waiters need only a new
-            // lease.
+            // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease.
             let now = Instant::now();
             let held = lease.is_none_or(|until| now < until);
             *lease = until;
@@ -247,12 +242,12 @@ impl Ledger {
             .is_none_or(|until| Instant::now() < until)
     }
 
-    /// Notifies of each new lease.
+    /// Signals each new lease.
     pub(crate) fn lease_changed(&self) -> watch::Receiver<Option<Instant>> {
         self.lease.subscribe()
     }
 
-    /// Returns when the lease is valid.
+    /// Waits until the lease is valid.
     pub(crate) async fn await_lease(&self) {
         let mut changed = self.lease_changed();
         while !self.has_lease() {
@@ -261,8 +256,7 @@ impl Ledger {
         }
     }
 
-    /// Returns when the others have the record at `place`. False if this computer no longer has the
-    /// master.
+    /// Waits until the other computers have the record at `place`. False if this computer no longer has the master.
     pub(super) async fn agreed(&self, place: Agreed) -> bool {
         let mut agreed = self.agreed.subscribe();
         // This cannot fail: the ledger owns the sender.
@@ -322,8 +316,7 @@ impl Inner {
         matches!(self.shared, Shared::Elsewhere)
     }
 
-    /// Passes `entries` to the other computers. `sources` tells where each comes from; missing ones
-    /// come from here.
+    /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
     pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
         let Shared::Here {
             last,
@@ -342,7 +335,7 @@ impl Inner {
                 seq: last.seq + 1,
                 entry: Entry::call(call.clone()),
             };
-            // An entry that cannot be written is in no journal, as on a single computer.
+            // No journal has an entry that cannot be encoded, as on a single computer.
             if format::push_record(&mut Vec::new(), &record).is_ok() {
                 last.seq += 1;
                 recent.add(last.seq, source, &Request::from(call.clone()));
@@ -351,7 +344,7 @@ impl Inner {
         }
     }
 
-    /// Notes that the state has changed otherwise than by calls.
+    /// Notes that the state has changed without a call.
     pub(super) fn share_state(&mut self) {
         if let Shared::Here {
             last,
@@ -361,10 +354,10 @@ impl Inner {
         {
             last.seq += 1;
             let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
-            // The new state may have changed anything.
+            // The new state may differ in any part.
             *recent = Recent::from(seq);
             changes.push(Change::State { seq, state });
-            // The following calls have other numbers than the session record says.
+            // The following calls have other numbers than the session's record says.
             self.session_unwritten = true;
         }
     }
@@ -430,7 +423,7 @@ mod tests {
         changes.iter().map(Change::seq).collect()
     }
 
-    /// Whether a call with this mark is acknowledged; none if it still waits.
+    /// Whether a call with this mark was acknowledged. `None` if it still waits.
     async fn acknowledged(ledger: &Ledger, mark: Mark) -> Option<bool> {
         let Some(mark) = ledger.to_await(mark) else {
             return Some(true);
@@ -486,7 +479,7 @@ mod tests {
         assert_eq!(acknowledged(&ledger, marks[0]).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, None);
         ledger.agree(9);
-        // Late news does not undo anything.
+        // A late acknowledgement undoes nothing.
         ledger.agree(8);
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
     }
@@ -502,7 +495,7 @@ mod tests {
         assert_eq!(cluster_seq(), 8);
         ledger.update_session(|session| session.term = 3);
         assert_eq!(ledger.session().cluster_seq, 8);
-        // A state without a record is in the next checkpoint, and not in the file before it.
+        // A state without a record is in the next checkpoint, but not in the file before it.
         ledger.adopt(state_of([set(2)]));
         answer(&ledger, &set(3));
         assert_eq!(ledger.session().cluster_seq, 0);
@@ -530,7 +523,7 @@ mod tests {
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
-        // The same holds when this computer leads again and uses the numbers for other calls.
+        // The same holds when this computer leads again and uses the same numbers for other calls.
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));
@@ -582,7 +575,7 @@ mod tests {
         let forwarded = |change: &Change| matches!(change, Change::Call(_, Source::Forwarded));
         let forwarded = changes.iter().filter(|change| forwarded(change));
         assert_eq!(forwarded.map(Change::seq).collect::<Vec<_>>(), [9]);
-        // A new state may have changed anything.
+        // A new state may differ in any part.
         ledger.adopt(state_of([set(1)]));
         assert_eq!(judged(&ledger, 11, &["/x"]), None);
         assert_eq!(judged(&ledger, 12, &["/x"]), Some(vec![true]));

@@ -10,7 +10,7 @@ use crate::{
 /// Most bytes of a reply in a log line.
 const LOGGED_REPLY: usize = 300;
 
-/// Summarizes a reply for the log, without values of parameters.
+/// Summarizes a reply for the log, without parameter values.
 fn summary(method: &Method, reply: &Reply) -> String {
     let text = match reply {
         Reply::Value(Value::Array(answer)) if *method == Method::SubscribeParam => {
@@ -39,7 +39,7 @@ impl Inner {
                 method = method.name(),
                 mirror,
                 master,
-                "the mirror's reply differs from the master's, which counts; the mirror is rebuilt. Please report this line (it is logged once per method)"
+                "the mirror's reply differs from the master's; the caller gets the master's, and the mirror is rebuilt. Please report this line (it is logged once per method)"
             );
         }
     }

@@ -102,7 +102,7 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     let answer = |call: &Request| ledger.stand_in(now, call).unwrap().0;
     assert_eq!(answer(&set(1)), answered(&set(1), &mut Master::default()));
     answer(&set(2));
-    // A call that changes nothing needs no master, and a refused call never ran.
+    // A call that changes nothing needs no master, and a refused call has not run.
     answer(&set(2));
     answer(&call("deleteParam", &["/n", "/b"]));
     answer(&call("setParam", &["/n", "/"]));
@@ -168,8 +168,7 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert!(ledger.stand_in(now, &bye).is_some());
 }
 
-/// A call in flight when a master goes away may still run when it is back, even if it changes
-/// nothing now.
+/// A call in flight when the master goes away may still run when it is back, even if the call changes nothing now.
 #[test]
 fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
     let ledger = ledger();
@@ -194,7 +193,7 @@ fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
     assert!(ledger.resume());
 }
 
-/// The registration that it removes may be on its way to a master that takes its time.
+/// The registration that it removes may be on its way to a slow master.
 #[test]
 fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     let ledger = ledger();
@@ -210,8 +209,7 @@ fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     assert!(ledger.answer_if_unchanged(now, &bye).is_none());
 }
 
-/// Loggers repeat these calls all the time. They take no room, and do not outdate a prepared
-/// injection.
+/// Loggers repeat these calls all the time. They use no memory, and do not outdate a prepared injection.
 #[test]
 fn what_changes_nothing_leaves_no_trace() {
     let ledger = ledger();
@@ -220,7 +218,7 @@ fn what_changes_nothing_leaves_no_trace() {
     assert!(ledger.answer_if_unchanged(now, &watch).is_none());
     ledger.stand_in(now, &watch);
     let (version, pending_before) = (ledger.version(), pending(&ledger));
-    // There is no journal that it could have a place in.
+    // Without a journal there is no mark.
     let expected = Some((answered(&watch, &mut Master::default()), Mark::default()));
     let (reply, mark, _) = ledger.answer_if_unchanged(now, &watch).unwrap();
     assert_eq!(Some((reply, mark)), expected);
@@ -260,7 +258,7 @@ fn a_write_behind_a_subscription_is_no_divergence() {
     assert!(!recorded.doubtful);
 }
 
-/// Also calls that are unknown to the mirror, because a master that comes back may know them.
+/// The same holds for calls that remove nothing from the mirror: a master that comes back may have it.
 #[test]
 fn what_takes_nothing_away_is_pending_within_limits() {
     let ledger = ledger();
@@ -299,7 +297,7 @@ fn who_the_master_is_outlasts_a_resync() {
     assert_eq!(ledger.answer(&get_pid), before);
 }
 
-/// A short call could ask for answers that need all the memory of a computer.
+/// A short call could ask for answers that need all of a computer's memory.
 #[test]
 fn reads_are_answered_together_within_limits() {
     let ledger = ledger();
@@ -349,7 +347,7 @@ fn a_look_counts_if_nothing_came_between() {
     assert!(!ledger.with_mirror(Master::is_empty));
 }
 
-/// A write that no journal holds is waited for only while there is a file to write it to.
+/// A write without a record waits only while there is a file to write to.
 #[tokio::test]
 async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     let ledger = ledger();
@@ -359,7 +357,7 @@ async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     held.apply(&publish);
     ledger.follow_state(held.clone()).unwrap();
     ledger.lead(7, &held);
-    // A node sends the write again: the previous leader recorded it and died before the answer.
+    // A node repeats a write after the previous leader had recorded it and died before the answer.
     let (_, mark) = ledger.stand_in(Instant::now(), &publish).unwrap();
     let safe = ledger.durable(ledger.to_await(mark).unwrap());
     let safe = tokio::time::timeout(std::time::Duration::from_secs(5), safe).await;
@@ -426,7 +424,7 @@ fn topics_are_remembered_while_a_dead_master_may_owe_notifications() {
     assert_eq!(owed(start + NOTICE_MEMORY / 2), ["/t"]);
 }
 
-/// A compaction comes between the record and the deaths of master and rosrescue.
+/// A compaction runs between the record and the deaths of master and rosrescue.
 #[test]
 fn who_was_displaced_lately_is_in_the_snapshot() {
     let ledger = ledger();
@@ -443,7 +441,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     let rebuilt = crate::checkpoint::session::rebuild(Some(read), Vec::new());
     let apis: Vec<_> = rebuilt.displaced.iter().map(|it| &*it.api).collect();
     assert_eq!(apis, ["http://n:1/"]);
-    // They are also in the snapshot of the next start, until the master is examined.
+    // They are also in the next start's snapshot, until the master is examined.
     let next = self::ledger();
     next.with_activity(|_, activity| activity.restore_displaced(rebuilt.displaced));
     assert_eq!(next.checkpoint().displaced, checkpoint.displaced);

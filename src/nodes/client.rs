@@ -21,7 +21,7 @@ use crate::{
 /// Largest accepted reply of a node, in bytes.
 const MAX_REPLY: usize = 16 << 20;
 
-/// Makes `call` to the node at `api` and waits for a sign of life for at most `limit`.
+/// Makes `call` to the node at `api`, and waits at most `limit` for a sign of life.
 pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
     ask_for(api, call, limit).await.0
 }
@@ -43,14 +43,14 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, O
         .unwrap_or((Sign::Silent, None))
 }
 
-/// The host of `api`, resolved to its first address; none if it has no address within `limit`.
+/// The host of `api`, resolved to its first address. `None` if it has no address within `limit`.
 pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;
     found.ok()?.ok()?.first().map(SocketAddr::ip)
 }
 
-/// What a node reports about itself.
+/// A node's answers about itself.
 #[derive(Debug)]
 pub(crate) struct Interview {
     pub sign: Sign,
@@ -60,7 +60,7 @@ pub(crate) struct Interview {
 }
 
 impl Interview {
-    /// The result for a node that did not answer.
+    /// The result for a node that does not answer.
     pub(super) const SILENT: Self = Self {
         sign: Sign::Silent,
         pid: None,
@@ -103,7 +103,7 @@ async fn connect(address: &MasterUri) -> Result<Connection, Sign> {
                 return connection.await.map_err(|_| Sign::Silent);
             }
             Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,
-            // An address cannot be reached, so the node may live there.
+            // The node may live, but this computer cannot reach its address.
             Err(_) => return Err(Sign::Silent),
         }
     }

@@ -1,8 +1,8 @@
-//! The health check: which nodes are alive, whether they are the ones that registered, and where
-//! the mirror differs from what they report.
+//! The health check: finds out which nodes are alive, whether they are the nodes that registered, and where the mirror
+//! differs from what they report.
 //!
-//! It must not delay any call: a roscpp node that waits for its registration cannot answer
-//! rosrescue before that call is done.
+//! It must not delay any call: a roscpp node that waits for its registration cannot answer rosrescue before that call
+//! is done.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -33,7 +33,7 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Pause before a node is asked again to confirm what is to be removed.
+/// Pause before a node is asked again to confirm a removal.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
 /// Most questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
@@ -47,8 +47,8 @@ pub(crate) struct CheckResult {
     pub(crate) reconciled: Vec<String>,
 }
 
-/// Follows a recovery from `outage`, in parallel with traffic: sends the missed notifications and
-/// asks all nodes. None if the next recovery begins meanwhile.
+/// Completes a recovery from `outage`, in parallel with traffic: sends the missed notifications and asks all nodes.
+/// `None` if the next recovery begins before it is done.
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
@@ -90,7 +90,7 @@ pub(crate) async fn after_recovery(
     })
 }
 
-/// Returns when the writes that are queued now have been answered.
+/// Waits until the writes that are queued now have been answered.
 async fn barrier(nodes: &Nodes) {
     let last = Request::new(Method::GetPid, [CALLER_ID]);
     // The answer does not matter.
@@ -193,7 +193,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
             Sign::Alive => {
                 refused = None;
                 if nodes.clear(port) {
-                    // These notifications were held back meanwhile.
+                    // Notifications to this node were held back until now.
                     notifications::notify_of_all(nodes, port);
                 }
             }
@@ -233,7 +233,7 @@ impl Drop for Waiting {
     }
 }
 
-/// The names at an address before the question, and when each last unregistered something.
+/// The names at an address when the question was asked, each with its last calls.
 #[derive(Default)]
 struct Asked {
     api: String,
@@ -241,7 +241,7 @@ struct Asked {
     unregistered: Vec<u64>,
 }
 
-/// What an answer implies for the names at the address.
+/// What an answer means for the names at the address.
 #[derive(Default)]
 struct Findings {
     others: Vec<Name>,
@@ -306,7 +306,7 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // If two names could be meant, neither is reconciled.
+                // The answer fits several names, so no name is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
@@ -331,8 +331,8 @@ impl Asked {
     }
 }
 
-/// Whether the node at `api` names this rosrescue as its master. If it does not, its answers may be
-/// meant for another master. roscpp cannot tell.
+/// Whether the node at `api` names this rosrescue as its master. A node with another master may have meant its answers
+/// for that one. roscpp does not tell its master.
 async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     let limit = nodes.timeout;
     let Some(_admitted) = nodes.visits.admit(port_of(api), limit).await else {
@@ -351,7 +351,7 @@ async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     named.names(&own, &named_at, node_is_here, resolver::is_own)
 }
 
-/// The addresses of a host; none if it has none within `limit`.
+/// The addresses of a host. `None` if it has no address within `limit`.
 async fn addresses(at: &MasterUri, limit: Duration) -> Vec<IpAddr> {
     let found = tokio::time::timeout(limit, resolver::addresses(&at.host, at.port)).await;
     let found = found.ok().and_then(Result::ok).unwrap_or_default();
@@ -376,9 +376,9 @@ impl Findings {
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
-    /// Applies the findings that are certain. A removal must also have been found by the previous
-    /// question. Removals come first, because a registration that rosrescue makes for a node counts
-    /// as the node's own and voids its other findings.
+    /// Carries out the findings that are certain. The previous question must have found a removal as well. Removals
+    /// come first: a registration that rosrescue makes for a node counts as the node's own, and voids the other
+    /// findings about it.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.others {
             let mut earlier = before.others.iter();
@@ -416,7 +416,7 @@ impl Findings {
     }
 }
 
-/// Makes a call for a node, unless the node itself does the opposite before the call is sent.
+/// Makes a call for a node, unless the node itself makes the opposite call first.
 async fn reconcile(
     nodes: &Nodes,
     one: &Registration,
@@ -437,14 +437,13 @@ async fn reconcile(
     }
 }
 
-/// Whether the only entry of a multicall succeeded. A node may report a type that the master
-/// refuses.
+/// Whether the only entry of a multicall succeeded. The master may refuse the type that a node reports.
 fn is_done(reply: &Reply) -> bool {
     let replies = batch::unpack(reply, 1).unwrap_or_default();
     replies.iter().any(master::is_success)
 }
 
-/// Unregisters all nodes of `asked`, because their port refuses. Returns the unregistered names.
+/// Unregisters all nodes of `asked`, because their port refuses connections. Returns the unregistered names.
 async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     let mut removals = JoinSet::new();
     for asked in asked {
@@ -459,10 +458,10 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     removals.join_all().await.into_iter().flatten().collect()
 }
 
-/// Unregisters a node as the node itself would do, unless it has come back since it was asked: its
-/// address is different, or its last calls are not the `same`.
+/// Unregisters a node as the node itself would. Does nothing if the node has come back since it was asked: its address
+/// has changed, or `same` rejects its last calls.
 async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
-    // The node's queued calls come first.
+    // The node's queued calls run before this.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(node);

@@ -13,7 +13,7 @@ use crate::{health::port_of, master};
 /// Delay between a node's last registration and the question, because starting nodes are busy.
 pub(super) const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
 
-/// The names that wait for an answer, by port. One question serves all names at a port.
+/// Names without a known process id, by port. One question serves all names at a port.
 #[derive(Debug, Default)]
 pub(super) struct New(Mutex<BTreeMap<String, Vec<Name>>>);
 
@@ -30,7 +30,7 @@ impl New {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether any names wait at `port`. If not, the next one needs a new task.
+    /// Whether names still wait at `port`. If none do, the next name needs a new task.
     fn go_on(&self, port: &str) -> bool {
         let mut new = self.lock();
         let waiting = new.get(port).is_some_and(|names| !names.is_empty());
@@ -41,7 +41,7 @@ impl New {
     }
 }
 
-/// Asks the nodes that are due.
+/// Asks the nodes whose turn it is.
 pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
     let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
         return;
@@ -73,7 +73,7 @@ pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
 async fn identify(nodes: Arc<Nodes>, port: String) {
     while nodes.new.go_on(&port) {
         let admitted = nodes.visits.admit(&port, nodes.timeout).await;
-        // This includes the names that have come meanwhile.
+        // This includes names that were added meanwhile.
         let names = nodes.new.lock().get_mut(&port).map(std::mem::take);
         // The health check asks unreachable nodes again.
         let answer = match admitted.is_some() && !nodes.is_unreachable(&port) {

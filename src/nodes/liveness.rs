@@ -1,6 +1,5 @@
-//! Finds out which nodes are alive, for reports only. A node on this computer is alive as long as a
-//! process listens at its port, according to the kernel's socket table. Other nodes are asked every
-//! 30 s.
+//! Finds out which nodes are alive, for reports only. A node on this computer is alive while a process listens at its
+//! port, which the kernel's socket table shows. Other nodes are asked every 30 s.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet},
@@ -29,7 +28,7 @@ use crate::{
     upstream::sockets,
 };
 
-/// Pause between two looks at the socket table.
+/// Pause between two reads of the socket table.
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
 /// Number of nodes asked at the same time.
 const AT_ONCE: usize = 8;
@@ -48,11 +47,11 @@ struct Known {
     here: BTreeMap<String, Vec<SocketAddr>>,
 }
 
-/// What is known about the life of a registered node.
+/// Whether a registered node is alive, as far as known.
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub(crate) health: Health,
-    /// When there was evidence last; none if there never was.
+    /// When there was evidence last. `None` if there never was.
     pub(crate) checked: Option<Instant>,
 }
 
@@ -72,10 +71,10 @@ impl Liveness {
 }
 
 impl Nodes {
-    /// What is known about the life of each registered node, by name.
+    /// Whether each registered node is alive, by name.
     pub(crate) fn lives(&self) -> BTreeMap<String, Life> {
         let now = Instant::now();
-        // Never hold two locks here.
+        // The two locks must never be held together.
         let unreachable = self.lock().clone();
         let nodes: Vec<_> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
@@ -106,7 +105,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
             nodes.map(|(_, api)| port_of(api).to_owned()).collect()
         });
-        // A blocking read of some kilobytes that the kernel generates in less than a millisecond.
+        // This blocks for less than a millisecond: the kernel generates some kilobytes.
         let listening = match registered.is_empty() {
             true => HashSet::new(),
             false => sockets::listening(),
@@ -155,8 +154,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
         }
         known.liveness.answered(&port, sign, Instant::now())
     };
-    // While the mirror stands in, nothing is logged, because the following health check reports
-    // dead nodes.
+    // Nothing is logged while the mirror stands in: the health check afterwards reports dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
         let names: Vec<_> = nodes.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
@@ -170,7 +168,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
     }
 }
 
-/// The addresses of `api` that belong to this computer. None if it has no address within `limit`.
+/// The addresses of `api` that belong to this computer. `None` if it has no address within `limit`.
 async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;

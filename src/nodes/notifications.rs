@@ -1,7 +1,7 @@
-//! Sends notifications that the master would send, has not sent, or will send late.
+//! Sends notifications in place of the master, or repeats those that the master has not sent or will send late.
 //!
-//! Each port gets its notifications in [order](crate::order), one at a time. A node that does not
-//! answer delays no other node.
+//! Each port gets its notifications in [order](crate::order), one at a time. A node that does not answer delays no
+//! other node.
 
 use std::{
     pin::pin,
@@ -23,21 +23,19 @@ use crate::{
     wait,
 };
 
-/// Nodes notified at the same time. Each takes a file descriptor.
+/// Number of nodes that are notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
-/// A node that takes longer than this lets the next node begin. Living nodes answer within
-/// milliseconds.
+/// Time after which a slow node no longer delays the next one. Living nodes answer within milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
-/// How long to wait for the answer to a `paramUpdate` from a node that never answers it but answers
-/// other calls, like rosnodejs. The notification only has to be read.
+/// How long to wait for the answer of a node that never answers `paramUpdate` but answers other calls, like rosnodejs.
+/// The node only has to read the notification.
 const MUTE: Duration = Duration::from_millis(500);
-/// Most slow nodes that are waited for in addition: there may be many on a computer whose packets
-/// vanish.
+/// Most slow nodes whose answers are awaited in addition. There may be many on a computer that has vanished.
 const SLOW: usize = 128;
-/// Pauses in seconds before each request to shut down, for a node that does not answer.
+/// Pauses in seconds before each attempt to shut down a node that does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 
-/// The notifications that are under way.
+/// The notifications in progress.
 #[derive(Debug)]
 pub(crate) struct Notifications {
     permits: Semaphore,
@@ -71,7 +69,7 @@ pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
             for topic in mirror.subscriptions(name) {
                 order.tell_state(port, Subject::Topic(topic.to_owned()));
             }
-            // There is nothing to send for a parameter that is not set and may never have been.
+            // A parameter that is not set, and perhaps never was, needs no notification.
             for key in mirror
                 .param_subscriptions(name)
                 .filter(|key| mirror.is_set(key))
@@ -91,8 +89,7 @@ pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     send_waiting(nodes);
 }
 
-/// Sends the notifications that wait for nodes. A node that is unreachable gets everything once it
-/// answers.
+/// Sends all waiting notifications. An unreachable node gets everything once it answers.
 pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     let ports = nodes.ledger.with_order(|order, _| order.take_idle_ports());
     for port in ports {
@@ -103,9 +100,8 @@ pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     }
 }
 
-/// Sends a node its notifications in order, one at a time. A node that does not take a notification
-/// becomes unreachable. A node that only does not answer `paramUpdate` still gets the next
-/// notification.
+/// Sends a node its notifications in order, one at a time. A node that does not take a notification becomes
+/// unreachable. A node that answers other calls but not `paramUpdate` still gets the next notification.
 async fn deliver(nodes: Arc<Nodes>, port: String) {
     let notifications = &nodes.notifications;
     let mut changed = nodes.ledger.order_changed();
@@ -166,8 +162,8 @@ async fn answers(nodes: &Nodes, port: &str) -> bool {
     client::ask(port, &master::get_pid(), nodes.timeout).await == Sign::Alive
 }
 
-/// Asks a node to shut down because another one has taken its name, as a master does. A different
-/// node that has taken over the address is never shut down.
+/// Asks a node to shut down because another one has taken its name, as a master does. If a different node listens at
+/// the address by now, that one is never shut down.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
     tokio::spawn(async move {
@@ -214,7 +210,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     });
 }
 
-/// Returns when no answer to the node at `port` about `subject` is under way.
+/// Waits until no answer to the node at `port` about `subject` is on its way.
 async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
     let mut changed = nodes.ledger.order_changed();
     loop {
@@ -239,7 +235,7 @@ fn is_taken(nodes: &Nodes, api: &str) -> bool {
         .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
 }
 
-/// Whether the node at the address is the displaced one. Without evidence it is not.
+/// Whether the node that answers is the displaced one. Without evidence the result is false.
 fn is_itself(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
     match (displaced.pid, pid) {
         (Some(known), Some(pid)) => known == pid,

@@ -1,4 +1,4 @@
-//! The hosts whose nodes use this rosrescue as their master, in a robot with several computers.
+//! Remembers the hosts whose nodes use this rosrescue as their master, for a robot with several computers.
 
 use std::{
     collections::HashSet,
@@ -10,7 +10,7 @@ use crate::{health::port_of, master::Request, ros_env::MasterUri};
 /// Most hosts that are remembered. A robot has few.
 const MOST: usize = 1024;
 
-/// The hosts of nodes that have registered here, and not at another computer's rosrescue.
+/// The hosts of nodes that register here. A host is removed when its nodes register at another computer.
 #[derive(Clone, Debug, Default)]
 pub struct Served(Arc<Mutex<HashSet<String>>>);
 
@@ -19,7 +19,7 @@ impl Served {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes the host of a node that a client of this rosrescue registers with `call`.
+    /// Notes the host of the node that `call` registers.
     pub(crate) fn add(&self, call: &Request) {
         for call in call.calls() {
             let Some(host) = call.registrant().and_then(|(_, api)| host_of(api)) else {

@@ -1,5 +1,5 @@
-//! Limits the questions to nodes, because anybody can register any address: one at a time to each
-//! port, a bounded rate to each host, and a bounded number in all.
+//! Limits the questions to nodes, because any client can register any address: one at a time to each port, a bounded
+//! rate to each host, and a bounded number in all.
 
 use std::{
     collections::HashMap,
@@ -13,10 +13,10 @@ use tokio::sync::{Mutex as Turn, OwnedMutexGuard, Semaphore, SemaphorePermit};
 use super::client;
 use crate::health::Rates;
 
-/// Nodes asked at the same time. Each takes two file descriptors until its deadline at most.
+/// Number of nodes that are asked at the same time. Each takes two file descriptors, at most until its deadline.
 const AT_ONCE: usize = 64;
 
-/// The visits that wait or are under way.
+/// The visits that wait or are in progress.
 #[derive(Debug)]
 pub(super) struct Visits {
     turns: Mutex<HashMap<String, Weak<Turn<()>>>>,
@@ -42,8 +42,7 @@ impl Default for Visits {
 }
 
 impl Visits {
-    /// Waits until the node at `port` may be asked. None if its host has no address within `limit`,
-    /// so that it cannot be asked.
+    /// Waits until the node at `port` may be asked. `None` if its host has no address within `limit`.
     pub(super) async fn admit(&self, port: &str, limit: Duration) -> Option<Admitted<'_>> {
         let turn = self.turn(port).lock_owned().await;
         let host = client::host(port, limit).await?;
@@ -54,8 +53,7 @@ impl Visits {
         tokio::time::sleep_until(from.into()).await;
         Some(Admitted {
             _turn: turn,
-            // Comes last, so that a host that must wait blocks no other one. The semaphore is never
-            // closed.
+            // This comes last, so that a host that has to wait does not block others. The semaphore is never closed.
             _permit: self.permits.acquire().await.ok(),
         })
     }

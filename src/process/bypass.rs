@@ -1,5 +1,5 @@
-//! Finds clients that bypass rosrescue and talk directly to the master of `proxy`, from the
-//! kernel's table of TCP sockets. They are only reported.
+//! Finds clients that bypass rosrescue and talk directly to the master of `proxy`. It reads the kernel's table of TCP
+//! sockets, and only reports them.
 
 use std::{
     collections::{BTreeMap, HashMap, HashSet},
@@ -27,10 +27,10 @@ use crate::{
     },
 };
 
-/// Pause between two looks at the table.
+/// Pause between two reads of the table.
 const LOOK_AGAIN: Duration = Duration::from_secs(5);
-/// How long a computer or a user counts after its last connection. XML-RPC clients connect again
-/// for each call, or after a while.
+/// How long a client is reported after its last connection. XML-RPC clients connect again for each call, or from time
+/// to time.
 const REMEMBERED: Duration = Duration::from_secs(600);
 
 /// A client that talks directly to the master.
@@ -57,7 +57,7 @@ impl Who {
         })
     }
 
-    /// Whether the client still counts when its last connection was seen `since` ago.
+    /// Whether the client is still reported if its last connection was seen `since` ago.
     fn counts(&self, since: Duration) -> bool {
         match self {
             Self::Process { pid, started, .. } => {
@@ -92,7 +92,7 @@ fn program_of(pid: u32) -> String {
     script.map_or(name, |script| script.to_string_lossy().into_owned())
 }
 
-/// The addresses of a master.
+/// The addresses of the master.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     port: u16,
@@ -102,7 +102,7 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// Resolves the master's address; none if its host has no address.
+    /// Resolves the master's address. `None` if its host has no address.
     pub(crate) async fn of(master: &MasterUri) -> Option<Self> {
         let found = resolver::addresses(&master.host, master.port).await.ok()?;
         let addresses: Vec<_> = found.iter().map(|at| at.ip().to_canonical()).collect();
@@ -130,16 +130,15 @@ impl Place {
 /// The clients that bypass this rosrescue.
 #[derive(Debug, Default)]
 pub(crate) struct Bypass {
-    /// When a connection of each client was last seen.
+    /// When each client's last connection was seen.
     seen: BTreeMap<Who, Instant>,
-    /// The owners of the sockets that the last look found.
+    /// The owners of the sockets in the last read of the table.
     sockets: HashMap<u64, Who>,
 }
 
 impl Bypass {
-    /// Looks at the table once, and returns the clients that are new. Blocks for a millisecond per
-    /// some hundred sockets of this computer, and longer if the owner of a new socket must be
-    /// searched for.
+    /// Reads the table once, and returns the new clients. Blocks for a millisecond per some hundred sockets of this
+    /// computer, and longer if it has to search for the owner of a new socket.
     pub(crate) fn look(&mut self, place: &Place) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
@@ -199,8 +198,8 @@ impl Bypass {
     }
 }
 
-/// The clients of the master at `place`: inode and user of their sockets on this computer, except
-/// those in `own`, and the addresses of other computers.
+/// The clients of the master at `place`: inode and user of each socket on this computer, except those in `own`, and the
+/// addresses of other computers.
 fn split(
     table: Vec<Established>,
     place: &Place,

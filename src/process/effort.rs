@@ -1,15 +1,15 @@
-//! What the threads of a process do, and how much processor time they get (`proc_pid_task(5)`).
-//! None of these reads needs the lock of the process's memory.
+//! Measures what the threads of a process do, and how much processor time they get (`proc_pid_task(5)`). It never needs
+//! the lock of the process's memory.
 
 use std::{fs, time::Duration};
 
 use crate::lifecycle::evidence::Effort;
 
-/// Most processes of a family.
+/// Most processes that are counted together.
 const FAMILY_MOST: usize = 64;
 
-/// The effort of the process `pid` and its children, because a wrapper may have started the master;
-/// none if there is no such process.
+/// The effort of the process `pid` and its descendants: a wrapper may have started the master. `None` if there is no
+/// such process.
 pub(crate) fn of(pid: u32) -> Option<Effort> {
     let mut threads = Threads::default();
     let mut family = vec![pid.to_string()];
@@ -89,8 +89,7 @@ impl Threads {
     }
 }
 
-/// Parses how long a thread has run, how long it has waited for the processor, and how often it was
-/// given it.
+/// Parses how long a thread has run, how long it has waited for the processor, and how often it got it.
 fn schedstat(text: &str) -> Option<(Duration, Duration, u64)> {
     let mut fields = text.split_whitespace().map(str::parse);
     let mut next = || fields.next()?.ok();

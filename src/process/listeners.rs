@@ -10,20 +10,20 @@ use std::{
 /// State of a listening socket in the kernel's tables.
 const LISTENING: &str = "0A";
 
-/// Who listens at the port of a master that rosrescue started.
+/// The program that listens at the port of a master that rosrescue started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Holder {
     /// The master, or a process that it has started.
     Master,
     /// Another program, with its process id if it can be seen. The master can never listen there.
     Stranger(Option<u32>),
-    /// Nobody, or nobody who can be seen.
+    /// No program, or none that this process can see.
     Unknown,
 }
 
 impl Holder {
-    /// Finds who listens at `port`, which the master `child` was given. `own` means that the master
-    /// is ROS's own program, which starts no other one.
+    /// Finds the program that listens at `port`, which the master `child` was given. `own` means that the master is
+    /// ROS's own rosmaster, which never starts another one.
     pub(crate) fn of(child: u32, port: u16, own: bool) -> Self {
         let sockets = sockets(port);
         if holds_one(child, &sockets) {
@@ -35,25 +35,24 @@ impl Holder {
     }
 }
 
-/// Judges what was found. `taken`: somebody other than the child itself listens.
+/// Judges the listeners that were found. `taken` says that a process other than the child listens.
 fn judge(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
     match seen.first() {
         _ if !taken => Holder::Unknown,
         _ if seen.iter().any(|pid| descends(*pid)) => Holder::Master,
-        // The listeners are processes of another user, which are invisible to us.
+        // The listeners belong to another user, so they are invisible to this process.
         None if !own => Holder::Unknown,
         first => Holder::Stranger(first.copied()),
     }
 }
 
-/// Whether `ancestor` started the process `pid`, directly or indirectly.
+/// Whether `ancestor` has started the process `pid`, directly or through other processes.
 fn descends(pid: u32, ancestor: u32) -> bool {
     let parent = |pid: &u32| super::parent_of(*pid).filter(|parent| *parent > 1);
     std::iter::successors(Some(pid), parent).any(|pid| pid == ancestor)
 }
 
-/// The processes that listen at `port` in our network namespace. Only root sees those of other
-/// users.
+/// The processes in this network namespace that listen at `port`. Only root sees those of other users.
 pub(crate) fn at(port: u16) -> Vec<u32> {
     let sockets = sockets(port);
     if sockets.is_empty() {
@@ -115,8 +114,7 @@ fn socket(line: &str) -> Option<(u16, PathBuf)> {
     ))
 }
 
-/// The inodes of the sockets that the process `pid` has open. For another user's process there are
-/// none, except for root.
+/// The inodes of the process's open sockets. Empty for another user's process, unless this process runs as root.
 pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
     let sockets = open_files(pid).filter_map(|file| {
         let inode = file.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;

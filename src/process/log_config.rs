@@ -1,5 +1,5 @@
-//! The logging configuration that rosmaster starts with. Python evaluates part of it, so it is not
-//! a file in a folder, where another user could change it.
+//! The logging configuration that rosmaster starts with. Python evaluates part of it, so it must not be in a file that
+//! another user could change.
 
 use std::{
     fs::File,
@@ -40,8 +40,8 @@ format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
 pub(super) struct LogConfig(Arc<File>);
 
 impl LogConfig {
-    /// Creates the file; none if the user has a configuration, or if the kernel lacks such files.
-    /// rosmaster then only starts more slowly.
+    /// Creates the file. `None` if the user has a configuration, or if the kernel does not support sealed files in
+    /// memory. Without it rosmaster only starts more slowly.
     pub(super) fn unless_given() -> Option<Self> {
         match std::env::var_os(VARIABLE) {
             Some(given) if !given.is_empty() => None,

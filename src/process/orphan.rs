@@ -1,10 +1,9 @@
 //! Orphans: rosmasters and rosouts that a killed rosrescue left running.
 //!
-//! They are identified by their process, not by their port, because another program may have taken
-//! the port since, even another rosmaster. A [`PidFile`](super::PidFile) names the process that was
-//! started last. Without that file all processes are searched: each process started by rosrescue
-//! has the checkpoint's path in its environment. No other program sets that variable, and the
-//! kernel shows it as long as the process lives.
+//! They are identified by their process and not by their port, which another program may have taken, even another
+//! rosmaster. A [`PidFile`](super::PidFile) names the process that was started last. Without that file all processes
+//! are searched: each process started by rosrescue has the checkpoint's path in its environment. No other program sets
+//! that variable, and the kernel shows it as long as the process lives.
 
 use std::{
     ffi::{OsStr, OsString},
@@ -34,16 +33,15 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 /// A rosmaster that an earlier rosrescue left running.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Orphan {
-    /// It listens at the expected port.
+    /// The rosmaster listens at the expected port.
     Serving(u32),
-    /// It was started for that port and does not listen yet, so it is still empty.
+    /// The rosmaster was given that port but does not listen yet, so it has no state.
     Starting(u32),
 }
 
 impl Rosmaster {
-    /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`,
-    /// and kills its other rosmasters, which are of no use. Blocks for long if all processes must
-    /// be searched.
+    /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
+    /// rosmasters. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
         let owner = owner(&self.checkpoint);
         let last = self.pid_file.last();
@@ -80,10 +78,9 @@ impl Rosmaster {
     }
 }
 
-/// Chooses from `all` the process that listens at `port` or will listen there: a rosmaster whose
-/// port is taken never listens. `is_told` tells whether a process was given a port. If none of
-/// `all` listens, another process of `owner` may, because a program given by `--rosmaster` may
-/// start another one.
+/// Chooses from `all` the process that listens at `port` or will listen there. A rosmaster that finds its port taken
+/// never listens. `is_told` says whether a process was given a port. If none of `all` listens, another process of
+/// `owner` may: a program given by `--rosmaster` may have started it.
 fn choose(
     port: u16,
     all: &[u32],
@@ -105,7 +102,7 @@ fn choose(
     serving.map(Orphan::Serving)
 }
 
-/// Whether the command line of the process `pid` gives `port` as rosmaster's.
+/// Whether the command line of the process `pid` gives it `port`.
 fn is_told(pid: u32, port: u16) -> bool {
     let command_line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     let words: Vec<_> = command_line.split(|byte| *byte == 0).collect();
@@ -115,8 +112,8 @@ fn is_told(pid: u32, port: u16) -> bool {
         .any(|pair| pair == [b"-p", port.as_bytes()])
 }
 
-/// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes
-/// of other containers may be visible, and their checkpoint may have the same path.
+/// Living processes with this `owner` whose rosrescue is gone. Only this network namespace is searched: processes of
+/// other containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     super::all().filter(|pid| is_orphan(*pid, owner)).collect()
 }
@@ -125,12 +122,12 @@ fn is_orphan(pid: u32, owner: &OsStr) -> bool {
     bears(pid, owner) && is_in_our_network(pid) && !has_rosrescue(pid)
 }
 
-/// Whether the process `pid` was started with this `owner`.
+/// Whether the environment of the process `pid` has this `owner`.
 pub(super) fn bears(pid: u32, owner: &OsStr) -> bool {
     owner_of(pid).is_some_and(|of| of == owner.as_bytes())
 }
 
-/// Whether a rosrescue started the process `pid`.
+/// Whether the process `pid` was started by a rosrescue.
 pub(super) fn has_owner(pid: u32) -> bool {
     owner_of(pid).is_some()
 }
@@ -142,7 +139,7 @@ fn owner_of(pid: u32) -> Option<Vec<u8>> {
     pairs.find_map(|pair| pair.strip_prefix(&*start).map(<[u8]>::to_vec))
 }
 
-/// Whether the process `pid` is in our network namespace.
+/// Whether the process `pid` is in this process's network namespace.
 pub(crate) fn is_in_our_network(pid: u32) -> bool {
     network(&pid) == network(&"self")
 }
@@ -152,15 +149,14 @@ fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
     fs::read_link(format!("/proc/{process}/ns/net")).ok()
 }
 
-/// Whether the parent of `pid` is a rosrescue, so that `pid` is no orphan. Our own parent does not
-/// count: a guardian starts no masters, but as the first process of a container it inherits those
-/// of dead workers.
+/// Whether the parent of `pid` is a rosrescue, so that `pid` is not an orphan. The parent of this process does not
+/// count: a guardian starts no masters, but as the first process of a container it inherits those of dead workers.
 fn has_rosrescue(pid: u32) -> bool {
     let parent = super::parent_of(pid);
     parent.is_some_and(|parent| parent != parent_id() && super::is_rosrescue(parent))
 }
 
-/// Returns when the process `pid`, which is not our child, has ended.
+/// Waits until the process `pid` has ended. It need not be a child of this process.
 ///
 /// # Errors
 ///
@@ -205,7 +201,7 @@ mod tests {
             .env(OWNER, &owner)
             .spawn()
             .unwrap();
-        // This test's program is named after rosrescue, too.
+        // This test's program also has a name that begins with rosrescue.
         assert_eq!(find(&owner), Vec::<u32>::new(), "its rosrescue lives");
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
         assert_eq!(find(&owner), [orphan]);

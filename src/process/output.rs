@@ -31,12 +31,12 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// Whether the disk still owes an answer. Before that it gets no other work.
+    /// Whether the disk has not finished the last request. Until then it gets no other.
     asked: AtomicBool,
 }
 
 impl Output {
-    /// The file named like `checkpoint` plus `suffix`. Nothing is opened yet.
+    /// Uses the file next to `checkpoint` with this `suffix`. Opens nothing yet.
     pub(super) fn beside(checkpoint: &Path, suffix: &str) -> Self {
         Self {
             path: beside(checkpoint, suffix),
@@ -44,7 +44,7 @@ impl Output {
         }
     }
 
-    /// Creates an empty file for the next process. Logs why if it cannot.
+    /// Creates an empty file for the next process. Logs a failure.
     pub(super) async fn renew(&self) {
         self.set(None);
         let path = self.path.clone();
@@ -79,7 +79,7 @@ impl Output {
             .unwrap_or_else(PoisonError::into_inner) = file;
     }
 
-    /// The present file, for a process to write to; none if there is no file.
+    /// The present file, for a process to write to. `None` if there is no file.
     pub(super) fn file(&self) -> Option<File> {
         let file = self
             .shared
@@ -99,8 +99,7 @@ impl Output {
         String::from_utf8_lossy(&tail).trim().to_owned()
     }
 
-    /// Runs `work` on the disk in another thread; none if that takes too long, or if earlier work
-    /// has not ended.
+    /// Runs `work` on the disk in another thread. `None` if that takes too long, or if earlier work has not ended.
     async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         if self.shared.asked.swap(true, Ordering::AcqRel) {
             return None;

@@ -1,6 +1,6 @@
-//! PID files next to the checkpoint, for the rosmaster and the rosout that were started last.
+//! PID files next to the checkpoint, one for the last rosmaster and one for the last rosout.
 //!
-//! With them a new worker finds what the last one left running, without looking at other processes.
+//! A new worker uses them to find the processes that the last worker left running, without searching all processes.
 
 use std::{
     fs,
@@ -17,7 +17,7 @@ use crate::{regular_file, wait};
 #[derive(Clone, Debug)]
 pub(super) struct PidFile(PathBuf);
 
-/// What a PID file tells about the process.
+/// The content of a PID file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Last {
     /// The process runs. It was given this port.
@@ -30,21 +30,20 @@ pub(super) enum Last {
 }
 
 impl PidFile {
-    /// The file of the process `name` next to `checkpoint`.
+    /// The file for the process `name` next to `checkpoint`.
     pub(super) fn beside(checkpoint: &Path, name: &str) -> Self {
         Self(beside(checkpoint, &format!(".{name}-pid")))
     }
 
-    /// Removes the file. Must be called before a process is started: if rosrescue is killed before
-    /// [`Self::write`], that process must be searched for. A slow disk delays it for
-    /// [`output::LIMIT`] at most.
+    /// Removes the file. This must happen before a process is started. If rosrescue is killed before [`Self::write`],
+    /// that process is found by a search. A slow disk delays this for [`output::LIMIT`] at most.
     pub(super) async fn clear(&self) {
         let file = self.clone();
         wait::within(output::LIMIT, move || file.remove()).await;
     }
 
-    /// Records the process `pid`, which was given `port`. Without the file it must be searched for.
-    /// Does not wait for the disk.
+    /// Records the process `pid`, which was given `port`. If writing fails, that process is found by a search. Does not
+    /// wait for the disk.
     pub(super) fn write(&self, pid: u32, port: u16) {
         let file = self.clone();
         spawn_blocking(move || file.record(pid, port));
@@ -67,7 +66,7 @@ impl PidFile {
         }
     }
 
-    /// Whether the process that was started last still runs.
+    /// Reads the file, and checks whether the process still runs.
     pub(super) fn last(&self) -> Last {
         let line = regular_file::open(&self.0).and_then(io::read_to_string);
         let line = line.unwrap_or_default();

@@ -5,8 +5,8 @@ use std::io;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use tokio::net::unix::pipe::Receiver;
 
-/// Opens a descriptor that becomes readable when the process `id` ends, or as `flags` specify. It
-/// is never read, only polled; tokio offers that safely only for pipes.
+/// Opens a descriptor that becomes readable when the process `id` ends, or as `flags` specify. It is only polled and
+/// never read. tokio's pipe type allows that without unsafe code.
 ///
 /// # Errors
 ///

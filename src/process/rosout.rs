@@ -21,13 +21,12 @@ pub(crate) struct Rosout {
     output: Output,
     /// PID file of the last rosout.
     pid_file: PidFile,
-    /// The checkpoint that identifies our rosouts.
+    /// The checkpoint that marks the rosouts of this rosrescue.
     owner: OsString,
 }
 
 impl Rosout {
-    /// Finds the rosout program; none if it is not installed. Its stderr goes to a file next to
-    /// `checkpoint`.
+    /// Finds the rosout program. `None` if it is not installed. Its stderr goes to a file next to `checkpoint`.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
             Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))

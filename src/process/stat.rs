@@ -1,8 +1,6 @@
-//! What the kernel shows of a process without the lock of that process's memory
-//! (`proc_pid_stat(5)`).
+//! Reads the state of a process without the lock of its memory (`proc_pid_stat(5)`).
 //!
-//! The environment and the command line do need that lock, and on a busy computer reading them
-//! takes 100 ms and more.
+//! The environment and the command line do need that lock. On a busy computer reading them can take 100 ms and more.
 
 use std::fs;
 
@@ -11,14 +9,13 @@ use std::fs;
 pub(crate) struct Stat {
     state: char,
     pub(super) parent: u32,
-    /// When it was started, in clock ticks since the boot. This identifies the process together
-    /// with its id.
+    /// When it was started, in clock ticks since boot. Start time and id together identify the process.
     pub(crate) started: u64,
     has_memory: bool,
 }
 
 impl Stat {
-    /// The state of the process `pid`; none if there is no such process.
+    /// The state of the process `pid`. `None` if there is no such process.
     pub(crate) fn of(pid: u32) -> Option<Self> {
         Self::parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
     }
@@ -38,12 +35,12 @@ impl Stat {
         })
     }
 
-    /// Whether it runs. A process that ends gives up its memory first, and its sockets after that.
+    /// Whether the process still runs. A process that ends frees its memory first, and then closes its sockets.
     pub(crate) fn is_alive(self) -> bool {
         self.has_memory && !matches!(self.state, 'Z' | 'X')
     }
 
-    /// Whether it is stopped, by Ctrl-Z, SIGSTOP or a debugger.
+    /// Whether the process is stopped, by Ctrl-Z, SIGSTOP or a debugger.
     pub(crate) fn is_stopped(self) -> bool {
         matches!(self.state, 'T' | 't')
     }

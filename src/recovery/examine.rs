@@ -34,10 +34,9 @@ const INJECTION_LIMIT: Duration = Duration::from_secs(60);
 const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
 /// Most rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
-/// Time limit for running calls of closed connections to end. A `setParam` of 60,000 keys takes
-/// some 10 s.
+/// Time limit for calls of closed connections to end. A `setParam` of 60,000 keys takes some 10 s.
 const SETTLE_LIMIT: Duration = Duration::from_secs(60);
-/// Pause between two checks whether these calls have ended. No event reports it.
+/// Pause between two checks whether these calls have ended. No event reports their end.
 const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a master could not be examined.
@@ -79,16 +78,16 @@ impl ExamineError {
 /// The result of an examination.
 #[derive(Debug)]
 pub(crate) struct Examination {
-    /// How the master came to hold the state.
+    /// How the master got its state.
     pub outcome: Outcome,
     /// Process id of the master.
     pub pid: i32,
-    /// HTTP and Python of the master, as text.
+    /// HTTP version and Python version of the master, as text.
     pub speaks: String,
-    /// How calls are known to reach this master.
+    /// How rosrescue makes sure that calls reach this master.
     pub verification: Verification,
     pub counts: Counts,
-    /// What was not injected, and why.
+    /// Parts of the state that were not injected, with the reasons.
     pub skipped: Vec<String>,
     /// Differences that remain after the last repair.
     pub mismatches: Vec<String>,
@@ -109,11 +108,10 @@ pub(crate) struct Manner {
 /// An injection that was prepared in advance.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// The mirror's version and the next token at the time of preparation; none if it was planned
-    /// just now.
+    /// The mirror's version and the next token when it was prepared. `None` if it was not prepared in advance.
     basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether it restores the complete state of the mirror.
+    /// Whether it restores the mirror's complete state.
     complete: bool,
 }
 
@@ -139,11 +137,11 @@ struct Target {
 
 /// How a master is brought to a state.
 enum Change {
-    /// Add what it lacks.
+    /// Add what the master lacks.
     Add,
-    /// It holds the state already, and gets a new token in place of this one.
+    /// The master holds the state already, and only gets a new token in place of this one.
     Renew(Token),
-    /// Replace everything that it holds, including this token.
+    /// Replace everything that the master holds, including this token.
     Replace(Token),
 }
 
@@ -164,16 +162,16 @@ pub(crate) struct Examiner {
     pub upstream: Arc<Upstream>,
     pub gate: Tx,
     pub supervision: Supervision,
-    /// How a hung master is distinguished from a slow one.
+    /// How to tell a hung master from a slow one.
     pub probing: Probing,
-    /// How long a probe may take.
+    /// Longest time for the master to answer a probe.
     pub probe_timeout: Duration,
     pub stats: &'static Stats,
 }
 
 impl Examiner {
-    /// What is known of the present master. `new` is the process id of a master that has just been
-    /// started and not been called yet.
+    /// The facts about the present master. `new` is the process id of a master that was just started and has not been
+    /// called yet.
     pub(super) fn known(&self, new: Option<i32>) -> Known {
         match (self.ledger.has_served_present(), new) {
             (None, _) => Known::Nothing,
@@ -189,8 +187,8 @@ impl Examiner {
         self.gate.set(State::Open { incarnation });
     }
 
-    /// Examines the master that `sentinel` is connected to. If the sentinel is still open
-    /// afterwards, the result is about that master alone.
+    /// Examines the master that `sentinel` is connected to. If the sentinel is still open afterwards, the whole result
+    /// concerns that one master.
     pub(crate) async fn examine(
         &self,
         sentinel: &Arc<Sentinel>,
@@ -228,7 +226,7 @@ impl Examiner {
             self.inject(connection, first, manner, start, &mut examination)
                 .await?;
         }
-        // All masters that rosrescue starts are of one release.
+        // All masters that rosrescue starts have the same version.
         if !is_new || self.ledger.with_mirror(Master::is_old).is_none() {
             let ask = Master::ask_if_old().into();
             let reply = self.while_alive(connection.call(&ask)).await?;
@@ -245,8 +243,8 @@ impl Examiner {
         Ok(examination)
     }
 
-    /// Gives the late master, which has answered, the writes that the mirror answered meanwhile.
-    /// Returns whether it now holds the mirror's state; if not, it must be examined.
+    /// Brings a late master, which has answered by now, up to date with the writes that the mirror has answered.
+    /// Returns whether it holds the mirror's state. Otherwise it must be examined.
     pub(super) async fn catch_up(&self) -> Result<bool, ExamineError> {
         let connect = self.upstream.connect();
         let mut connection = within(CATCH_UP_LIMIT, connect).await?;
@@ -278,8 +276,7 @@ impl Examiner {
         Ok(verdict.is_ok())
     }
 
-    /// Returns when the master cannot be running a call of a closed connection any more. Its state
-    /// is reliable only then.
+    /// Waits until the master runs no more calls of closed connections. Before that, its state can still change.
     async fn settle(&self, master: SocketAddr) -> Result<(), ExamineError> {
         let settled = async {
             self.upstream.no_writers().await;
@@ -326,8 +323,7 @@ impl Examiner {
         let found = match fresh {
             true => Master::default(),
             false => {
-                // If this master was given the mirror's state, the mirror supplies what cannot be
-                // read back.
+                // If this master got the mirror's state, the mirror supplies what cannot be read back.
                 let previous = match bears {
                     Bears::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
@@ -368,7 +364,7 @@ impl Examiner {
                 let state = tokio::task::block_in_place(|| {
                     replay::reconcile(&mirror, &found, &pending, authority)
                 });
-                // Reading a master does not show its parameter subscribers.
+                // A master does not tell which nodes subscribe to parameters.
                 let hidden = |call: &Request| {
                     let method = call.method();
                     matches!(method, Method::SubscribeParam | Method::UnsubscribeParam)
@@ -380,8 +376,8 @@ impl Examiner {
                     say_difference(&self.ledger.adopt(found));
                     return Ok(());
                 } else {
-                    // A later start with an older copy of the checkpoint must not treat the writes
-                    // as pending.
+                    // Without a new token, a start with an older copy of the checkpoint would treat the writes as
+                    // pending.
                     (state, Change::Renew(before))
                 }
             }
@@ -390,7 +386,7 @@ impl Examiner {
             say_difference(&self.ledger.adopt(state.clone()));
         }
         if bears == Bears::Nothing {
-            // A master that was only late goes on to send what it had begun to send.
+            // A master that was only late finishes its notifications.
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
         let token = self.ledger.succeed();
@@ -404,7 +400,7 @@ impl Examiner {
             .await
     }
 
-    /// Brings the master to `target`, reads it back, and leaves `token` on it.
+    /// Brings the master to `target`, reads it back, and sets `token` in it.
     async fn bring(
         &self,
         connection: &mut Connection,
@@ -442,7 +438,7 @@ impl Examiner {
                 if !matches!(change, Change::Renew(_)) {
                     self.stats.masters_restored.count();
                 }
-                // Thousands of small allocations are freed in another thread.
+                // Freeing thousands of small allocations takes time, so another thread does it.
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
@@ -453,7 +449,7 @@ impl Examiner {
                 mismatches = ?examination.mismatches,
                 "the master does not hold what was restored to it; restoring again; please report this line"
             );
-            // What the master holds wins over what was expected; the rest is retried.
+            // What the master holds now replaces what was expected, and the missing part is injected again.
             let first = self.first_look(connection).await?;
             let found = inspect::second(first, connection, plan.expected());
             let found = self.while_alive(found).await?;
@@ -480,7 +476,7 @@ impl Examiner {
         Ok(first)
     }
 
-    /// Waits for slow `work` as long as the master answers probes.
+    /// Waits for slow `work` while the master answers probes.
     async fn while_alive<T, E: Into<ExamineError>>(
         &self,
         work: impl Future<Output = Result<T, E>>,
@@ -492,8 +488,8 @@ impl Examiner {
     }
 }
 
-/// Whether a master has answered as planned. The reply is long and calls are waiting, so it is
-/// decoded only if it differs from the predicted one.
+/// Whether a master has answered as planned. The reply is long and calls are waiting, so it is decoded only if its
+/// bytes differ from the prediction.
 fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
     Ok(match raw.body == plan.answer() {
         true => Ok(()),
@@ -502,20 +498,19 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, Exami
     })
 }
 
-/// Like [`sockets::may_run_a_call`], but off the runtime's threads: with 15,000 sockets it takes
-/// 100 ms.
+/// Like [`sockets::may_run_a_call`], without blocking the runtime: with 15,000 sockets it takes 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
 }
 
-/// Whether the process `pid` listens at the port of `master`, as far as the system shows it.
+/// Whether the process `pid` seems to listen at the port of `master`.
 async fn listens(pid: i32, master: SocketAddr) -> bool {
     let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
     tokio::task::spawn_blocking(look).await.unwrap_or(false)
 }
 
-/// Logs where the master differed from the mirror.
+/// Logs the differences between the master and the mirror.
 fn say_difference(difference: &[String]) {
     if !difference.is_empty() {
         rarely!(
@@ -526,7 +521,7 @@ fn say_difference(difference: &[String]) {
     }
 }
 
-/// Logs where a living master differed from the checkpoint.
+/// Logs the differences between a living master and the checkpoint.
 fn say_older(difference: &[String]) {
     if !difference.is_empty() {
         rarely!(

@@ -23,12 +23,11 @@ pub(crate) struct MasterProcess {
     rosmaster: Rosmaster,
     /// Port of the last master. It is tried first, so that the address stays the same.
     port: Option<u16>,
-    /// Process id of our child, or of the master that was left running, until its end is reported.
+    /// Process id of the child, or of the master that an earlier rosrescue left running. Set until its end is reported.
     current: Option<u32>,
-    /// A master that an earlier rosrescue had just started. It is empty, and used in place of a new
-    /// one.
+    /// A master that an earlier rosrescue had just started. It has no state, and is used instead of a new one.
     starting: Option<u32>,
-    /// Process id of our child until it is called for the first time.
+    /// Process id of a new child until it is called for the first time.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     /// How the last master ended, until it is reported.
@@ -38,8 +37,8 @@ pub(crate) struct MasterProcess {
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`. The last one was at `port`; `left` is what still runs of an
-    /// earlier rosrescue.
+    /// Starts masters with `rosmaster`. The last one was at `port`, and `left` is a master that an earlier rosrescue
+    /// left running.
     pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Orphan>) -> Self {
         let mut this = Self {
             rosmaster,
@@ -80,12 +79,12 @@ impl MasterProcess {
         self.current
     }
 
-    /// Whether a master of an earlier rosrescue is running that may hold a state.
+    /// Whether a master of an earlier rosrescue is running and may hold a state.
     pub(crate) fn is_orphan(&self) -> bool {
         self.current.is_some()
     }
 
-    /// Waits for `end` in a task and reports how `pid` ended.
+    /// Waits for `end` in a task, then reports how `pid` ended.
     fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
         let ends = self.ends.0.clone();
         tokio::spawn(async move {
@@ -101,7 +100,7 @@ impl MasterProcess {
         upstream: &Upstream,
     ) -> Result<(), ProcessError> {
         let pid = match self.starting.take() {
-            // It is at the address that the upstream has from the checkpoint.
+            // The upstream has its address from the checkpoint.
             Some(pid) => pid,
             None => self.start(ledger, upstream).await?,
         };
@@ -119,8 +118,7 @@ impl MasterProcess {
         let uri = address.to_string();
         upstream.relocate(address);
         if ledger.session().master_uri.as_ref() != Some(&uri) {
-            // This is recorded before the master runs, so that the next rosrescue can find it if
-            // this one dies now.
+            // Recorded before the master runs. If rosrescue dies now, its successor can find the master.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
         let mut child = self.rosmaster.start(port).await?;
@@ -137,14 +135,14 @@ impl MasterProcess {
         Ok(pid)
     }
 
-    /// The master that was started since the last call of [`Self::take_new`]: its process id and
-    /// port, and whether it is ROS's own program.
+    /// The master that was started since the last [`Self::take_new`]: its process id and port, and whether it is ROS's
+    /// own rosmaster.
     pub(crate) fn new_one(&self) -> Option<(u32, u16, bool)> {
         let pid = u32::try_from(self.new?).ok()?;
         Some((pid, self.port?, self.rosmaster.is_own()))
     }
 
-    /// Gives up the master's port, which another program has taken.
+    /// Notes that another program has taken the master's port.
     pub(crate) fn port_taken(&mut self, by: Option<u32>) {
         rarely!(
             warn,
@@ -160,12 +158,12 @@ impl MasterProcess {
         self.new.take()
     }
 
-    /// Takes how the last master ended.
+    /// Takes the description of how the last master ended.
     pub(crate) fn take_end(&mut self) -> Option<String> {
         self.end.take()
     }
 
-    /// Returns when the master has ended. Cancel safe.
+    /// Waits until the master has ended. Cancel safe.
     pub(crate) async fn exited(&mut self) {
         let how = gone(&mut self.ends.1, self.current).await;
         let how = match std::mem::take(&mut self.killed) {
@@ -179,8 +177,8 @@ impl MasterProcess {
     }
 
     pub(crate) fn kill(&mut self) {
-        // A child's process id cannot be reused before its end is reported. For a master that was
-        // left running this also holds, except for a moment between its end and the report.
+        // A child's process id is not reused before its end is reported. For an adopted master this also holds, except
+        // for a moment between its end and the report.
         if let Some(pid) = self.current {
             if self.port.is_some() {
                 alarm!(
@@ -195,7 +193,7 @@ impl MasterProcess {
         }
     }
 
-    /// Stops the master in order.
+    /// Stops the master cleanly.
     pub(crate) async fn stop(mut self) {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
@@ -203,7 +201,7 @@ impl MasterProcess {
         }
     }
 
-    /// Kills the master at once, so that it notifies no more nodes. Returns when it is gone.
+    /// Kills the master at once, so that it notifies no more nodes. The returned future waits for its end.
     pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
@@ -222,13 +220,13 @@ impl MasterProcess {
     }
 }
 
-/// Waits until the master `current` has ended, and returns how. Cancel safe.
+/// Waits until the master `current` has ended, and returns how it ended. Cancel safe.
 async fn gone(ends: &mut mpsc::Receiver<End>, current: Option<u32>) -> String {
     loop {
         match ends.recv().await {
             Some((pid, how)) if Some(pid) == current => return how,
             Some(_) => {}
-            // This does not happen, because the caller holds a sender.
+            // Does not happen, because the caller holds a sender.
             None => std::future::pending().await,
         }
     }

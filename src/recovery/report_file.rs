@@ -1,5 +1,5 @@
-//! Stores the reports of rescues as files next to the checkpoint, for later questions and for the
-//! process that continues the session.
+//! Stores the reports of rescues as files next to the checkpoint, for operators and for the next process of the
+//! session.
 
 use std::{
     fs::{self, OpenOptions},
@@ -22,7 +22,7 @@ use crate::{
 const KEPT: usize = 20;
 /// Largest file that is read, in bytes.
 const LARGEST: u64 = 16 << 20;
-/// A master that dies every few seconds must not wear out a memory card.
+/// Limits the reports of a master that dies every few seconds: memory cards wear out.
 static LIMIT: Limit = Limit::new();
 
 /// The last line of a report's file, as JSON. The lines before it are the report for people.
@@ -30,7 +30,7 @@ static LIMIT: Limit = Limit::new();
 pub(crate) struct Kept {
     /// Id of the session.
     session: String,
-    /// Totals of the session by then, as in [`Facts`](crate::status::Facts).
+    /// Totals of the session at that time, as in [`Facts`](crate::status::Facts).
     rescues: u64,
     deaths: u64,
     worker_restarts: u64,
@@ -82,13 +82,13 @@ fn write(checkpoint: &Path, kept: &Kept) -> io::Result<()> {
         env!("CARGO_PKG_VERSION")
     )?;
     let mut others = files(checkpoint)?;
-    // This report is always kept: if the clock was set back, it would count as the oldest.
+    // This report stays in any case. If the clock was set back, it would count as the oldest.
     others.retain(|other| *other != path);
     let surplus = (others.len() + 1).saturating_sub(KEPT);
     others.iter().take(surplus).try_for_each(fs::remove_file)
 }
 
-/// The common beginning of the names of these files.
+/// The prefix of the names of these files.
 fn prefix(checkpoint: &Path) -> Option<String> {
     Some(format!(
         "{}.report-",
@@ -114,8 +114,8 @@ fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Reads the reports next to the checkpoint at `checkpoint`, sorted by number. Files that cannot be
-/// read or that lack a last line in JSON are left out.
+/// Reads the reports next to the checkpoint at `checkpoint`, sorted by number. Leaves out files that cannot be read or
+/// have no JSON in the last line.
 pub(crate) fn read(checkpoint: &Path) -> Vec<Kept> {
     let files = files(checkpoint).unwrap_or_default();
     let mut all: Vec<Kept> = files.iter().filter_map(|file| read_one(file)).collect();
@@ -132,9 +132,8 @@ fn read_one(file: &Path) -> Option<Kept> {
     serde_json::from_str(text.lines().next_back()?).ok()
 }
 
-/// What the files next to the checkpoint at `checkpoint` tell about the session with this id.
-/// `died` tells whether its last process ended abnormally; `states` is the highest number of a kept
-/// rescue state.
+/// The facts about the session with this id in the files next to the checkpoint at `checkpoint`. `died` says whether
+/// its last process crashed. `states` is the highest number of a kept rescue state.
 pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64) -> Earlier {
     let all = read(checkpoint);
     let last = all.last().map_or(0, |kept| kept.report.number);
@@ -152,7 +151,7 @@ pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64)
             report,
             ..
         } = kept;
-        // A rescue without a kept report, as in a crash loop, is in the count of the next one.
+        // In a crash loop not every rescue has a report. The next report's total includes it.
         earlier.rescues = earlier.rescues.max(rescues);
         earlier.deaths = earlier.deaths.max(deaths);
         let restarts = worker_restarts + u64::from(died);

@@ -21,9 +21,9 @@ use crate::{
     },
 };
 
-/// Pause before a message about a lasting state is repeated. It doubles with each repetition.
+/// Pause before the same message is logged again. It doubles with each repetition.
 const REPEAT: Duration = Duration::from_secs(10);
-/// Longest pause before such a message is repeated.
+/// Longest pause before the same message is logged again.
 const LONGEST_REPEAT: Duration = Duration::from_secs(600);
 
 /// A period in which calls did not pass to the master.
@@ -34,11 +34,11 @@ pub(super) struct Outage {
     wall: f64,
     port_open: Option<Instant>,
     stats: &'static Stats,
-    /// Counts at the beginning of the outage, as given by [`counted`].
+    /// The numbers of [`counted`] when the outage began.
     before: (u64, u64),
 }
 
-/// Number of calls that the mirror has answered, and of calls that timed out.
+/// Number of calls that the mirror has answered, and number of calls that timed out.
 fn counted(stats: &Stats) -> (u64, u64) {
     (
         stats.calls_without_master.value(),
@@ -64,7 +64,7 @@ impl Outage {
         self.port_open = Some(now);
     }
 
-    /// The report of an outage that ends at `now` with `examination`.
+    /// The report of an outage that ends at `now` with this `examination`.
     pub(super) fn report(&self, now: Instant, examination: Examination) -> Report {
         let total = now.duration_since(self.since);
         let absence = self
@@ -99,7 +99,7 @@ impl Outage {
     }
 }
 
-/// The last message about a lasting state.
+/// The last repeated message.
 pub(super) struct Said {
     text: String,
     pause: Duration,
@@ -108,7 +108,7 @@ pub(super) struct Said {
 }
 
 impl Driver {
-    /// Reports an examination. Health check and reconciliation add to the report when they end.
+    /// Reports an examination. The health check and the reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.lifecycle.begins() && examination.outcome == Outcome::Injected {
             // The master holds only the session's initial state.
@@ -120,12 +120,12 @@ impl Driver {
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.ended.is_some() && quiet.contains(&cause) {
-            // The first sign of trouble was the beginning of the process's end.
+            // The first sign was part of the process's end.
             report.cause = Cause::Exited.as_str().into();
         }
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
-            // This is usual: a master with `-t` closes each idle connection, and the threads of a
-            // master that is being stopped end before it does.
+            // This is normal: a master with `-t` closes each idle connection, and the threads of a master that is being
+            // stopped end before the process.
             all_clear!(
                 info,
                 AWAY,
@@ -147,7 +147,7 @@ impl Driver {
         }
         self.restored = (report.outcome == Outcome::Injected).then_some(report.number);
         if !self.lifecycle.has_served() {
-            // After a restart of rosrescue it is unknown what changed just before.
+            // After a restart of rosrescue, the latest changes before the outage are unknown.
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
@@ -172,7 +172,7 @@ impl Driver {
     }
 
     pub(super) fn log_waiting(&mut self, what: &str) {
-        // A child that is about to listen needs no message.
+        // Waiting for a child that is about to listen needs no message.
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
@@ -185,7 +185,7 @@ impl Driver {
         }
     }
 
-    /// Logs a warning. The same text is logged again only after growing pauses.
+    /// Logs a warning. Repeats the same text only after growing pauses.
     pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
         let pause = match &self.said {

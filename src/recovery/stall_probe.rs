@@ -1,4 +1,4 @@
-//! Checks whether a master that is busy with an injection is still alive.
+//! Checks whether a master is alive while it is busy with an injection.
 
 use std::time::Duration;
 
@@ -6,9 +6,9 @@ use super::examine::Examiner;
 use crate::master;
 
 impl Examiner {
-    /// Probes the master over separate connections. Returns how long it has been silent, once it
-    /// has missed enough probes in a row to count as hung. rosmaster serves each connection in its
-    /// own thread, so a working master answers.
+    /// Probes the master over separate connections until enough probes in a row are unanswered for it to count as hung.
+    /// Returns how long it has been silent. rosmaster serves each connection in a thread of its own, so a busy master
+    /// still answers.
     pub(super) async fn silence(&self) -> Duration {
         let (probing, patience) = (self.probing, self.probe_timeout);
         let sign_of_life = master::get_pid();
@@ -17,8 +17,7 @@ impl Examiner {
             if missed == 0 {
                 tokio::time::sleep(probing.interval).await;
             }
-            // A master that refuses or answers nonsense does not hang; the injection itself will
-            // fail.
+            // A master that refuses or answers nonsense does not hang. Its injection will fail anyway.
             let probe = async {
                 if let Ok(mut connection) = self.upstream.connect().await {
                     let _ = connection.call(&sign_of_life).await;

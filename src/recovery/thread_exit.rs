@@ -1,9 +1,8 @@
 //! Watches for the earliest sign that a process is dying: the end of one of its threads.
 //!
-//! A signal that ends a process ends each thread separately. Only the last thread frees the memory
-//! and then closes the descriptors, one by one. A master with 80 nodes has some 100 threads and
-//! some 100 descriptors. Its connections end 4 to 12 ms after its death, most of its threads after
-//! 1 to 4 ms.
+//! A signal that ends a process ends each thread separately. Only the last thread frees the memory and then closes the
+//! descriptors, one by one. A master with 80 nodes has some 100 threads and some 100 descriptors. After its death, most
+//! of its threads end within 1 to 4 ms, and its connections within 4 to 12 ms.
 
 use std::{fs, future::poll_fn, io, task::Poll};
 
@@ -12,16 +11,15 @@ use tokio::net::unix::pipe::Receiver;
 
 use crate::process::pidfd;
 
-/// Number of threads to watch. One is not enough, because it may be the last to end. A rosmaster
-/// with `-w 1` has only two threads that live as long as it does: one calls nodes, one serves.
+/// Number of threads to watch. One is not enough, because it may end last. In a rosmaster with `-w 1`, only two threads
+/// live as long as the process: one calls nodes, one serves.
 const WATCHED: usize = 2;
 /// Flag that makes the descriptor report the end of a thread instead of a process. Needs Linux 6.9
 /// or later.
 const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits());
 
-/// Resolves when one of the oldest threads of the process `pid` has ended. The first thread is not
-/// watched, because Linux reports its end only with the end of the process. In rosmaster the oldest
-/// threads live as long as the master.
+/// Completes when one of the oldest threads of the process `pid` has ended. In rosmaster these live as long as the
+/// process. The first thread is not watched, because Linux reports its end only with that of the process.
 ///
 /// # Errors
 ///
@@ -53,8 +51,7 @@ mod tests {
 
     use super::*;
 
-    /// A program that starts threads, reports it, and ends one of them or itself when it reads a
-    /// line.
+    /// A program that starts threads and says so. When it reads a line, it ends one of them or itself.
     const PROGRAM: &str = "
 import sys, threading, time
 end = threading.Event()

@@ -1,5 +1,4 @@
-//! Decides who may call and who may change something, according to `--allow` and `--allow-write`.
-//! No IO.
+//! Decides which clients may call and which may make changes, according to `--allow` and `--allow-write`.
 
 use std::{
     collections::HashMap,
@@ -14,13 +13,12 @@ use ipnet::IpNet;
 use super::admission::Refusal;
 use crate::master::Kind;
 
-/// A refused node calls again up to 20 times per second, so each address is logged once in this
-/// time.
+/// Pause between two log lines about the same address. A refused node calls again up to 20 times per second.
 const SAY_AGAIN: Duration = Duration::from_secs(60);
-/// Most addresses that are remembered for that. Calls from others are counted but not logged.
+/// Most addresses that are remembered for that. Calls from further addresses are counted but not logged.
 const REMEMBERED: usize = 1000;
 
-/// The networks of `--allow` and `--allow-write`. An empty list allows everybody.
+/// The networks of `--allow` and `--allow-write`. An empty list allows all clients.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Access {
     allow: Vec<IpNet>,
@@ -40,9 +38,8 @@ impl Access {
         Self { allow, allow_write }
     }
 
-    /// What a connection from `peer` to our address `own` may do. This computer may do everything,
-    /// because rosmaster, rosout and the robot's own nodes run here. A client that may change may
-    /// also call.
+    /// What a connection from `peer` to the address `own` of this computer may do. This computer may do everything,
+    /// because rosmaster, rosout and the robot's own nodes run here. A client that may make changes may also read.
     pub(crate) fn of(&self, peer: IpAddr, own: Option<IpAddr>) -> Grant {
         let peer = peer.to_canonical();
         let here = peer.is_loopback() || own.map(|own| own.to_canonical()) == Some(peer);
@@ -58,7 +55,7 @@ impl Access {
 }
 
 impl Grant {
-    /// Whether any request is accepted.
+    /// Accepts a request of any kind, or refuses it.
     pub(crate) fn check(self, peer: IpAddr) -> Result<(), Refusal> {
         match self {
             Self::Nothing => Err(refusal(peer, "call", "--allow")),
@@ -66,8 +63,8 @@ impl Grant {
         }
     }
 
-    /// Whether a call of this kind is accepted; none if it could not be decoded. A call that only
-    /// the master understands may change anything.
+    /// Accepts or refuses a call of this kind. The kind is `None` if the call could not be decoded. A call that only
+    /// the master understands may make any change.
     pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Refusal> {
         match (self, kind) {
             (Self::Write, _) | (Self::Read, Some(Kind::Read | Kind::Identity)) => Ok(()),
@@ -76,8 +73,8 @@ impl Grant {
     }
 }
 
-/// rospy and roscpp treat this status like a master that is not there yet, and call again. An
-/// XML-RPC fault would end a node that is starting.
+/// The answer to a refused call. rospy and roscpp treat this status like a master that is not running yet, and call
+/// again. An XML-RPC fault would end a node that is starting.
 fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
     let reason = match what {
         "call" => {
@@ -129,7 +126,7 @@ impl fmt::Display for Access {
 pub(crate) struct Said(HashMap<IpAddr, Instant>);
 
 impl Said {
-    /// Whether to log `peer` now.
+    /// Whether to log a refusal of `peer` now.
     pub(crate) fn is_due(&mut self, now: Instant, peer: IpAddr) -> bool {
         let is_recent = |said: &Instant| now.duration_since(*said) < SAY_AGAIN;
         if self.0.get(&peer).is_some_and(is_recent) {
@@ -175,12 +172,12 @@ mod tests {
             (&LAN, &["10.0.0.8/32"], "10.0.0.8", Write),
             (&LAN, &["10.0.0.8/32"], "10.0.0.9", Read),
             (&LAN, &["10.0.0.8/32"], "192.0.2.1", Nothing),
-            // A client that may change may also call.
+            // A client that may make changes may also read.
             (&LAN, &["192.0.2.1/32"], "192.0.2.1", Write),
-            // An address of one family is in no network of the other.
+            // A network of one address family contains no address of the other.
             (&["0.0.0.0/0"], &[], "fd00::9", Nothing),
             (&["::/0"], &[], "10.0.0.9", Nothing),
-            // This computer may always change.
+            // This computer may always make changes.
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "127.0.0.1", Write),
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "::1", Write),
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "10.0.0.7", Write),

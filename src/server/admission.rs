@@ -1,7 +1,7 @@
-//! Checks a request's head before the request is admitted. No IO.
+//! Decides from a request's head whether the request is admitted.
 //!
-//! ROS 1 has no authentication. Two things can be refused without any ROS client noticing: a call
-//! that a web page makes through a person's browser, and a `shutdown` from another computer.
+//! ROS 1 has no authentication. Two requests can be refused without any ROS client noticing: a call that a web page
+//! makes through a browser, and a `shutdown` from another computer.
 
 use std::net::IpAddr;
 
@@ -17,7 +17,7 @@ use crate::master::{MASTER, Request};
 pub(crate) struct Refusal {
     /// The HTTP status to answer.
     pub status: StatusCode,
-    /// The reason, for people.
+    /// The reason, for the log and the answer.
     pub reason: String,
 }
 
@@ -56,14 +56,14 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     Ok(())
 }
 
-/// Whether a GET with these headers may have a page. A browser keeps the answer from pages of other
-/// sites anyway, but not the connection to `/events`, of which there are few.
+/// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but such a
+/// page could occupy `/events`, which allows few connections.
 pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_host(headers, names)?;
     check_origin(headers)
 }
 
-/// Whether the request does not come from another site's page.
+/// Whether the request comes from a page of this site, or not from a page.
 fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
     for origin in headers.get_all(ORIGIN) {
         let origin = String::from_utf8_lossy(origin.as_bytes());
@@ -82,11 +82,11 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Whether `Host` is an address or a name of this computer. After DNS rebinding, a page whose own
-/// name was pointed at this computer sends that name.
+/// Whether `Host` is an address or a name of this computer. After DNS rebinding, a foreign page sends its own name,
+/// which leads to this computer.
 ///
-/// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain
-/// may follow its host name. That is safe, because the status page changes nothing.
+/// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain may follow its host
+/// name. That is safe, because the status page changes nothing.
 fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
@@ -129,8 +129,8 @@ pub(crate) fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
 }
 
-/// Whether a `shutdown` is one that a master sends to a node whose name was taken. It arrives here
-/// if a client, on any computer, registered rosrescue's address as a node's.
+/// Whether this `shutdown` was meant for a node. A master sends one to a node whose name was taken. It arrives here if
+/// a client has registered rosrescue's address as a node's.
 pub(crate) fn is_for_a_node(call: &Request) -> bool {
     call.caller() == Some(MASTER)
 }
@@ -206,8 +206,7 @@ mod tests {
             same_site.insert(HOST, host.parse().unwrap());
             assert_eq!(check_post(&same_site, &own), Ok(()));
         }
-        // The computer's domains are not known: such a page may be read from, but it may not change
-        // anything.
+        // The computer's domains are unknown, so such a page may read but not make changes.
         let rebound = [
             ("origin", "http://robot.evil.example"),
             ("host", "robot.evil.example"),

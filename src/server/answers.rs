@@ -1,4 +1,4 @@
-//! Limits the memory of large answers under way, and closes slow readers when it runs out.
+//! Limits the memory of large answers that are being sent, and closes slow readers when it is used up.
 
 use std::{
     collections::HashMap,
@@ -16,24 +16,24 @@ use tokio::sync::{Mutex as Turn, Notify, OwnedSemaphorePermit, Semaphore};
 
 use super::{body::SMALL, replies::HttpReply};
 
-/// A client that reads its answer more slowly than this, in bytes per second, is closed when there
-/// is no room for others.
+/// Slowest reading of a large answer, in bytes per second. A slower client is closed when other answers need its
+/// memory.
 const RATE: u32 = 256 << 10;
-/// How far ahead of [`RATE`] a client can get. After a longer pause it counts as slow.
+/// Most credit that a client gains by reading faster than [`RATE`]. After a pause of this length it counts as slow.
 const AHEAD: Duration = Duration::from_millis(250);
-/// Number of answers that may wait for room although they are already in memory. They precede those
-/// that are not, so that few answers are made twice.
+/// Most answers that may wait for memory although they are already encoded. They go before those that are not, so that
+/// few answers must be encoded twice.
 const WAITING: usize = 4;
 
 /// Tracks how fast one connection reads its large answers.
 #[derive(Debug)]
 pub(crate) struct Reader {
-    /// Until when it counts as fast enough.
+    /// Until when the reader counts as fast enough.
     fast_until: Mutex<Instant>,
     /// Whether it has had a large answer.
     counts: AtomicBool,
     close: Notify,
-    /// Whether it was told to close and has not reacted yet.
+    /// Whether the connection was told to close and is still open.
     told: AtomicBool,
 }
 
@@ -55,7 +55,7 @@ impl Reader {
             .unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes that it has read this many bytes.
+    /// Notes that the client has read this many bytes.
     pub(crate) fn took(&self, bytes: usize) {
         if self.counts.load(Ordering::Relaxed) {
             let mut until = self.fast_until();
@@ -63,25 +63,24 @@ impl Reader {
         }
     }
 
-    /// Completes when the connection must close, if it [is still slow](Self::is_slow).
+    /// Completes when the connection should close, unless it [is no longer slow](Self::is_slow).
     pub(crate) async fn is_to_close(&self) {
         self.close.notified().await;
         self.told.store(false, Ordering::Relaxed);
     }
 
-    /// Whether it is too slow. Ask only after one more attempt to write, because rosrescue itself
-    /// may have been busy.
+    /// Whether the client is too slow. Try to write once more before asking, because rosrescue itself may have been
+    /// busy.
     pub(crate) fn is_slow(&self) -> bool {
         *self.fast_until() <= Instant::now()
     }
 }
 
-/// Until when a reader counts as fast enough if it takes `bytes` at `now` and counted so until
-/// `before`.
+/// Until when a reader counts as fast enough, after it has read `bytes` at `now` and counted so until `before`.
 fn fast_until(before: Instant, now: Instant, bytes: usize) -> Instant {
     let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
     let earned = Duration::from_secs(1) * bytes / RATE;
-    // Debts are kept, so that a byte now and then is not enough.
+    // A debt remains, so reading a single byte from time to time is not enough.
     (before + earned).min(now + AHEAD)
 }
 
@@ -91,18 +90,18 @@ pub struct Answers {
     /// Size in KiB.
     size: u32,
     room: Arc<Semaphore>,
-    /// The requests that wait for room without an answer yet, in order.
+    /// Requests that wait for memory before their answer is encoded, in order.
     turn: Turn<()>,
     waiting: Semaphore,
     under_way: Mutex<HashMap<u64, Arc<Reader>>>,
     next: AtomicU64,
 }
 
-/// Room for one answer; released on drop.
+/// Memory for one answer, released on drop.
 #[derive(Debug)]
 pub(crate) struct Room(OwnedSemaphorePermit);
 
-/// An answer's bytes, which keep their room until they have been written.
+/// An answer's bytes, which keep their memory reserved until they have been written.
 struct Counted {
     bytes: Bytes,
     number: u64,
@@ -134,7 +133,7 @@ pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
 }
 
 impl Answers {
-    /// Creates room for large answers of `bytes` in total. A larger answer takes all of it.
+    /// Creates memory for large answers of `bytes` in total. A larger answer takes all of it.
     pub(crate) fn within(bytes: usize) -> Arc<Self> {
         let size = u32::try_from(bytes >> 10).unwrap_or(u32::MAX);
         Arc::new(Self {
@@ -152,7 +151,7 @@ impl Answers {
         kib.min(self.size)
     }
 
-    /// Returns `room` if it is enough for `bytes`, or new room if there is some soon.
+    /// Returns `room` if it is enough for `bytes`, or a new reservation if memory becomes free soon.
     pub(crate) async fn enough(&self, room: Option<Room>, bytes: usize) -> Option<Room> {
         let kib = self.kib(bytes);
         if let Some(room) = room
@@ -167,19 +166,19 @@ impl Answers {
         }
     }
 
-    /// Waits for room for an answer that has not been made yet.
+    /// Reserves memory for an answer that has not been encoded yet.
     pub(crate) async fn reserve(&self, bytes: usize) -> Room {
         let _turn = self.turn.lock().await;
         self.acquire(bytes).await
     }
 
-    /// Waits for room for an answer that is already in memory; none if too many wait like that.
+    /// Reserves memory for an encoded answer. `None` if too many encoded answers already wait.
     async fn reserve_now(&self, bytes: usize) -> Option<Room> {
         let _waiting = self.waiting.try_acquire().ok()?;
         Some(self.acquire(bytes).await)
     }
 
-    /// Waits for room, and closes clients that read too slowly.
+    /// Reserves memory, and closes clients that read too slowly.
     async fn acquire(&self, bytes: usize) -> Room {
         let mut room = std::pin::pin!(self.room.clone().acquire_many_owned(self.kib(bytes)));
         loop {
@@ -196,8 +195,7 @@ impl Answers {
         }
     }
 
-    /// Closes the connection that has been too slow for longest, if there is one. Returns when to
-    /// look again.
+    /// Closes the connection that has been too slow for longest, if there is one. Returns when to check again.
     fn close_slowest(&self, now: Instant) -> Instant {
         let under_way = lock(&self.under_way);
         let readers = under_way
@@ -214,7 +212,7 @@ impl Answers {
             reader.told.store(true, Ordering::Relaxed);
             reader.close.notify_one();
         }
-        // If that is not enough, the next one follows.
+        // If that does not free enough, the next connection is closed.
         now + Duration::from_millis(1)
     }
 
@@ -285,7 +283,7 @@ mod tests {
         assert_eq!(answers.room.available_permits(), 0);
         drop(bytes);
         let room = answers.enough(None, LARGE).await.unwrap();
-        // Existing room is enough if it is large enough.
+        // An existing reservation is used if it is large enough.
         assert!(answers.enough(Some(room), LARGE).await.is_some());
         assert_eq!(lock(&answers.under_way).len(), 1);
     }

@@ -1,4 +1,4 @@
-//! Reads request bodies within limits on size, arrival rate and memory.
+//! Reads request bodies, within limits of size, time and memory.
 
 use std::{io, time::Duration};
 
@@ -12,22 +12,22 @@ use tokio::{
 
 use crate::xmlrpc::Value;
 
-/// Bodies larger than this, in bytes, reserve memory and are decoded off the runtime's threads.
-/// Decoding this much takes some 0.3 ms.
+/// Larger bodies, in bytes, reserve memory and are decoded outside of the runtime. Decoding this much takes some 0.3
+/// ms.
 pub(crate) const SMALL: usize = 64 << 10;
-/// Time allowed for every body, plus a second for each [`RATE`] bytes that have arrived. Also the
-/// longest pause within a body.
+/// Time allowed for every body, plus one second for each [`RATE`] bytes that have arrived. Also the longest pause
+/// within a body.
 const TIME: Duration = Duration::from_secs(10);
 /// The slowest accepted link, in bytes per second.
 const RATE: u64 = 64 << 10;
-/// Breaks deadlocks: its holder may exceed the budget. So one body can always be read to its end
-/// when several hold a part of the budget each.
+/// Permit that breaks deadlocks: its holder may exceed the budget. Without it, several bodies that each hold a part of
+/// the budget could wait for each other forever.
 static LAST: Semaphore = Semaphore::const_new(1);
 
 /// Number of bodies of the largest size that fit into memory at the same time.
 const LARGE_BODIES: usize = 4;
 
-/// Memory for large bodies in KiB, if none is larger than `max_body` bytes.
+/// The memory for large bodies, in KiB, if none is larger than `max_body` bytes.
 pub(crate) fn budget(max_body: usize) -> Semaphore {
     Semaphore::new(LARGE_BODIES * (max_body >> 10))
 }
@@ -37,7 +37,7 @@ pub(crate) fn budget(max_body: usize) -> Semaphore {
 pub(crate) enum BodyError {
     /// The body is larger than this limit, in bytes.
     TooLarge { limit: usize },
-    /// The body ended early, or is not HTTP.
+    /// The body ended early, or is not valid HTTP.
     Broken,
     /// The bytes of the body came too slowly.
     TooSlow,
@@ -45,8 +45,8 @@ pub(crate) enum BodyError {
     NoRoom,
 }
 
-/// Memory reserved for one body; released on drop. A body reserves twice what has arrived of it. An
-/// announced length reserves nothing.
+/// Memory reserved for one body, released on drop. A body reserves twice the size that has arrived. The announced
+/// length reserves nothing.
 #[derive(Debug)]
 pub(crate) struct Room<'a> {
     /// The budget, in KiB.
@@ -84,7 +84,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// Like [`grow`](Self::grow), within the time that a body of `longest` bytes may take.
+    /// Like [`grow`](Self::grow), but fails after the time that a body of `longest` bytes may take.
     async fn grow_in_time(&mut self, bytes: usize, longest: usize) -> Result<(), BodyError> {
         let grown = timeout(time_for(longest), self.grow(bytes)).await;
         grown.map_err(|_| BodyError::NoRoom)
@@ -130,7 +130,7 @@ pub(crate) async fn read(
             let size = (2 * length).min(most);
             let waits = Instant::now();
             room.grow_in_time(size, most).await?;
-            // The client did not cause this delay.
+            // This wait is not the client's fault.
             start += waits.elapsed();
             whole.reserve_exact(size.saturating_sub(whole.len()));
         }
@@ -138,8 +138,7 @@ pub(crate) async fn read(
     }
 }
 
-/// Reserves memory for the decoded values of a large body, because short values take many times the
-/// size of their text.
+/// Reserves memory for the decoded values of a large body. Short values take many times the size of their text.
 pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
     const OPEN: &[u8] = b"<value";
     let searched = text.clone();
@@ -155,7 +154,7 @@ pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result
     room.grow_in_time(size, text.len()).await
 }
 
-/// Runs `work` off the runtime's threads.
+/// Runs `work` outside of the runtime.
 async fn in_a_thread<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Option<T> {
@@ -175,7 +174,7 @@ mod tests {
         assert!(pool.available_permits() < (80 << 10) - 100 * 2 * size_of::<Value>());
     }
 
-    /// Each body holds a part of the room and needs more than is left.
+    /// Each body holds a part of the memory and needs more than is left.
     #[tokio::test]
     async fn bodies_with_a_part_of_the_room_do_not_wait_for_each_other() {
         let pool = Semaphore::new(256);

@@ -37,27 +37,27 @@ use crate::{
     xmlrpc::{self, ListWriter, Reply, Value},
 };
 
-/// The connection is closed without an answer, after which a node retries. An error made up by
-/// rosrescue would cost the node its registration, or end the node.
+/// The connection is closed without an answer, so the node calls again. An error made up by rosrescue would cost the
+/// node its registration, or end the node.
 #[derive(Debug, Error)]
 #[error("closed without an answer: {0}")]
 pub(crate) struct Closed(pub(super) &'static str);
 
-/// Time after which the mirror answers for the master, where the mirror is exact. A rosmaster
-/// answers within a millisecond, or within some ten behind a call that keeps its interpreter busy.
+/// Time after which the mirror answers in place of the master, if it is exact. A rosmaster answers within a
+/// millisecond, or within some ten behind a call that keeps its interpreter busy.
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
-/// Size in bytes of values that take about a millisecond to encode.
+/// Values larger than this, in bytes, take more than a millisecond to encode.
 const LARGE: usize = 64 << 10;
 /// Largest answer that is kept, in bytes.
 const KEPT_MOST: usize = 16 << 20;
-/// Why a write is not answered.
+/// The reason if a write is not answered.
 const UNANSWERED: &str = "the master did not answer";
-/// Why a call that only a master can answer is not answered.
+/// The reason if a call that only a master can answer is not answered.
 pub(super) const NOT_IN_TIME: &str = "the master did not come back in time, see --hold";
-/// Why a multicall of reads is not answered while the master is away.
+/// The reason if a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "only a master can answer so many reads at once";
 
-/// Why a call is not answered here.
+/// The reason why a call is not answered here.
 #[derive(Debug)]
 pub(super) enum Unanswered {
     Closed(Closed),
@@ -81,7 +81,7 @@ impl From<Unanswered> for Closed {
 }
 
 pub struct Calls {
-    /// Tells whether calls pass to the master.
+    /// The gate, which tells whether calls pass to the master.
     pub gate: gate::Rx,
     pub ledger: Arc<Ledger>,
     /// Whether the mirror or the master answers reads while there is a master.
@@ -93,14 +93,14 @@ pub struct Calls {
     /// Connections for reads.
     pub pool: Arc<Pool>,
     pub write_queue: WriteQueue,
-    /// Notified when the master takes too long to answer a call.
+    /// Signals that the master takes too long to answer a call.
     pub slow: Arc<Notify>,
     pub stats: &'static Stats,
-    /// The address of rosrescue, which replaces the master's in replies.
+    /// rosrescue's own address. It replaces the master's in replies.
     pub uri: String,
     /// How long a call waits if only a master can answer it.
     pub hold: Duration,
-    /// The other computers; none without `--cluster`.
+    /// The other computers. `None` without `--cluster`.
     pub(crate) others: Option<Others>,
 }
 
@@ -110,7 +110,7 @@ pub struct LargeAnswer {
     text: Bytes,
 }
 
-/// Refuses a `shutdown` that is not meant for the master, or that comes from another computer.
+/// Refuses a `shutdown` that was meant for a node, or that comes from another computer.
 fn refuse_shutdown(peer: SocketAddr, call: Option<&Request>) -> Option<HttpReply> {
     let call = call.filter(|call| call.kind() == Kind::Shutdown)?;
     if !admission::may_shut_down(peer.ip()) {
@@ -127,7 +127,7 @@ fn refuse_shutdown(peer: SocketAddr, call: Option<&Request>) -> Option<HttpReply
 }
 
 impl Calls {
-    /// Answers a call of `peer`. `call` is none if its body could not be decoded.
+    /// Answers a call of `peer`. `call` is `None` if the body could not be decoded.
     pub(crate) async fn answer(
         &self,
         peer: SocketAddr,
@@ -176,14 +176,14 @@ impl Calls {
         }
     }
 
-    /// The answer to a getPid or a getUri while there is no master, and always to a getUri.
+    /// The answer to a `getUri`, and also to a `getPid` while there is no master.
     pub(super) fn identity(&self, call: &Request) -> Result<HttpReply, Closed> {
         let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
         Ok(xml(&reply))
     }
 
-    /// What rosmaster makes of a request that [`Request::decode`] does not decode, while rosmaster
-    /// is away: the call, or the fault that it answers. None if only a master knows.
+    /// How rosmaster would treat a request that [`Request::decode`] does not decode: as a call, or with a fault. `None`
+    /// if only a master can tell.
     fn decode_without_master(&self, head: &Head, body: &Bytes) -> Option<Result<Request, Reply>> {
         let is_away = matches!(self.gate.state(), State::StandingIn | State::Injecting);
         let is_plain = head.encoding.is_none() && matches!(head.path.as_str(), "/" | "/RPC2");
@@ -204,7 +204,7 @@ impl Calls {
         }
     }
 
-    /// The mirror's answer to a read while there is a master; none if the master's may differ.
+    /// The mirror's answer to a read while there is a master. `None` if the master's answer may differ.
     async fn exact_answer(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call.filter(|_| self.reads == Reads::Mirror)?;
         let answer = || self.ledger.exact_answer(read).map(Reply::Value);
@@ -221,10 +221,10 @@ impl Calls {
         Some(reply)
     }
 
-    /// Encodes the result of `answer`. None if a master cannot marshal it.
+    /// Encodes the result of `answer`. `None` if a master could not encode it.
     ///
-    /// An answer that takes milliseconds is encoded off the runtime, one at a time. Equal answers
-    /// in a row share one encoding; values are shared, so comparing them is quick.
+    /// An answer that takes milliseconds is encoded outside of the runtime, one at a time. Equal answers in a row are
+    /// encoded once. Values share memory, so comparing them is quick.
     async fn encode(&self, answer: impl Fn() -> Option<Reply>) -> Option<HttpReply> {
         let value = match answer()? {
             Reply::Value(value) => value,
@@ -271,8 +271,8 @@ impl Calls {
         Ok(delivered(reply.await?, delivery))
     }
 
-    /// Begins the answer to a read. Waits until the master has answered what it may notify the
-    /// caller of, except for a late master, whose notifications are repeated later.
+    /// Begins the answer to a read. Waits until the master has answered the calls that may notify the caller. Does not
+    /// wait for a late master, whose notifications are repeated later.
     async fn begin_read(&self, read: Option<&Request>) -> Option<Delivery> {
         let mut changed = self.ledger.order_changed();
         let patience = self.patience();
@@ -291,8 +291,7 @@ impl Calls {
         }
     }
 
-    /// Like [`Self::read`], with the answer already begun. `known` is the call, if the mirror may
-    /// answer it.
+    /// Like [`Self::read`], after the answer was begun. `known` is the call, if the mirror may answer it.
     async fn read_in_order(
         &self,
         head: Head,
@@ -309,8 +308,8 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // A mirror in doubt waits for the probes' verdict on the master. A late master
-                    // may know more methods than rosmaster.
+                    // A mirror in doubt waits until probes have judged the master. A late master may know more methods
+                    // than rosmaster.
                     let is_late =
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);
@@ -386,8 +385,8 @@ impl Calls {
         self.http(call.as_deref(), answer, delivery)
     }
 
-    /// Makes one part after the other. If a part gets no result for each entry, its answer is used
-    /// for the whole multicall.
+    /// Sends the parts one after the other. If a part does not get one result for each entry, its answer is used for
+    /// the whole multicall.
     async fn write_parts(
         &self,
         head: &Head,
@@ -398,8 +397,8 @@ impl Calls {
         for part in parts {
             let part = Arc::new(part);
             let body = xmlrpc::encode_call(&Request::clone(&part).into());
-            // No node hears of a subject and writes about it in so many calls at once, so each
-            // part's answer counts as written when it arrives.
+            // No node is notified of a subject and also writes about it in that many calls at once, so each part's
+            // answer counts as written when it arrives.
             let (answer, delivery) = self
                 .queue(
                     head.clone(),
@@ -440,8 +439,8 @@ impl Calls {
         Ok(delivered(reply, delivery))
     }
 
-    /// Queues a write. While the master is away, the mirror answers it from the queue. During an
-    /// injection, or while the master takes too long, it does so only if the write changes nothing.
+    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection, or while
+    /// the master takes too long, the mirror answers it only if it changes nothing.
     async fn queue(
         &self,
         head: Head,
@@ -494,8 +493,8 @@ impl Calls {
         }
     }
 
-    /// When the mirror answers instead of the master. If the master has kept an earlier call
-    /// waiting, this call gets no [`PATIENCE`] of its own.
+    /// When the mirror answers instead of the master. If an earlier call waits for the master already, this call does
+    /// not get another [`PATIENCE`].
     fn patience(&self) -> tokio::time::Instant {
         let now = tokio::time::Instant::now();
         if self.pool.is_stalled() {
@@ -504,7 +503,7 @@ impl Calls {
         self.write_queue.unanswered_since().unwrap_or(now) + PATIENCE
     }
 
-    /// The mirror's answer to a write that changes nothing; none if it changes something.
+    /// The mirror's answer to a write that changes nothing. `None` if it changes something.
     async fn answer_if_unchanged(
         &self,
         call: Option<&Request>,

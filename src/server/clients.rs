@@ -19,18 +19,18 @@ use crate::{
 
 /// Most clients listed on the status page. There may be thousands.
 const LISTED: usize = 1000;
-/// Most characters of a caller id that are kept, because a client may send any length and stay
-/// connected for hours.
+/// Most characters of a caller id that are kept. A client may send a caller id of any length, and stay connected for
+/// hours.
 const CALLER_ID: usize = 200;
 
-/// Most callers of ended connections whose times are kept. Tools have a new name each time.
+/// Most callers of ended connections whose times are kept. Tools use a new name each time.
 const CALLERS: usize = 256;
 
 /// The connections of clients, and how long their calls took.
 #[derive(Debug, Default)]
 pub struct Clients {
     present: DashMap<SocketAddr, Seen>,
-    /// Times of callers whose connections have ended or now serve another caller.
+    /// Times of callers whose connections have ended or are now used by another caller.
     past: Mutex<HashMap<String, Times>>,
 }
 
@@ -52,7 +52,7 @@ impl Seen {
     }
 }
 
-/// How long calls took.
+/// How long a caller's calls took.
 #[derive(Clone, Copy, Debug, Default)]
 struct Times {
     calls: u64,
@@ -93,7 +93,7 @@ impl Clients {
         }
     }
 
-    /// Notes that the call of `peer` that began at `start` was answered, or its connection closed.
+    /// Notes that the call of `peer` that began at `start` has ended, with or without an answer.
     pub fn answered(&self, peer: SocketAddr, start: Instant) {
         let now = Instant::now();
         let longest = now.duration_since(start);
@@ -153,7 +153,7 @@ impl Clients {
         callers.collect()
     }
 
-    /// The connections sorted by caller id, at most a thousand.
+    /// The connections sorted by caller id, at most [`LISTED`].
     pub(crate) fn list(&self) -> Vec<Client> {
         let clients = self.present.iter().take(LISTED).map(|entry| Client {
             peer: entry.key().to_string(),

@@ -33,19 +33,18 @@ impl Comparisons {
 }
 
 impl Calls {
-    /// The mirror's version, if the master's answer to `read` can be compared with the mirror: it
-    /// shows the graph, and the master has no unanswered writes.
+    /// The mirror's version if `read` is `getSystemState` and no write to the master is unanswered. `None` if answer
+    /// and mirror cannot be compared.
     pub(super) fn comparable(&self, read: Option<&Request>) -> Option<u64> {
         let shows_graph = read.is_some_and(|read| *read.method() == Method::GetSystemState);
         (shows_graph && self.write_queue.unanswered_since().is_none())
             .then(|| self.ledger.version())
     }
 
-    /// Compares the master's answer to `read` with the mirror, in parallel with traffic. If they
-    /// differ, the master is read again. `version` is what [`Self::comparable`] returned before the
-    /// read.
+    /// Compares the master's answer to `read` with the mirror, in parallel with traffic. If they differ, the master is
+    /// examined again. `version` is the result of [`Self::comparable`] before the read.
     pub(super) fn compare(&self, read: Option<&Request>, version: Option<u64>, raw: &RawReply) {
-        // The answer may or may not include a write that ran meanwhile.
+        // A write that ran meanwhile may or may not be part of the answer.
         let (Some(read), Some(version)) = (read, version) else {
             return;
         };

@@ -1,8 +1,7 @@
-//! Ends a connection whose peer sends a request's head too slowly, or does not read its answer.
+//! Closes a connection if its peer sends a request's head too slowly, or does not read its answer.
 //!
-//! hyper's limit on the time for a head includes the idle time before it, and would close the
-//! keep-alive connections that nodes hold for hours. Here the time starts with the first byte of
-//! the head. hyper has no limit for writing.
+//! hyper's time limit for a head includes the idle time before it, and would close the keep-alive connections that
+//! nodes hold for hours. Here the time starts with the first byte of the head. hyper has no time limit for writing.
 
 use std::{
     io,
@@ -36,7 +35,7 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 #[derive(Clone, Default)]
 pub(crate) struct Deadlines {
     place: Arc<AtomicU8>,
-    /// Dropped when the answer has been written.
+    /// Values that are dropped once the answer has been written.
     held: Arc<Mutex<Option<UntilWritten>>>,
     pub(super) reader: Arc<Reader>,
 }
@@ -52,8 +51,7 @@ impl Deadlines {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
-    /// Notes that the answer is ready. After it has been sent, `held` is dropped, and the next byte
-    /// starts a head.
+    /// Notes that the answer is ready. After it has been sent, `held` is dropped, and the next byte starts a new head.
     pub(crate) fn replying(&self, held: Option<UntilWritten>) {
         *self.held() = held;
         self.place.store(REPLYING, Ordering::Relaxed);
@@ -83,16 +81,16 @@ pub(crate) struct Timed<'a, S> {
     stream: S,
     deadlines: Deadlines,
     deadline: Pin<Box<Sleep>>,
-    /// Whether the peer does not read.
+    /// Whether the peer did not read in time.
     stuck: bool,
     idle: &'a Idle,
-    /// Notified when the connection must close because too many are idle.
+    /// Signals that the connection must close because too many are idle.
     close: Arc<Notify>,
     idling: Option<Idling<'a>>,
 }
 
 impl<'a, S> Timed<'a, S> {
-    /// Wraps `stream` before its first request. `close` is notified when `idle` has too many.
+    /// Wraps `stream` before its first request. `close` signals that `idle` has too many connections.
     pub(crate) fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
@@ -105,7 +103,7 @@ impl<'a, S> Timed<'a, S> {
         }
     }
 
-    /// Fails a write that makes no progress.
+    /// Fails if a write has made no progress for too long.
     fn written(
         &mut self,
         cx: &mut Context<'_>,
@@ -273,7 +271,7 @@ mod tests {
         deadlines.replying(None);
         stream.write_all(b"HTTP").await.unwrap();
         assert!(!deadlines.is_idle());
-        // Another connection is idle meanwhile.
+        // Another connection is idle at the same time.
         drop(idle.enter(&Arc::default()));
         stream.flush().await.unwrap();
         assert!(deadlines.is_idle());

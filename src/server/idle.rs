@@ -1,8 +1,7 @@
-//! Connections without a request, ordered by the start of their idle time.
+//! Connections without a request in progress, ordered by the start of their idle time.
 //!
-//! Nodes keep such connections for hours, so there is no idle timeout. When there are too many, the
-//! one that has been idle for longest is closed. Its client reconnects when needed, as it must with
-//! a rosmaster that closes idle connections.
+//! Nodes keep such connections for hours, so there is no idle timeout. If there are too many, the one that has been
+//! idle for longest is closed. Its client reconnects when needed, as with a rosmaster that closes idle connections.
 
 use std::{
     collections::BTreeMap,
@@ -11,8 +10,8 @@ use std::{
 
 use tokio::sync::Notify;
 
-/// Most idle connections, whatever the limit on all. Each takes some 16 KB, or 40 KB after a large
-/// body.
+/// Most idle connections, even if many more connections are allowed. Each takes some 16 KB, or 40 KB after a
+/// large body.
 const MOST: usize = 2000;
 
 #[derive(Debug)]
@@ -24,13 +23,12 @@ pub struct Idle {
 #[derive(Debug, Default)]
 struct Queue {
     next: u64,
-    /// Closes each idle connection when notified. The first has been idle for longest.
+    /// Signals that close the idle connections. The first connection has been idle for longest.
     waiting: BTreeMap<u64, Arc<Notify>>,
 }
 
 impl Idle {
-    /// Allows half of `connections` (two or more) to be idle, so that idle ones never block a new
-    /// one.
+    /// Allows half of `connections` (two or more) to be idle, so that idle ones never block a new one.
     pub fn among(connections: usize) -> Self {
         Self {
             most: (connections / 2).min(MOST),
@@ -38,9 +36,8 @@ impl Idle {
         }
     }
 
-    /// Counts a connection as idle until the result is dropped. `close` is notified if it must
-    /// close. If it has a request by then, the request is served first, and the connection counts
-    /// as idle again afterwards.
+    /// Counts a connection as idle until the result is dropped. `close` signals that it must close. If a request has
+    /// arrived by then, the request is answered first, and the connection counts as idle again.
     pub fn enter(&self, close: &Arc<Notify>) -> Idling<'_> {
         let mut queue = self.queue();
         let number = queue.next;
@@ -95,7 +92,7 @@ mod tests {
         let [first, second, third, fourth] = [(); 4].map(|()| Arc::new(Notify::new()));
         let was_idle = idle.enter(&first);
         let _second = idle.enter(&second);
-        // A request and its answer come between.
+        // The connection serves a request meanwhile.
         drop(was_idle);
         let _first = idle.enter(&first);
         assert!(
@@ -108,7 +105,7 @@ mod tests {
             [&second, &first, &third].map(|close| is_told(close)),
             [true, false, false]
         );
-        // Connections that have ended make room.
+        // Ended connections make room for others.
         drop(left);
         let _fourth = idle.enter(&fourth);
         assert!(!is_told(&first));

@@ -25,19 +25,19 @@ use super::{
 };
 use crate::limit::rarely;
 
-/// Connections that the kernel holds while rosrescue is busy or briefly away.
+/// Number of connections that the kernel holds while rosrescue is busy or restarting.
 const BACKLOG: i32 = 1024;
 /// Read buffer of a connection, in bytes. hyper keeps it while the connection is idle. A head must
 /// fit into it.
 const BUFFER: usize = 16 << 10;
-/// Pause after a failed accept, for example without a free file descriptor.
+/// Pause after a failed accept, for example for lack of a file descriptor.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// Idle time after which the kernel probes the peer, so that connections of vanished computers do
 /// not pile up.
 const KEEPALIVE: Duration = Duration::from_secs(60);
 
-/// How long a port may stay in use at the start, because the kernel closes the sockets of a killed
-/// process a moment after its end.
+/// How long a port may stay in use at the start. The kernel closes the sockets of a killed process a moment after its
+/// end.
 const LINGER: Duration = Duration::from_secs(2);
 const LINGER_PAUSE: Duration = Duration::from_millis(20);
 
@@ -134,7 +134,7 @@ fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
     Ok(socket.into())
 }
 
-/// Serves `listener` until `stop`. Requests under way may finish.
+/// Serves `listener` until `stop`. Running requests may finish.
 pub async fn run(
     listener: TcpListener,
     server: Arc<Server>,
@@ -144,7 +144,7 @@ pub async fn run(
 ) {
     let mut failed = false;
     loop {
-        // The permit comes second, so that an unused listener takes none.
+        // The permit comes second, so that an idle listener takes none.
         let accepted = async {
             let accepted = listener.accept().await?;
             // The semaphore is never closed.
@@ -190,7 +190,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let close = Arc::new(Notify::new());
     let timed = Timed::new(stream, deadlines.clone(), &here.idle, close.clone());
     let service = |request| {
-        // It is boxed so that idle connections hold no memory for it.
+        // Boxed, so that idle connections hold no memory for it.
         Box::pin(service::serve(
             server.clone(),
             peer,
@@ -206,7 +206,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
         .serve_connection(TokioIo::new(timed), service_fn(service));
     let ended = loop {
         tokio::select! {
-            // A request that has arrived goes first.
+            // A request that has arrived is served first.
             biased;
             ended = &mut connection => break ended,
             () = close.notified() => {
@@ -217,9 +217,8 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
             }
             () = deadlines.reader.is_to_close() => {
                 if deadlines.is_replying() && deadlines.reader.is_slow() {
-                    tracing::debug!(%peer, "closed a connection that reads too slowly: others need its memory");
-                    // A reset, so that the kernel keeps nothing of the answer and the client calls
-                    // again.
+                    tracing::debug!(%peer, "closed a connection that reads too slowly: other answers need its memory");
+                    // A reset: the kernel drops the answer, and the client calls again.
                     let stream = connection.into_parts().io.into_inner();
                     let _ = SockRef::from(stream.stream()).set_linger(Some(Duration::ZERO));
                     return;
@@ -236,8 +235,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     }
 }
 
-/// This computer's address on the network, if it has one: the one that its route to the outside
-/// uses. No packet is sent.
+/// This computer's address in the network, if it has one: the source address of its default route. No packet is sent.
 pub fn local_address() -> Option<IpAddr> {
     let routed = |from: SocketAddr, to: SocketAddr| {
         let socket = net::UdpSocket::bind(from).ok()?;

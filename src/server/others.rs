@@ -1,4 +1,4 @@
-//! Calls in a robot with several computers: answered here, or by the leader.
+//! Calls in a robot with several computers: answered here, or forwarded to the leader.
 
 use std::{
     collections::VecDeque,
@@ -40,14 +40,14 @@ use crate::{
 
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// Method by which `rosrescue handover` asks the leader to give up leading.
+/// rosrescue's own method by which `rosrescue handover` asks the leader to hand over.
 pub(crate) const HANDOVER: &str = "rosrescue/handover";
 
-/// A request to give up leading: the computer that should lead, and where to report who led or why
-/// it failed.
+/// A handover request: the computer that should lead, and a channel for the result. The result is the previous leader's
+/// name, or why the handover failed.
 pub(crate) type Handover = (String, oneshot::Sender<Result<String, String>>);
 
-/// The connection to the other computers.
+/// The connection to the other computers of the robot.
 #[derive(Clone, Debug)]
 pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
@@ -55,23 +55,22 @@ pub(crate) struct Others {
     pub(crate) handovers: mpsc::Sender<Handover>,
     /// Hosts whose nodes use this rosrescue as their master.
     pub(crate) served: Served,
-    /// Answers that followers have not passed on yet.
+    /// Answers that followers have not passed on to their callers yet.
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
     /// How far the mirror follows the journal.
     pub(crate) followed: watch::Receiver<Place>,
-    /// The latest place in the journal that a leader's answer mentioned.
+    /// The latest journal position in a leader's answer.
     pub(crate) told: Arc<Mutex<Place>>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
 }
 
-/// Method by which a follower tells the leader that it has passed an answer on to its caller.
+/// rosrescue's own method by which a follower tells the leader that it has passed an answer on to its caller.
 const PASSED_ON: &str = "rosrescue/passedOn";
 
-/// Answers on their way to callers through followers, with what must be held until they have been
-/// written there.
+/// Answers on their way through followers to callers. Each keeps something until it has been written there.
 #[derive(Default)]
 pub(crate) struct Passing(Mutex<Passed>);
 
@@ -93,8 +92,8 @@ impl Passing {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps what an answer holds. Returns the number by which it is [ended](Self::end). A follower
-    /// that stays silent delays others no longer than a client that does not read.
+    /// Keeps what an answer holds. Returns the number for [`Self::end`]. A silent follower delays others no longer than
+    /// a client that does not read.
     fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
@@ -119,7 +118,7 @@ impl Passing {
     }
 }
 
-/// When dropped, tells the leader that its answer has been passed on.
+/// On drop, tells the leader that its answer has been passed on.
 struct PassOn {
     leader: Arc<Peer>,
     term: u64,
@@ -128,7 +127,7 @@ struct PassOn {
 
 impl Drop for PassOn {
     fn drop(&mut self) {
-        // Without a runtime rosrescue is stopping.
+        // Without a runtime, rosrescue is stopping.
         let Ok(runtime) = Handle::try_current() else {
             return;
         };
@@ -144,7 +143,7 @@ impl Drop for PassOn {
     }
 }
 
-/// A call on its way.
+/// A call that is being answered.
 struct Call<'a> {
     others: &'a Others,
     calls: &'a Calls,
@@ -204,7 +203,7 @@ impl Others {
         let mut sent = false;
         let mut unanswered = None;
         loop {
-            // The leader that ran it died before it could answer, and the next one would refuse it.
+            // The leader that ran this deletion died before its answer, and the next leader would refuse it.
             if sent && deletes.is_some() && call.deletes().is_none() {
                 return Ok(deleted(deletes.as_deref().unwrap_or_default()));
             }
@@ -239,9 +238,8 @@ impl Others {
                     };
                     let answered = tokio::select! {
                         biased;
-                        // What is answered while cut off lasts only if nobody else changes it. The
-                        // computer that has asked need not be cut off, and may be about to lead
-                        // itself.
+                        // Writes answered while cut off last only if no other computer changes them. The computer that
+                        // asked may not be cut off, and may be about to lead.
                         _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, source) => answered,
                     };
@@ -263,7 +261,7 @@ impl Others {
                 Way::Leader { uri, term } => {
                     let leader = self.peers.at(&uri);
                     if call.hands_over().is_some() {
-                        // It is sent only once, because the next leader would give up, too.
+                        // The request is sent only once: after a failure, the next leader would hand over as well.
                         let silent = || handed_over(Err("the leader does not answer".to_owned()));
                         return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
                     }
@@ -279,7 +277,7 @@ impl Others {
                             Some(reply) => return Ok(reply),
                             None => Some(Instant::now() + RETRY_PAUSE),
                         },
-                        // The answer would never come, or does not count any more.
+                        // The answer would never come, or would no longer count.
                         _ = way.changed(), if call.kind != Kind::Read => continue,
                     }
                 }
@@ -307,8 +305,7 @@ impl Others {
         }
     }
 
-    /// Makes the writes of a computer that was cut off. None if this computer does not lead any
-    /// more.
+    /// Makes the writes of a computer that was cut off. `None` if this computer no longer leads.
     async fn merge(&self, calls: &Calls, ask: Ask) -> Option<HttpReply> {
         let mut leads = self.way.clone();
         tokio::select! {
@@ -333,7 +330,7 @@ impl Others {
     }
 }
 
-/// The answer to a handover: who has led, or why it still leads.
+/// The answer to a handover request.
 fn handed_over(result: Result<String, String>) -> HttpReply {
     let (code, text, who) = match result {
         Ok(who) => (1, "another computer may lead now".to_owned(), who),
@@ -344,27 +341,26 @@ fn handed_over(result: Result<String, String>) -> HttpReply {
 }
 
 impl Call<'_> {
-    /// The computer that should lead, if the call asks the leader to give up leading.
+    /// The computer that should lead, if the call requests a handover.
     fn hands_over(&self) -> Option<&str> {
         let call = self.call.as_ref()?;
         let is_it = matches!(call.method(), Method::Unknown(name) if **name == *HANDOVER);
         is_it.then(|| call.text(1).unwrap_or_default())
     }
 
-    /// The merge that the call asks for, if it comes from a computer that was cut off.
+    /// The writes to merge, if the call comes from a computer that was cut off.
     fn merges(&self) -> Option<Ask> {
         Ask::read(self.call.as_ref()?)
     }
 
-    /// The number of the answer that a follower has passed on, if the call reports that.
+    /// The answer's number, if the call reports that a follower has passed an answer on.
     fn was_passed_on(&self) -> Option<u64> {
         let call = self.call.as_ref()?;
         let is_it = matches!(call.method(), Method::Unknown(name) if **name == *PASSED_ON);
         is_it.then(|| call.text(1)?.parse().ok()).flatten()
     }
 
-    /// Passes the leader's answer on to the caller. This computer's nodes know of its content from
-    /// now on.
+    /// Passes the leader's answer on to the caller. From now on this computer's nodes know what it says.
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
@@ -387,8 +383,7 @@ impl Call<'_> {
         reply
     }
 
-    /// The leader's answer. For a read that takes long, the mirror's answer. None if there is none
-    /// now.
+    /// The leader's answer. For a slow read, the mirror's answer. `None` if there is no answer now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
         if self.kind != Kind::Read {
             return match leader.forward(term, &self.head, &self.body).await {
@@ -404,8 +399,7 @@ impl Call<'_> {
         {
             return Some(reply);
         }
-        // This continues after the mirror has answered, because the next answer in time shows that
-        // the leader is back.
+        // The request continues after the mirror has answered: the next answer in time shows that the leader is back.
         let mut asked = {
             let (leader, head, body) = (leader.clone(), self.head.clone(), self.body.clone());
             tokio::spawn(async move { leader.forward(term, &head, &body).await })
@@ -431,7 +425,7 @@ impl Call<'_> {
         }
     }
 
-    /// The parameter that is deleted, if the mirror has it.
+    /// The parameter that the call deletes, if the mirror has it.
     fn deletes(&self) -> Option<String> {
         let call = self.call.as_ref()?;
         let (caller, key) = (call.caller()?, call.text(1)?);
@@ -446,8 +440,8 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// The mirror's answer to a read. None to any other call, and none if the mirror does not yet
-    /// show what the leader's answers have shown: reads on one computer never go back in time.
+    /// The mirror's answer to a read. `None` for other calls. Also `None` if the leader's answers on this computer have
+    /// shown a later state than the mirror's: reads on one computer never go back in time.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let read = self.call.as_ref().filter(|_| self.kind == Kind::Read)?;
         let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
@@ -457,7 +451,7 @@ impl Call<'_> {
         }
     }
 
-    /// Like [`Self::by_mirror`], once the mirror has caught up.
+    /// Waits until the mirror has caught up, then does as [`Self::by_mirror`].
     async fn by_mirror_when_fresh(&self) -> Option<HttpReply> {
         if self.kind != Kind::Read {
             return None;

@@ -47,14 +47,14 @@ use crate::{
 const HTML: &str = "text/html; charset=utf-8";
 const JSON: &str = "application/json";
 
-/// Of `/state.json`. A change that a reader could stumble over gets another number.
+/// Version of `/state.json`. It changes when a field is removed or changes its meaning.
 const SCHEMA: u32 = 1;
-/// Most nodes, topics or services in it.
+/// Most nodes, topics or services in `/state.json`.
 const LISTED: usize = 5000;
-/// Kept length of what a page is asked for, in characters.
+/// Most characters of a query value.
 const ASKED: usize = 500;
 
-/// Who may do what to a page: load its own script, style and data, and nothing else.
+/// Content security policy: a page may only load its own script, style and data.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
                       img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
@@ -68,7 +68,7 @@ const HEADERS: [(HeaderName, &str); 5] = [
 ];
 
 pub struct Pages {
-    /// What nodes use as `ROS_MASTER_URI`.
+    /// Address that nodes use as `ROS_MASTER_URI`.
     pub uri: String,
     pub checkpoint: String,
     pub upstream: Arc<Upstream>,
@@ -79,19 +79,19 @@ pub struct Pages {
     pub clients: Arc<Clients>,
     pub stats: &'static Stats,
     pub(crate) rate: Rate,
-    /// Whose values are not shown.
+    /// Parameters whose values are hidden.
     pub hide: Hide,
-    /// Ends what listeners read.
+    /// Ends the event streams.
     pub stop: CancellationToken,
-    /// What a page needs and keeps for the next one.
+    /// The state that pages share.
     pub(crate) desk: Desk,
 }
 
-/// What pages share.
+/// The state that pages share.
 #[derive(Debug)]
 pub(crate) struct Desk {
     feed: Feed,
-    /// A whole state is made for one after the other.
+    /// Permit to build the complete state, which happens one request at a time.
     reading: Semaphore,
 }
 
@@ -104,7 +104,7 @@ impl Default for Desk {
     }
 }
 
-/// The page at `uri`.
+/// The answer to a GET of `uri`.
 pub(super) async fn page(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpReply {
     let mut reply = answer(server, uri, headers).await;
     for (name, value) in HEADERS {
@@ -158,7 +158,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
     }
 }
 
-/// Whether a browser asks. curl takes anything.
+/// Whether the client is a browser. curl accepts any type.
 fn wants_html(headers: &HeaderMap) -> bool {
     let accepted = headers.get_all(ACCEPT).into_iter();
     let mut accepted = accepted.filter_map(|accepted| accepted.to_str().ok());
@@ -176,12 +176,12 @@ fn json(text: serde_json::Result<String>) -> HttpReply {
     }
 }
 
-/// What of a page is asked for.
+/// The query of a page.
 #[derive(Debug, Default)]
 struct Asked {
-    /// Only the parameters of a namespace,
+    /// Show only the parameters in this namespace.
     params: Option<String>,
-    /// or those with this in their names.
+    /// Show only the parameters with this text in their names.
     search: Option<String>,
 }
 
@@ -201,14 +201,14 @@ impl Asked {
     }
 }
 
-/// What `/state.json` answers.
+/// The content of `/state.json`.
 #[derive(Debug, Serialize)]
 struct WholeState {
     schema: u32,
-    /// As in the events.
+    /// The same version number as in the events.
     version: u64,
     registrations: u64,
-    /// How many are registered; the lists may be shorter.
+    /// Numbers of registered items. The lists may be shorter.
     totals: Totals,
     #[serde(flatten)]
     robot: Robot,

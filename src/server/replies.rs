@@ -27,7 +27,7 @@ use crate::{
 /// The reply that hyper sends.
 pub(crate) type HttpReply = Response<Content>;
 
-/// Carried in the extensions of a reply: dropped when the reply has been written, or never will be.
+/// A value in a reply's extensions that is dropped when the reply has been written, or never will be.
 #[derive(Clone)]
 pub(crate) struct UntilWritten(
     #[expect(dead_code, reason = "held, not read")] Arc<dyn Send + Sync>,
@@ -39,7 +39,7 @@ impl UntilWritten {
     }
 }
 
-/// Returns `reply`, which is ready to be written.
+/// Returns `reply`, which is now ready to be written.
 pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> HttpReply {
     if let Some(delivery) = delivery {
         delivery.ready();
@@ -53,7 +53,7 @@ pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> Htt
 pub(crate) enum Content {
     /// The whole body.
     Whole(Full<Bytes>),
-    /// A stream that is produced as long as somebody reads it.
+    /// A stream that is produced while the client reads it.
     Events(mpsc::Receiver<Bytes>),
 }
 
@@ -95,8 +95,7 @@ impl Body for Content {
     }
 }
 
-/// The mirror's reply, or the master's from a batch, with rosrescue's address in place of the
-/// master's.
+/// A reply of the mirror, or a result out of the master's batch, with rosrescue's address in place of the master's.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
     match call.filter(|call| batch::asks_uri(call)) {
         Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),
@@ -104,7 +103,7 @@ pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpRepl
     }
 }
 
-/// A master's reply, with rosrescue's address in place of its own.
+/// A master's reply, with rosrescue's address in place of the master's.
 pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> HttpReply {
     if let Some(call) = call.filter(|call| batch::asks_uri(call))
         && let Ok(reply @ Reply::Value(_)) = xmlrpc::decode_reply(&raw.body)

@@ -31,13 +31,13 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Sent to another computer whose body rosrescue cannot decode. The master may be able to, and the
-/// call may be a `shutdown`.
+/// The answer to a client on another computer if rosrescue cannot decode its body. The master may be able to decode it,
+/// and the call may be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and accepts such requests only from the master's own computer; send XML-RPC in UTF-8, without a document type";
 
-/// Other large answers are waiting, and this one cannot be made again.
+/// The reason if other large answers are waiting and this one cannot be made again.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
-/// How often an answer is made that is larger each time.
+/// How often an answer is made again because it has grown.
 const ATTEMPTS: u32 = 4;
 
 /// Answers one request.
@@ -116,12 +116,12 @@ async fn post(
             .filter(|name| !name.as_bytes().eq_ignore_ascii_case(b"identity"))
             .cloned(),
     };
-    // Held until the call is answered.
+    // Reserved until the call is answered.
     let mut room = Room::of(&server.bodies);
     let read = async {
         let limit = server.max_body;
         let body = body::read(request.into_body(), limit, &mut room).await?;
-        // A compressed body is left to the master, because no ROS client compresses.
+        // A compressed body is forwarded without decoding. No ROS client compresses.
         let call = match &head.encoding {
             None => decode(body.clone(), &mut room).await?,
             Some(_) => None,
@@ -167,8 +167,8 @@ async fn post(
     answered
 }
 
-/// Answers a call. A large answer that finds no room is made again when there is some, so that few
-/// wait in memory.
+/// Answers a call. If there is no memory for a large answer, the answer is dropped and made again later, so that few
+/// large answers wait.
 async fn answer(
     server: &Server,
     peer: SocketAddr,
@@ -200,7 +200,7 @@ async fn answer(
     Err(Closed("its answer keeps growing"))
 }
 
-/// A page, in the room for large answers if it is large.
+/// Answers with a page. A large page waits for memory, like any large answer.
 async fn page(
     server: &Server,
     page: HttpReply,
@@ -219,7 +219,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// Like [`refuse`], but the log names an address once a minute, because nodes call again and again.
+/// Like [`refuse`], but logs each address at most once a minute, because nodes call again and again.
 fn keep_out(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     let mut said = server
         .refused
@@ -232,7 +232,7 @@ fn keep_out(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// Decodes a body; none if it cannot be decoded.
+/// Decodes a body. `None` if it cannot be decoded.
 async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<master::Request>, BodyError> {
     if body.len() <= body::SMALL {
         return Ok(master::Request::decode(&body).ok());

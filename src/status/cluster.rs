@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use crate::cluster::machine::Role;
 
-/// This computer's role and what it knows about the others. `app::cluster` fills it.
+/// This computer's role, and the facts about the other computers. `app::cluster` fills it.
 #[derive(Clone, Debug)]
 pub struct ClusterFacts {
     /// This computer's name.
@@ -12,10 +12,10 @@ pub struct ClusterFacts {
     pub role: Role,
     /// Since when it has this role.
     pub since: Instant,
-    /// The current leader as far as this computer knows, or the last one while there is none.
+    /// The present leader as far as this computer knows. If there is none, the last one.
     pub leader: Option<LeaderFacts>,
-    /// Since when there is no leader, as far as this computer knows: the last one gave up or is
-    /// silent. None while there is a leader.
+    /// Since when there is no leader, as far as this computer knows: the last one stepped down or is silent. `None` if
+    /// there is a leader.
     pub leaderless: Option<Instant>,
     /// The last journal record that this computer knows of.
     pub seq: u64,
@@ -23,14 +23,15 @@ pub struct ClusterFacts {
     pub behind: u64,
     /// Number of writes made here that etcd does not have yet.
     pub uncommitted: u64,
-    /// Since when etcd does not answer, and why; none while it answers.
+    /// Since when etcd does not answer, and why. `None` if it answers.
     pub etcd: Option<(Instant, String)>,
     /// All computers that have ever taken part, including this one.
     pub members: Vec<MemberFacts>,
     /// Number of takeovers by this computer.
     pub takeovers: u64,
     pub last_takeover: Option<Takeover>,
-    /// Number of writes answered while cut off that were lost, because others had changed the same.
+    /// Number of writes that were answered while cut off and then lost, because other computers had changed the same
+    /// data.
     pub lost_writes: u64,
 }
 
@@ -56,14 +57,14 @@ pub struct MemberFacts {
     pub role: Role,
     /// The last journal record in its mirror.
     pub seq: u64,
-    /// When this computer last heard from it; none if not since this rosrescue started.
+    /// When this computer last heard from it. `None` if it has not, since this rosrescue started.
     pub heard: Option<Instant>,
 }
 
 impl MemberFacts {
-    /// How often a computer reports its state to the others.
+    /// Pause between two reports of a computer to the others.
     pub const SAYS_EVERY: Duration = Duration::from_secs(5);
-    /// A computer that has not reported for this long is away.
+    /// A computer counts as away if it has not reported for this long.
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
 
     pub(crate) fn is_away(&self) -> bool {
@@ -78,9 +79,9 @@ pub struct Takeover {
     pub at: Instant,
     /// Time from the last sign of the previous leader to the first answered write.
     pub took: Duration,
-    /// Name of the previous leader; none if there was none.
+    /// Name of the previous leader. `None` if there was none.
     pub from: Option<String>,
-    /// Whether the previous leader gave up in order, as in a handover.
+    /// Whether the previous leader stepped down cleanly, as in a handover.
     pub in_order: bool,
 }
 

@@ -7,8 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
 use crate::{clock, cluster::machine::Role, ros_env::MasterUri};
 
-/// What is known about the robot's computers, this one included. Times of day are seconds since
-/// 1970.
+/// The facts about all computers of the robot. Times of day are seconds since 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Computers {
     /// This computer's name.
@@ -16,9 +15,9 @@ pub(crate) struct Computers {
     pub(crate) role: Role,
     /// Since when it has this role.
     pub(crate) since: f64,
-    /// The current leader, or the last one while there is none.
+    /// The present leader. If there is none, the last one.
     pub(crate) leader: Option<Leader>,
-    /// Since when there is no leader; none while there is one.
+    /// Since when there is no leader. `None` if there is one.
     pub(crate) leaderless_since: Option<f64>,
     /// The last journal record that this computer knows of.
     pub(crate) seq: u64,
@@ -26,7 +25,7 @@ pub(crate) struct Computers {
     pub(crate) behind: u64,
     /// Number of writes made here that etcd does not have yet.
     pub(crate) uncommitted: u64,
-    /// Why etcd does not answer; none while it answers.
+    /// Why etcd does not answer. `None` if it answers.
     pub(crate) etcd_trouble: Option<Trouble>,
     /// All computers, sorted by name.
     pub(crate) computers: Vec<Computer>,
@@ -34,7 +33,7 @@ pub(crate) struct Computers {
     pub(crate) takeovers: u64,
     /// The last takeover by this computer.
     pub(crate) last_takeover: Option<Taken>,
-    /// Number of writes answered while cut off that were lost.
+    /// Number of writes that were answered while cut off and then lost.
     pub(crate) lost_writes: u64,
 }
 
@@ -65,10 +64,10 @@ pub(crate) struct Computer {
     pub(crate) role: Role,
     /// Number of journal records that its mirror lacks.
     pub(crate) behind: u64,
-    /// When this computer last heard from it; none for this computer itself, or if not since this
-    /// rosrescue started.
+    /// When this computer last heard from it. `None` for this computer itself, and if it has not, since this rosrescue
+    /// started.
     pub(crate) heard: Option<f64>,
-    /// Whether it has not been heard from for 15 s.
+    /// Whether it has been silent for 15 s.
     pub(crate) away: bool,
 }
 
@@ -79,9 +78,9 @@ pub(crate) struct Taken {
     pub(crate) at: f64,
     /// Seconds from the last sign of the previous leader to the first answered write.
     pub(crate) seconds: f64,
-    /// Name of the previous leader; none if there was none.
+    /// Name of the previous leader. `None` if there was none.
     pub(crate) from: Option<String>,
-    /// Whether the previous leader gave up in order, as in a handover.
+    /// Whether the previous leader stepped down cleanly, as in a handover.
     pub(crate) in_order: bool,
 }
 
@@ -93,7 +92,7 @@ impl From<&ClusterFacts> for Computers {
             .map(|of| Computer::new(of, facts))
             .collect();
         computers.sort_by(|a, b| a.name.cmp(&b.name));
-        // A takeover has no previous leader when this computer was the first one.
+        // The first leader has no predecessor.
         let last = facts.last_takeover.as_ref();
         let last = last.filter(|takeover| takeover.from.is_some());
         Self {
@@ -162,15 +161,14 @@ impl From<&Takeover> for Taken {
 }
 
 impl Computers {
-    /// The current leader; none while there is no leader.
+    /// The present leader. `None` if there is none.
     pub(crate) fn leads(&self) -> Option<&Leader> {
         self.leader
             .as_ref()
             .filter(|_| self.leaderless_since.is_none())
     }
 
-    /// Finds the computer that `given` means: its whole name, the beginning of exactly one name, or
-    /// its address.
+    /// Finds the computer that `given` stands for: its whole name, the beginning of exactly one name, or its address.
     pub(crate) fn find(&self, given: &str) -> Option<&str> {
         let names = || self.computers.iter().map(|of| of.name.as_str());
         if let Some(name) = names().find(|name| *name == given) {
@@ -259,7 +257,7 @@ impl Computers {
         Ok(())
     }
 
-    /// In a line, as `rosrescue top` shows it.
+    /// The computers in one line, for `rosrescue top`.
     pub(crate) fn line(&self) -> String {
         let each = self.computers.iter().map(|computer| match computer.away {
             true => format!("{} is AWAY", computer.name),
@@ -270,7 +268,7 @@ impl Computers {
 }
 
 impl Computer {
-    /// A computer that is cut off may have heard last that another one leads.
+    /// Describes the computer's role. A computer that is cut off may still name an earlier leader.
     fn doing(&self, leader: Option<&Leader>) -> String {
         let doing = match self.role {
             Role::Joining => "is joining",
@@ -296,7 +294,7 @@ mod tests {
 
     use super::*;
 
-    /// As `rosrescue status` prints it.
+    /// Prints the lines of `rosrescue status`.
     struct Lines<'a>(&'a Computers);
 
     impl fmt::Display for Lines<'_> {

@@ -1,4 +1,4 @@
-//! The condition of the robot in words: one name, what nodes notice now, and what to do.
+//! The condition of the robot in words: its name, what nodes notice now, and what to do.
 
 mod computers;
 
@@ -25,7 +25,7 @@ pub(crate) enum Name {
     CrashLoop,
     /// Calls are answered, but changes are not recorded.
     Unprotected,
-    /// This computer is cut off from the others.
+    /// This computer is cut off from the other computers.
     Alone,
     /// The state is unknown: no master has been seen yet, and calls wait for one.
     Waiting,
@@ -80,17 +80,17 @@ pub(crate) struct Condition {
     pub(crate) since: f64,
     /// What nodes notice now, in one or more sentences.
     pub(crate) text: String,
-    /// What to do; none if there is nothing to do.
+    /// What to do. `None` if nothing.
     pub(crate) action: Option<String>,
 }
 
 impl Condition {
-    /// Whether nobody has to look at the robot.
+    /// Whether no operator is needed.
     pub(crate) fn is_good(&self) -> bool {
         self.is_protected() && self.action.is_none()
     }
 
-    /// Whether changes are recorded and calls pass to a master, here or on the leader.
+    /// Whether changes are recorded and calls pass to a master, on this computer or on the leader.
     pub(crate) fn is_protected(&self) -> bool {
         matches!(self.name, Name::Protected | Name::Following)
     }
@@ -119,7 +119,7 @@ pub(crate) struct Situation {
     pub(crate) gate: State,
     /// When the gate last opened or shut.
     pub(crate) gate_since: Instant,
-    /// Why changes are not recorded; none if they are.
+    /// Why changes are not recorded. `None` if they are.
     pub(crate) unprotected: Option<String>,
     pub(crate) master: String,
 }

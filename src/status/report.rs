@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::limit::{Pair, all_clear, rarely};
 use crate::{clock, master::Counts};
 
-/// Limits the log lines that the master is away and that calls pass again.
+/// Limits the log lines that the master is away, and that calls pass to the master again.
 pub(crate) static AWAY: Pair = Pair::new();
 
 /// Cause of a recovery at an ordinary start of rosrescue.
@@ -25,11 +25,11 @@ pub(crate) const CUT_OFF: &str = "this computer was cut off from the others";
 pub enum Outcome {
     /// A new session: master and mirror were both empty.
     Begun,
-    /// A new master was given the mirror's state.
+    /// A new master got the mirror's state.
     Injected,
     /// The mirror was set to the state of a running master.
     Adopted,
-    /// The same master as before was given the changes that it had missed.
+    /// The same master as before got the changes that it had missed.
     Reconciled,
     /// The same master as before already held the right state.
     Resumed,
@@ -75,7 +75,7 @@ pub struct Report {
     pub number: u64,
     /// Why calls stopped passing.
     pub cause: String,
-    /// How the previous master's process ended; none if rosrescue did not see it end.
+    /// How the previous master's process ended. `None` if rosrescue did not see its end.
     pub ended: Option<String>,
     /// When calls stopped passing, in seconds since 1970 by the wall clock, for comparison with
     /// logs.
@@ -92,7 +92,7 @@ pub struct Report {
     pub answered: u64,
     /// Number of calls that timed out during the outage, because only a master could answer them.
     pub unanswered: u64,
-    /// Time from the open gate to the end of the health check, in milliseconds; none until it ends.
+    /// Time from the open gate to the end of the health check, in milliseconds. `None` until it ends.
     pub health_check_ms: Option<f64>,
     /// Number of items of each kind that the master holds now.
     pub restored: Counts,
@@ -107,13 +107,13 @@ pub struct Report {
     pub reconciled: Vec<String>,
     /// Nodes that did not answer and stay registered.
     pub unreachable: Vec<String>,
-    /// Topics whose subscribers were sent the publishers again, in case the previous master died
-    /// before it could. Nothing is wrong with them.
+    /// Topics whose publishers were sent to their subscribers again, in case the previous master died before it had
+    /// sent them. This is not an error.
     pub told_again: Vec<String>,
 }
 
 impl Report {
-    /// Whether a person should see the report: it is not an ordinary start.
+    /// Whether the recovery is a rescue. An ordinary start is not.
     pub(crate) fn is_rescue(&self) -> bool {
         !(self.cause == STARTED && matches!(self.outcome, Outcome::Begun | Outcome::Adopted))
     }
@@ -140,7 +140,7 @@ impl Report {
         lists.into_iter().filter(|(_, list)| !list.is_empty())
     }
 
-    /// What nodes noticed of the outage.
+    /// What nodes noticed during the outage.
     fn felt(&self) -> String {
         match (self.answered, self.unanswered) {
             (0, 0) => "no calls meanwhile".to_owned(),
@@ -151,7 +151,7 @@ impl Report {
         }
     }
 
-    /// Logs that calls pass again.
+    /// Logs that calls pass to the master again.
     pub(crate) fn log(&self) {
         let phases = &self.phases;
         all_clear!(

@@ -1,7 +1,7 @@
 //! HTTP and Python versions of a master, and what follows from them.
 
-/// Describes HTTP and Python of a master for people. The HTTP version follows from whether the
-/// master keeps connections open, the Python version from its `Server` header.
+/// Describes HTTP version and Python version of a master for people. Whether the master keeps connections open gives
+/// the HTTP version. Its `Server` header gives the Python version.
 pub(crate) fn speaks(keeps_alive: bool, server: Option<&str>) -> String {
     let http = match keeps_alive {
         true => "HTTP/1.1",
@@ -20,9 +20,8 @@ pub(crate) fn speaks(keeps_alive: bool, server: Option<&str>) -> String {
     }
 }
 
-/// Whether the rosmaster of ros_comm `release` keeps connections open on this kernel; none if
-/// either version cannot be read. Releases before 1.14 never do. Releases since 1.14.11 and 1.15.10
-/// do from Linux 4.16 on.
+/// Whether the rosmaster of ros_comm `release` keeps connections open on this kernel. `None` if either version cannot
+/// be read. Releases before 1.14 never do. Releases since 1.14.11 and 1.15.10 do from Linux 4.16 on.
 pub(crate) fn keeps_alive(release: &str, kernel: &str) -> Option<bool> {
     let (major, minor, patch) = numbers(release)?;
     Some(match (major, minor) {

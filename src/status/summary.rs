@@ -1,4 +1,4 @@
-//! The complete status at one moment, as `/status.json` has it and `rosrescue status` shows it.
+//! The complete status at one moment, for `/status.json` and `rosrescue status`.
 
 use std::fmt;
 
@@ -66,9 +66,9 @@ pub(crate) struct Status {
     pub(crate) condition: Condition,
     /// Address of the real master.
     pub(crate) master: String,
-    /// Process id of the master, or of the last one; none if there was none.
+    /// Process id of the present or last master. `None` if there was none.
     pub(crate) master_pid: Option<i32>,
-    /// HTTP and Python of the present or last master.
+    /// HTTP version and Python version of the present or last master.
     #[serde(default)]
     pub(crate) master_speaks: Option<String>,
     /// Processes, users and computers that bypass rosrescue and talk directly to the master of
@@ -83,10 +83,10 @@ pub(crate) struct Status {
     pub(crate) open: bool,
     /// Whether calls are answered by the master or the mirror.
     pub(crate) ready: bool,
-    /// Whether calls go to another computer, which has the master.
+    /// Whether another computer has the master and calls go there.
     #[serde(default)]
     pub(crate) elsewhere: bool,
-    /// Since when the mirror stands in; none while calls pass.
+    /// Since when the mirror stands in. `None` if calls pass.
     pub(crate) standing_in_since: Option<f64>,
     /// Number of writes that the mirror answered and the master has not run yet.
     pub(crate) pending_writes: usize,
@@ -98,7 +98,7 @@ pub(crate) struct Status {
     #[serde(default)]
     pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
-    /// Why the state is not recorded; none if it is.
+    /// Why the state is not recorded. `None` if it is.
     pub(crate) unprotected: Option<String>,
     pub(crate) journal: Journal,
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
@@ -111,7 +111,7 @@ pub(crate) struct Status {
     /// Registered nodes whose port refuses connections.
     #[serde(default)]
     pub(crate) dead_nodes: Vec<String>,
-    /// Registered nodes that have not been checked yet, or not lately.
+    /// Registered nodes that have not been checked, or not in the last two minutes.
     #[serde(default)]
     pub(crate) unchecked_nodes: Vec<String>,
     /// Number of registered nodes that are alive, by the kernel's socket table or an answer.
@@ -133,7 +133,7 @@ pub(crate) struct Status {
     pub(crate) clients: Vec<Client>,
     /// Counters since this process started.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
-    /// The robot's computers; none without `--cluster`.
+    /// The robot's computers. `None` without `--cluster`.
     #[serde(default)]
     pub(crate) cluster: Option<Computers>,
 }

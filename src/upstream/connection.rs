@@ -29,19 +29,19 @@ use crate::{
     xmlrpc::{self, Call, Reply},
 };
 
-/// Size in bytes of replies that take about a millisecond to decode.
+/// Size in bytes from which a reply takes more than a millisecond to decode.
 const LONG: usize = 256 << 10;
 
-/// Sends and receives for hyper's handle.
+/// The hyper object that sends and receives.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A connection to the master, for one call at a time.
 ///
-/// The caller's own task drives it, because another task would have to be woken twice for each
-/// call. So nobody notices its end between two calls; [`Self::is_closed`] checks for it.
+/// The caller's task drives it: another task would have to be woken twice for each call. So its end is not noticed
+/// between two calls; [`Self::is_closed`] checks for it.
 ///
-/// If the server closes its end after one answer, as HTTP/1.0 servers do, the next call gets a new
-/// connection. Another process may listen there by then.
+/// If the server closes the connection after one answer, as HTTP/1.0 servers do, the next call gets a new connection.
+/// Another process may listen there by then.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
@@ -51,18 +51,18 @@ pub struct Connection {
     instance: HeaderValue,
     max_reply: usize,
     silence: Option<Silence>,
-    /// Whether the last answer kept the connection alive.
+    /// Whether the server left the connection open after the last answer.
     keeps_alive: Option<bool>,
     server: Option<HeaderValue>,
 }
 
-/// The connection that the caller drives; none if it has ended. Dropping it also ends the count of
-/// connections for writes.
+/// The connection that the caller drives. `None` if it has ended. Dropping it also ends the count of connections for
+/// writes.
 #[derive(Debug)]
 struct Drive(Option<(Box<Driver>, Option<Writer>)>);
 
 impl Drive {
-    /// Runs `work`, which waits for the connection.
+    /// Drives the connection while `work` runs.
     async fn run<T>(&mut self, work: impl Future<Output = T>) -> T {
         let mut work = std::pin::pin!(work);
         std::future::poll_fn(|context| {
@@ -70,7 +70,7 @@ impl Drive {
                 return Poll::Ready(done);
             }
             self.poll(context);
-            // Data that has arrived is seen at once.
+            // So data that has arrived is seen at once.
             work.as_mut().poll(context)
         })
         .await
@@ -80,15 +80,14 @@ impl Drive {
         if let Some((driver, _)) = &mut self.0
             && Pin::new(driver).poll(context).is_ready()
         {
-            // The call under way gets the error, if there is one.
+            // The running call gets the error, if there is one.
             self.0 = None;
         }
     }
 }
 
 impl Connection {
-    /// A connection to the server at `address` over `stream`. Replies larger than `max_reply` bytes
-    /// are refused.
+    /// Starts HTTP with the server at `address` over `stream`. Replies larger than `max_reply` bytes are refused.
     pub async fn over(
         stream: TcpStream,
         address: &MasterUri,
@@ -136,12 +135,12 @@ impl Connection {
         self.sender.is_closed()
     }
 
-    /// Whether the server answers more than one call on a connection. None before its first answer.
+    /// Whether the server answers more than one call on a connection. `None` before its first answer.
     pub fn keeps_alive(&self) -> Option<bool> {
         self.keeps_alive
     }
 
-    /// Whether the server's dictionaries are ordered, as its last answer shows.
+    /// Whether the server keeps dictionaries in order, according to its last answer.
     pub fn keeps_order(&self) -> bool {
         keeps_order(self.server())
     }
@@ -156,8 +155,7 @@ impl Connection {
         self.exchange(head, body, None).await
     }
 
-    /// Sends a body made by rosrescue. The part of the reply that equals `predicted` is only
-    /// compared and takes no memory.
+    /// Sends a body made by rosrescue. The part of the reply that equals `predicted` is compared without being stored.
     pub async fn predicted(
         &mut self,
         body: Bytes,
@@ -176,13 +174,12 @@ impl Connection {
         if self.keeps_alive == Some(false) {
             self.reopen().await.map_err(CallError::NotConnected)?;
         }
-        // There is no Accept-Encoding, because rosmaster would compress replies in Python.
+        // No Accept-Encoding is sent, because rosmaster would compress replies in Python.
         let mut request = Request::post(head.path.as_str())
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
-            // This is also needed for an empty body: without it rosmaster answers with status 500
-            // and no body.
+            // An empty body needs it too: without it rosmaster answers with status 500 and no body.
             .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {
@@ -237,7 +234,7 @@ async fn handshake(
 ) -> io::Result<(SendRequest<Full<Bytes>>, Box<Driver>)> {
     stream.set_nodelay(true)?;
     if let Some(silence) = silence {
-        // Best effort: the connection also works without it.
+        // If this fails, the connection still works.
         let _ = silence.bound(&stream);
     }
     let (sender, driver) = http1::Builder::new()
@@ -248,7 +245,7 @@ async fn handshake(
     Ok((sender, Box::new(driver)))
 }
 
-/// Whether a server that answers like this takes another request on the connection.
+/// Whether a server that answers like this accepts another request on the connection.
 fn keeps_alive(version: Version, headers: &HeaderMap) -> bool {
     let values = headers.get_all(CONNECTION).into_iter();
     let mut words = values.flat_map(|value| value.to_str().unwrap_or_default().split(','));
@@ -291,7 +288,7 @@ mod tests {
 
     use super::*;
 
-    /// A body that arrives in these pieces.
+    /// A body in these pieces.
     struct Pieces(std::vec::IntoIter<&'static str>);
 
     impl Body for Pieces {

@@ -20,7 +20,7 @@ pub(crate) enum InspectError {
     NotAMaster(#[from] NotAMaster),
 }
 
-/// Makes the first request; without the parameters if the master cannot return one of them.
+/// Makes the first request. Leaves out the parameters if the master cannot return one of them.
 pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
@@ -48,12 +48,12 @@ async fn look(
     Ok(Inspection::decode(&reply, token)?)
 }
 
-/// Whether a parameter may have broken the document: a master does not escape the text of a date.
+/// Whether a parameter may have broken the document. A master does not escape the text of a date.
 fn is_broken_document(error: &InspectError) -> bool {
     matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
 
-/// Makes the second request. Returns the state that the master holds.
+/// Makes the second request, and returns the master's state.
 pub(crate) async fn second(
     first: Inspection,
     connection: &mut Connection,

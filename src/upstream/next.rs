@@ -1,4 +1,4 @@
-//! This module holds the connection for the next call.
+//! Keeps or prepares the connection for the next call.
 
 use std::time::Duration;
 
@@ -7,23 +7,23 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::{RawReply, VerifyError, verify::Verified};
 
-/// A connection that was made ahead is not used after this time: the master may close an idle one.
-/// `core` starts rosmaster with `-t 5`, and a timeout of less than a second makes no sense.
+/// Longest time until a prepared connection is used, because a master may close idle connections. `core` starts
+/// rosmaster with `-t 5`, and timeouts below a second make no sense.
 const AGE_MAX: Duration = Duration::from_millis(500);
 
 /// A connection for the next call.
 #[derive(Debug)]
 pub(crate) enum Next {
-    /// The master has left the connection of the last call open.
+    /// The connection of the last call, which the master has left open.
     Kept(Box<Verified>),
-    /// The master closes each connection after one answer, so the next one is made ahead. The next call
-    /// then does not wait until the master has accepted it. The moment is that of its beginning.
+    /// A new connection, made before it is needed because the master closes each one after one answer. So the next call
+    /// does not wait until the master has accepted it. The instant is when connecting began.
     Ahead(AbortOnDropHandle<Result<Verified, VerifyError>>, Instant),
 }
 
 impl Next {
-    /// Returns what follows `verified`, on which `reply` has come: the connection itself, or a new one
-    /// that `connect` makes. Returns none if the next call has to connect.
+    /// The connection after `reply` has come on `verified`: the same one, or a new one made by `connect`. `None` if the
+    /// next call has to connect.
     pub(crate) fn after(
         verified: Verified,
         reply: &RawReply,
@@ -34,7 +34,7 @@ impl Next {
         }
         let useful = reply.status.is_success() && verified.stays_verified();
         let connect = async {
-            // The answer goes to its client first.
+            // The answer goes to the client first.
             tokio::task::yield_now().await;
             connect.await
         };
@@ -42,7 +42,7 @@ impl Next {
         useful.then(|| Self::Ahead(ahead(), Instant::now()))
     }
 
-    /// Returns whether the connection has ended, or may end soon.
+    /// Whether the connection has ended or may end soon.
     pub(crate) fn is_stale(&mut self) -> bool {
         match self {
             Self::Kept(verified) => verified.connection.is_closed(),
@@ -50,7 +50,7 @@ impl Next {
         }
     }
 
-    /// Waits for the connection. Returns none if it has ended, or could not be made.
+    /// Waits for the connection. `None` if it has ended or could not be made.
     pub(crate) async fn ready(self) -> Option<Verified> {
         match self {
             Self::Kept(verified) => Some(*verified),
@@ -124,14 +124,14 @@ mod tests {
         let verified = next.ready().await.unwrap();
         drop(accepted);
 
-        // One that the master may close by itself soon is not used.
+        // A connection that the master may close soon is not used.
         let (next, _) = after(reply(false), by_sentinel()).await;
         let Some(Next::Ahead(made, since)) = next else {
             panic!("{next:?}")
         };
         assert!(Next::Ahead(made, since - 2 * AGE_MAX).is_stale());
 
-        // A tunnel may lead it elsewhere before it is used.
+        // A tunnel may lead to another master before the connection is used.
         let (next, _) = after(reply(false), Verification::TokenAfterwards).await;
         assert!(next.is_none());
         drop(verified);

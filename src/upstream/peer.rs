@@ -14,29 +14,28 @@ use crate::{master, ros_env::MasterUri, xmlrpc};
 
 /// Most idle connections that are kept.
 const IDLE_MOST: usize = 64;
-/// Path of calls that are meant for the leader of a term: this prefix, and the term.
+/// Prefix of the path of calls for the leader of a term. The term follows.
 const PATH: &str = "/cluster/";
-/// Number of missed probes after which a connection ends. Probes by the cluster notice a dead
-/// computer sooner.
+/// Number of unanswered probes after which a connection ends. The cluster's own probes notice a dead computer sooner.
 const SILENT_PROBES: u32 = 3;
 
-/// The term, if a request with this path is meant for the leader of one.
+/// The term in a path, if the request is meant for the leader of that term.
 pub(crate) fn term_of(path: &str) -> Option<u64> {
     path.strip_prefix(PATH)?.parse().ok()
 }
 
-/// Status of an answer by a computer that does not lead in the term.
+/// Status of an answer by a computer that does not lead in that term.
 pub(crate) const NOT_LEADING: StatusCode = StatusCode::MISDIRECTED_REQUEST;
 
-/// Header in a leader's answer: the number of the last record that was acknowledged by then. The
-/// receiver may know of that record, so it must not be given an older state.
+/// Header in a leader's answer: the number of the last record that was acknowledged then. The caller may know of that
+/// record, so it must not be shown an older state.
 pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
 
-/// Header in a leader's answer: the answer's number. The leader is told when the caller has the
-/// answer, because some notifications must not be sent before that.
+/// Header in a leader's answer: the answer's number. Its follower reports the number when the caller has the answer.
+/// Some notifications must not be sent before that.
 pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
-/// Why another computer has not answered.
+/// Why another computer did not answer.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum PeerError {
@@ -62,7 +61,7 @@ impl Peer {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether its last answer has not come in time.
+    /// Whether its last answer was late.
     pub(crate) fn is_late(&self) -> bool {
         self.late.load(Ordering::Relaxed)
     }
@@ -71,8 +70,7 @@ impl Peer {
         self.late.store(late, Ordering::Relaxed);
     }
 
-    /// Sends it a call as the leader of `term`. The call may have been run even if there is no
-    /// answer.
+    /// Sends a call to it as the leader of `term`. Even without an answer, the call may have been run.
     pub(crate) async fn forward(
         &self,
         term: u64,
@@ -116,7 +114,7 @@ impl Peer {
         Ok(reply)
     }
 
-    /// Whether it says that it leads in `term`.
+    /// Whether it confirms that it leads in `term`.
     pub(crate) async fn leads(&self, term: u64) -> bool {
         let call = master::get_pid();
         let body = Bytes::from(xmlrpc::encode_call(&call));
@@ -124,7 +122,7 @@ impl Peer {
     }
 }
 
-/// Finds the rosrescue of the current leader.
+/// Connects to the rosrescue of the present leader.
 #[derive(Debug)]
 pub(crate) struct Peers {
     instance: HeaderValue,
@@ -133,7 +131,7 @@ pub(crate) struct Peers {
 }
 
 impl Peers {
-    /// `instance` identifies this process; see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
+    /// Creates the connections. `instance` identifies this process; see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
     pub(crate) fn new(instance: HeaderValue, probe_timeout: std::time::Duration) -> Self {
         Self {
             instance,
@@ -142,7 +140,7 @@ impl Peers {
         }
     }
 
-    /// The rosrescue at `uri`. Connections to any other one are dropped.
+    /// The rosrescue at `uri`. Drops the connections to any other one.
     pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {

@@ -28,8 +28,8 @@ pub enum ReadError {
     Connect(#[from] VerifyError),
     #[error(transparent)]
     Call(#[from] CallError),
-    /// The gate was shut meanwhile.
-    #[error("the master went away meanwhile")]
+    /// The gate has shut since the read began.
+    #[error("the master went away during the read")]
     Shut,
 }
 
@@ -41,7 +41,7 @@ pub struct Pool {
     permits: Semaphore,
     /// Idle connections, each with its incarnation.
     idle: Mutex<Vec<(u64, Next)>>,
-    /// Number of reads that have waited too long.
+    /// Number of reads that have waited too long for the master.
     stalled: AtomicUsize,
 }
 
@@ -73,7 +73,7 @@ impl Pool {
         self.stalled.load(Ordering::Relaxed) > 0
     }
 
-    /// Notes that a read has waited for the master too long, until the result is dropped.
+    /// Notes that a read waits too long for the master, until the result is dropped.
     pub fn stalled(&self) -> Stalled<'_> {
         self.stalled.fetch_add(1, Ordering::Relaxed);
         Stalled(self)
@@ -93,8 +93,7 @@ impl Pool {
         }
     }
 
-    /// Sends a read to the master of `incarnation`. The read is sent once more if an idle
-    /// connection turns out to be closed.
+    /// Sends a read to the master of `incarnation`. Sends it once more if an idle connection turns out to be closed.
     pub async fn forward(
         &self,
         incarnation: u64,

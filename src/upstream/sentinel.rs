@@ -8,7 +8,7 @@ use tokio::{net::TcpStream, sync::watch};
 
 use super::{ConnectError, Upstream, is_local};
 
-/// How often the sentinel is renewed if nothing else renews it: before a master with the shortest
+/// Pause after which the sentinel is renewed if nothing else has renewed it. That is before a master with the shortest
 /// sensible `-t` closes it.
 const RENEWAL: Duration = Duration::from_secs(1);
 
@@ -31,8 +31,7 @@ impl Sentinel {
         })
     }
 
-    /// Whether the other end is, or seems to be, on this computer. The end of a tunnel is on this
-    /// computer, too.
+    /// Whether the other end seems to be on this computer. A tunnel's near end also counts.
     pub(crate) fn is_local(&self) -> bool {
         self.local
     }
@@ -42,8 +41,7 @@ impl Sentinel {
         self.peer
     }
 
-    /// Whether the connection is open. It asks the kernel, because the runtime may not have noticed
-    /// its end yet.
+    /// Whether the connection is open. Asks the kernel, because the runtime may not have noticed its end yet.
     pub(crate) fn is_open(&self) -> bool {
         let mut byte = [MaybeUninit::uninit()];
         let peeked = SockRef::from(&**self.stream.borrow()).peek(&mut byte);
@@ -54,15 +52,14 @@ impl Sentinel {
     /// of a dying process one by one, mostly the newest first.
     pub(crate) async fn renew(&self, upstream: &Upstream) -> Result<(), ConnectError> {
         let (_, stream) = upstream.bounded_stream().await?;
-        // It is still open after the connect, so no other process can have taken the new
-        // connection.
+        // The old connection is still open, so the new one must lead to the same process.
         if self.is_open() {
             self.stream.send_replace(Arc::new(stream));
         }
         Ok(())
     }
 
-    /// Runs `work` and renews the connection meanwhile.
+    /// Runs `work` and keeps renewing the connection.
     pub(crate) async fn during<T>(&self, upstream: &Upstream, work: impl Future<Output = T>) -> T {
         let renewing = async {
             loop {
@@ -77,8 +74,7 @@ impl Sentinel {
         }
     }
 
-    /// Returns when the connection has ended, or when the other end sends something unasked, as no
-    /// master does.
+    /// Waits until the connection has ended, or until the other end sends data without a request, which no master does.
     pub(crate) async fn ended(&self) {
         let mut renewed = self.stream.subscribe();
         loop {
@@ -144,7 +140,7 @@ mod tests {
         assert!(sentinel.is_open() && !ended.is_finished());
         drop(second);
         ended.await.unwrap();
-        // Its process is gone, so a connection to its successor is not trusted.
+        // The process is gone, so a connection to its successor is not trusted.
         sentinel.renew(&upstream).await.unwrap();
         assert!(!sentinel.is_open());
     }

@@ -1,15 +1,13 @@
-//! Whether the master may still be running a call of an earlier connection, according to the kernel's table
-//! of TCP sockets.
+//! Finds out from the kernel's table of TCP sockets whether the master may still be running a call of a closed
+//! connection.
 //!
-//! A rosmaster runs each connection in a thread of its own, and closes its end only after running what has
-//! arrived. So while it may run a call of a connection that rosrescue has closed, or that the end of an
-//! earlier rosrescue closed,
+//! A rosmaster runs each connection in a thread of its own, and closes its end only after it has run what has arrived.
+//! rosrescue, or the death of an earlier rosrescue, may have closed a connection whose call still runs. Then the
+//! master's end, on this computer, is in the state CLOSE_WAIT, whether accepted or not. The other end, which belongs to
+//! no process any more, is in FIN_WAIT1 or FIN_WAIT2.
 //!
-//! * its end of the connection, on this computer, is in the state CLOSE_WAIT, whether accepted or not,
-//! * our end, which belongs to no process any more, is in FIN_WAIT1 or FIN_WAIT2.
-//!
-//! Linux forgets our end a minute after the other side has acknowledged the close. So a master on another
-//! computer gets no more time than that; see `docs/decisions/0003-no-call-in-flight.md`.
+//! Linux drops that end a minute after the master's side has acknowledged the close. So a master on another computer
+//! gets no more time than that; see `docs/decisions/0003-no-call-in-flight.md`.
 
 use std::{
     collections::HashSet,
@@ -26,17 +24,16 @@ const CLOSING: u8 = 0x0b;
 const LISTEN: u8 = 0x0a;
 const ESTABLISHED: u8 = 0x01;
 
-/// Whether the master at `master` may still be running a call of a connection that was closed on this side.
+/// Whether the master at `master` may still be running a call of a connection that this side has closed.
 pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
     ["tcp", "tcp6"].into_iter().any(|table| {
-        // Without the table nothing is known, which counts as if nothing ran.
+        // Without the table nothing is known, and no call is assumed to run.
         let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
         is_in_table(&table, master)
     })
 }
 
-/// The addresses at which processes listen in this network namespace. IPv4 addresses are never
-/// mapped.
+/// The addresses at which processes in this network namespace listen. IPv4 addresses are not in their IPv6 form.
 pub(crate) fn listening() -> HashSet<SocketAddr> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
@@ -53,12 +50,11 @@ pub(crate) struct Established {
     pub(crate) local: SocketAddr,
     pub(crate) remote: SocketAddr,
     pub(crate) user: u32,
-    /// Inode of the socket, which identifies it.
+    /// Inode that identifies the socket.
     pub(crate) inode: u64,
 }
 
-/// The ends of all connections. IPv4 addresses are never mapped. Blocks for as long as the kernel
-/// needs to generate the table.
+/// All ends of connections. IPv4 addresses are not in their IPv6 form. Blocks while the kernel generates the table.
 pub(crate) fn established() -> Vec<Established> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
@@ -68,7 +64,7 @@ pub(crate) fn established() -> Vec<Established> {
     sockets.collect()
 }
 
-/// The end of a connection in a line of the table.
+/// Parses one line of the table as the end of a connection.
 fn end_in(line: &str) -> Option<Established> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, remote, state) = (columns.next()?, columns.next()?, columns.next()?);
@@ -83,7 +79,7 @@ fn end_in(line: &str) -> Option<Established> {
     })
 }
 
-/// The address in a line of the table, if its socket listens.
+/// The address in one line of the table, if the socket listens.
 fn listens_at(line: &str) -> Option<SocketAddr> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, state) = (columns.next()?, columns.nth(1)?);

@@ -1,4 +1,4 @@
-//! Verifies that the served incarnation, and no other, answers a call.
+//! Verifies that the present incarnation answers a call, and no other master.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use thiserror::Error;
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream, sentinel::Sentinel};
 use crate::replay::Token;
 
-/// Why a connection or a reply is not known to come from the served incarnation.
+/// Why it is unknown whether a connection leads to the present incarnation.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum VerifyError {
@@ -16,33 +16,30 @@ pub enum VerifyError {
     Connect(#[from] ConnectError),
     #[error(transparent)]
     Call(#[from] CallError),
-    /// It is another incarnation, which does not hold the state yet.
+    /// Another incarnation answered. It does not hold the state yet.
     #[error("the master behind a new connection does not have the present incarnation's token")]
     OtherIncarnation,
-    /// The master that was served is gone.
+    /// The present incarnation has ended.
     #[error("the master's sentinel has ended")]
     Ended,
 }
 
-/// How calls are known to reach the served incarnation.
+/// How calls are verified to reach the present incarnation.
 #[derive(Clone, Debug)]
 pub(crate) enum Verification {
-    /// The master keeps connections open (HTTP/1.1): the token is looked up on each connection
-    /// before its first call.
+    /// The master keeps connections open (HTTP/1.1). Each connection is checked for the token before its first call.
     TokenFirst,
-    /// The master closes each connection after one answer (HTTP/1.0), and the sentinel is connected
-    /// to the process that listens. While the sentinel is open, no other process can have taken a
-    /// connection.
+    /// The master closes each connection after one answer (HTTP/1.0), and the sentinel is connected to the process that
+    /// listens. While the sentinel is open, no other process can have accepted a connection.
     Sentinel(Arc<Sentinel>),
-    /// The master closes each connection after one answer, but runs elsewhere or cannot be seen:
-    /// the token is looked up after each answer.
+    /// The master closes each connection after one answer, and runs elsewhere or cannot be seen. The token is checked
+    /// after each answer.
     TokenAfterwards,
 }
 
 impl Verification {
-    /// Chooses how calls to a master are verified. `keeps_alive`: it answers more than one call on
-    /// a connection. `sees_master`: the sentinel is connected to the master's own process and not
-    /// to a tunnel.
+    /// Chooses how to verify calls. `keeps_alive` says that the master answers more than one call on a connection.
+    /// `sees_master` says that the sentinel is connected to the master's own process and not to a tunnel.
     pub(crate) fn of(keeps_alive: bool, sees_master: bool, sentinel: &Arc<Sentinel>) -> Self {
         match (keeps_alive, sees_master) {
             (true, _) => Self::TokenFirst,
@@ -52,7 +49,7 @@ impl Verification {
     }
 }
 
-/// A connection to the served incarnation, as far as that is known before a call.
+/// A connection to the present incarnation, as far as that can be known before a call.
 #[derive(Debug)]
 pub(crate) struct Verified {
     pub(crate) connection: Connection,
@@ -60,14 +57,13 @@ pub(crate) struct Verified {
 }
 
 impl Verified {
-    /// Returns whether the connection leads to that incarnation for as long as it is open. Behind a tunnel
-    /// it may not: the tunnel can lead a connection that carries nothing yet elsewhere.
+    /// Whether the connection leads to that incarnation as long as it is open. A tunnel may lead an unused connection
+    /// elsewhere.
     pub(crate) fn stays_verified(&self) -> bool {
         !matches!(self.by, Verification::TokenAfterwards)
     }
 
-    /// Sends `body` unchanged. Returns the reply unchanged, if it comes from the incarnation that
-    /// bears `token`.
+    /// Sends `body` unchanged, and returns the reply unchanged if it comes from the incarnation with `token`.
     pub(crate) async fn forward(
         &mut self,
         upstream: &Upstream,
@@ -80,7 +76,7 @@ impl Verified {
         Ok(reply)
     }
 
-    /// Whether what was answered since the verification counts.
+    /// Whether answers since the verification come from the right incarnation.
     pub(crate) async fn confirm(
         &self,
         upstream: &Upstream,
@@ -89,7 +85,7 @@ impl Verified {
         let confirmed = match &self.by {
             Verification::TokenFirst => Ok(()),
             Verification::Sentinel(sentinel) => is_open(sentinel),
-            // The process that bears the token now has had the port since it was given the token.
+            // The process that has the token now has held the port since it got the token.
             Verification::TokenAfterwards => match upstream.connect().await {
                 Ok(mut connection) => look_up(&mut connection, token).await,
                 Err(error) => Err(error.into()),
@@ -99,7 +95,7 @@ impl Verified {
     }
 }
 
-/// Verifies a new `connection`, because the master may have been replaced unnoticed.
+/// Verifies a new `connection`, because another master may listen there by now.
 pub(crate) async fn connection(
     mut connection: Connection,
     upstream: &Upstream,
@@ -108,15 +104,14 @@ pub(crate) async fn connection(
     let by = upstream.verification().ok_or(VerifyError::Ended)?;
     match &by {
         Verification::TokenFirst => look_up(&mut connection, token).await?,
-        // The sentinel is open after the connect, so the connection leads to the same process.
+        // The sentinel is still open after connecting, so the connection leads to the same process.
         Verification::Sentinel(sentinel) => is_open(sentinel)?,
         Verification::TokenAfterwards => {}
     }
     Ok(Verified { connection, by })
 }
 
-/// Probes the master that `sentinel` is connected to, and renews the sentinel if the master bears
-/// `token`.
+/// Probes the master that `sentinel` is connected to. Renews the sentinel if the master has `token`.
 pub(crate) async fn probe(
     upstream: &Upstream,
     token: &Token,

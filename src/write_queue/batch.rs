@@ -14,8 +14,8 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Most calls in a batch. A compact multicall costs the master some 40 µs per call, so a call waits
-/// for a few milliseconds at most.
+/// Most calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a few
+/// milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
 /// Most bytes of bodies in a batch.
 pub(super) const BYTES_MAX: usize = 1 << 20;
@@ -24,7 +24,7 @@ pub(super) const BYTES_MAX: usize = 1 << 20;
 pub(crate) enum Answer {
     /// The master's reply as it came.
     Raw(RawReply),
-    /// A reply that must be encoded: the mirror's, or one result of a batch.
+    /// A reply that rosrescue must encode: the mirror's, or one result out of a batch.
     Made(Reply),
     /// No answer: the connection is closed, so that the client retries.
     Close,
@@ -34,28 +34,28 @@ pub(crate) enum Answer {
 
 #[derive(Debug)]
 pub(crate) struct Item {
-    /// The client's bytes; none for a call made by rosrescue.
+    /// The client's bytes. `None` for a call made by rosrescue.
     pub raw: Option<(Head, Bytes)>,
-    /// The call; none if the bytes could not be decoded.
+    /// The call. `None` if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
     answer: oneshot::Sender<Answered>,
-    /// The call's relation to what nodes hear.
+    /// The subjects of the call, for the order in which nodes hear of them.
     concern: Concern,
-    /// The call's answer, once the call is on its way to the master or the mirror has answered it.
+    /// The answer's place in the order. Set once the call is on its way to the master, or the mirror has answered it.
     pub delivery: Option<Delivery>,
-    /// For a call made by rosrescue: the condition under which it is still right.
+    /// For a call made by rosrescue: the condition under which it is still wanted.
     pub condition: Option<Condition>,
-    /// Whether the nodes whose ports it takes have been dealt with.
+    /// Whether nodes whose port the call takes have been unregistered.
     pub way_made: bool,
     pub source: Source,
-    /// For writes of a computer that was cut off.
+    /// Set for the writes of a computer that was cut off.
     pub(super) merge: Option<Merge>,
 }
 
 /// An answer, and what must be dropped when the caller has it.
 pub(crate) type Answered = (Answer, Option<Delivery>);
 
-/// A node and its last calls when it was decided to register or unregister something for it. The
+/// A node and its last calls at the time when rosrescue decided to register or unregister something for it. The
 /// condition fails if the node itself does the opposite meanwhile.
 #[derive(Clone, Debug)]
 pub struct Condition {
@@ -74,8 +74,8 @@ impl Condition {
 }
 
 impl Item {
-    /// Creates an item for a client's call, or for one made by rosrescue if there is no `raw`. Also
-    /// returns where its answer arrives.
+    /// Creates an item for a client's call, or without `raw` for a call made by rosrescue. Also returns the receiver of
+    /// its answer.
     pub(crate) fn new(
         raw: Option<(Head, Bytes)>,
         call: Option<Arc<Request>>,
@@ -99,7 +99,7 @@ impl Item {
         &self.concern
     }
 
-    /// Treats the call as if no node heard of anything.
+    /// Treats the call as if no node were notified of anything.
     #[cfg(test)]
     pub(super) fn forget_concern(&mut self) {
         self.concern = Concern::default();
@@ -109,13 +109,13 @@ impl Item {
         let _ = self.answer.send((answer, self.delivery));
     }
 
-    /// Whether nobody waits for the answer: the call is answered, or its client has gone.
+    /// Whether the answer is no longer awaited: the call is answered, or its client has disconnected.
     pub(super) fn is_dropped(&self) -> bool {
         self.answer.is_closed()
     }
 
-    /// Whether it must stay behind everything that was queued before it: it may do anything, or its
-    /// decision was based on that.
+    /// Whether the call must stay behind all calls that were queued before it: it may change anything, or was decided
+    /// from their effects.
     fn is_last(&self) -> bool {
         self.raw.is_none() || self.call.is_none()
     }
@@ -152,7 +152,7 @@ impl Item {
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
     pub(crate) items: Vec<Item>,
-    /// When to try again because of calls that were passed over; none if a change will be reported.
+    /// When to try again because calls were passed over. `None` if a change will wake the queue.
     pub(crate) until: Option<Instant>,
 }
 
@@ -206,7 +206,7 @@ pub(crate) fn pack(
     batch
 }
 
-/// The request for `items`; for a single call, the client's own bytes.
+/// The request for `items`. For a single call, the client's own bytes.
 pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     if let [
         Item {
@@ -230,7 +230,7 @@ pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     (Head::default(), Bytes::from(body))
 }
 
-/// The replies to the `count` calls of a batch; none if the master did not answer each.
+/// The replies to the `count` calls of a batch. `None` if the master did not answer each.
 pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     let Reply::Value(Value::Array(results)) = reply else {
         return None;

@@ -74,7 +74,7 @@ pub(crate) struct Drain {
     incarnation: u64,
     resync: ResyncSchedule,
     retry_at: Option<tokio::time::Instant>,
-    /// When calls that wait for answers to others are tried again at the latest.
+    /// Latest time to retry calls that wait until other calls are answered.
     pub(super) held_until: Option<tokio::time::Instant>,
     order_changed: watch::Receiver<()>,
     lease: watch::Receiver<Option<Instant>>,

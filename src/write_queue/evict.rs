@@ -1,5 +1,5 @@
-//! With `--reap-dead-nodes`, a node is unregistered when another node registers its port. No node
-//! is asked, because a node cannot answer before its registration is done.
+//! Unregisters a node when another node registers its port, with `--reap-dead-nodes`. The node is not asked, because a
+//! node cannot answer before its registration is done.
 
 use std::{sync::Arc, time::Instant};
 
@@ -30,7 +30,7 @@ impl Drain {
                 .into_iter()
                 .filter_map(|item| merge::judged(&ledger, item))
                 .collect();
-            // The answered calls leave room for others.
+            // Answered calls leave room for more.
             if !any || !items.is_empty() {
                 break items;
             }
@@ -68,7 +68,7 @@ fn eviction(ledger: &Ledger, call: &Request) -> Option<Eviction> {
     ledger.with_mirror(|mirror| Eviction::before(mirror, call))
 }
 
-/// Evicts while the mirror stands in, which happens at once.
+/// Unregisters at once, while the mirror stands in.
 pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     if let Some(eviction) = eviction(ledger, call)
         && ledger.stand_in(Instant::now(), &eviction.call).is_some()

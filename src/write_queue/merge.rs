@@ -1,5 +1,5 @@
-//! Merges the writes of a computer that was cut off. Writes that conflict with changes by others
-//! are left out at the last moment, when nothing else is on its way to the master.
+//! Merges the writes of a computer that was cut off. Conflicts with changes by other computers are left out at the last
+//! moment, when no other call is on its way to the master.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -17,7 +17,7 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// The latest verdicts on the writes of an item.
+/// The last verdicts on the writes of an item.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Judged(Arc<Mutex<Option<Vec<Verdict>>>>);
 
@@ -26,8 +26,7 @@ impl Judged {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = verdicts;
     }
 
-    /// The answer to the computer that sent the writes, given the master's `reply` to those that
-    /// were made.
+    /// The answer to the computer that sent the writes. `reply` is the master's reply to those that were made.
     pub(super) fn answer(&self, reply: &Reply) -> wire::Answer {
         match &*self.0.lock().unwrap_or_else(PoisonError::into_inner) {
             Some(verdicts) => wire::Answer::of(verdicts, reply),
@@ -43,7 +42,7 @@ pub(crate) struct Merge {
     judged: Judged,
 }
 
-/// An item for the queue, where its answer arrives, and the verdicts on its writes.
+/// Makes an item for the queue. Also returns the receiver of its answer, and the verdicts on its writes.
 pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<Answered>, Judged) {
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
@@ -67,8 +66,7 @@ fn set_call(item: &mut Item, call: Request) {
     item.call = Some(call);
 }
 
-/// Leaves out writes that conflict with changes by others. None if nothing is left and the item is
-/// answered.
+/// Leaves out writes that conflict with changes by other computers. `None` if none remain and the item is answered.
 pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);

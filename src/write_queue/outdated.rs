@@ -1,4 +1,4 @@
-//! Recognises calls by rosrescue that other calls have made wrong.
+//! Recognises calls by rosrescue that became wrong while they were queued.
 
 use super::batch::Item;
 use crate::{
@@ -6,8 +6,8 @@ use crate::{
     master::Master,
 };
 
-/// Whether a call made by rosrescue is no longer right: the node has come back at another address
-/// and would be shut down, or it has done the opposite itself.
+/// Whether a call made by rosrescue is no longer right. The node has registered at another address, and the call would
+/// shut it down; or the node itself has done the opposite.
 pub(super) fn is_outdated(ledger: &Ledger, item: &Item) -> bool {
     let Some(call) = item.call.as_deref().filter(|_| item.raw.is_none()) else {
         return false;

@@ -1,5 +1,5 @@
-//! Sends long multicalls to the master in parts, so that other writes pass in between. rosmaster
-//! does not run a multicall as one step either: the entries of concurrent multicalls take turns.
+//! Sends long multicalls to the master in parts, so that other writes pass in between. rosmaster does not run a
+//! multicall as one step either: entries of concurrent multicalls take turns.
 
 use std::{iter::Peekable, vec};
 
@@ -9,14 +9,14 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Most entries of a multicall that is sent whole, in its client's bytes.
+/// Most entries of a multicall that is sent whole, as the client's own bytes.
 const ENTRIES_WHOLE: usize = 2 * CALLS_MAX;
 
-/// The parts of a long multicall: multicalls of a batch's size, in order.
+/// The parts of a long multicall, in order. Each is a multicall of a batch's size.
 pub(crate) struct Parts(Peekable<vec::IntoIter<Entry>>);
 
 impl Parts {
-    /// Takes `call` apart; none if it must be sent whole. `bytes` is the length of its body.
+    /// Splits `call`. `None` if it must be sent whole. `bytes` is the length of its body.
     pub(crate) fn of(call: &mut Option<Request>, bytes: usize) -> Option<Self> {
         let call = call.take_if(|call| {
             let entries = call.entries();
@@ -44,9 +44,8 @@ impl Iterator for Parts {
     }
 }
 
-/// Whether the entry's result depends on no other entry. A malformed entry, or a parameter's value
-/// that the master cannot return, turns the whole multicall into a fault. A dict among the results
-/// shows later writes.
+/// Whether the entry's result is independent of other entries. A malformed entry, or a parameter's value that the
+/// master cannot return, turns the whole multicall into a fault. A dict among the results shows later writes.
 fn stands_alone(entry: &Entry) -> bool {
     let Entry::Request(call) = entry else {
         return false;
@@ -66,7 +65,7 @@ fn weight(entry: &Entry) -> usize {
 mod tests {
     use super::*;
 
-    /// The multicall with a malformed entry at its end.
+    /// The multicall with a malformed entry added at its end.
     fn malformed(call: Request) -> Request {
         let mut entries = call.into_entries();
         entries.push(Entry::Malformed("malformed".into()));

@@ -7,18 +7,17 @@ use tokio::time::Instant;
 
 /// Pause after an inspection that failed.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);
-/// Writes wait for an inspection, and a larger state takes longer. After each inspection writes
-/// pass for this many times its duration; calls that need an inspection meanwhile share the next
-/// one.
+/// After each inspection writes pass for this many times its duration, because they wait for inspections and a larger
+/// state takes longer. Requests that come meanwhile share the next inspection.
 const SPACING: u32 = 10;
-/// Longest pause between two inspections, because answers may wait for the next one.
+/// Longest pause between two inspections. Answers may be waiting for the next one.
 const SPACING_MOST: Duration = Duration::from_secs(30);
 
 /// The schedule of inspections.
 #[derive(Debug, Default)]
 pub(super) struct ResyncSchedule {
     due: bool,
-    /// When an inspection that failed or came too early is due again.
+    /// When to repeat an inspection that failed or came too early.
     retry_at: Option<Instant>,
     not_before: Option<Instant>,
 }
@@ -43,7 +42,7 @@ impl ResyncSchedule {
         (self.due, self.retry_at) = (true, None);
     }
 
-    /// Forgets all requests, because they concerned the previous incarnation.
+    /// Drops all requests, because they concerned the previous incarnation.
     pub(super) fn reset(&mut self) {
         (self.due, self.retry_at) = (false, None);
     }

@@ -17,7 +17,7 @@ use crate::{
 
 /// The result of a round trip.
 pub(super) struct Done {
-    /// The next connection, if there is one already, and its incarnation.
+    /// The next connection, if there is one already, with its incarnation.
     pub(super) connection: Option<(u64, Next)>,
     pub(super) result: Result<Received, RoundTripError>,
 }
@@ -42,7 +42,7 @@ pub(super) enum RoundTripError {
 }
 
 impl RoundTripError {
-    /// Whether the master may have run what was sent.
+    /// Whether the master may have run the request.
     pub(super) fn may_have_run(&self) -> bool {
         let is_unsent =
             |error: &CallError| matches!(error, CallError::NotSent(_) | CallError::NotConnected(_));
@@ -50,8 +50,8 @@ impl RoundTripError {
     }
 }
 
-/// Sends `request`, or reads the master's state if there is none. The future owns what it needs, so
-/// dropping it ends the connection.
+/// Sends `request`, or without one reads the master's state. The future owns what it needs, so dropping it closes the
+/// connection.
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,
@@ -103,7 +103,7 @@ async fn connect(link: Link, token: Token) -> Result<Verified, VerifyError> {
     verify::connection(connection, &link.upstream, &token).await
 }
 
-/// Reads the state of the master behind a connection.
+/// Reads the state of the connected master.
 async fn held(link: &Link, token: &Token, verified: &mut Verified) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
     let mut first = inspect::first(&mut verified.connection, token).await?;

@@ -116,7 +116,7 @@ struct World {
     batch: u64,
     /// Whether the mirror has answered the batch in flight.
     late: bool,
-    /// The master; none while it is dead.
+    /// The master. `None` while it is dead.
     master: Option<Master>,
     /// Number of the master.
     life: u64,

@@ -1,4 +1,4 @@
-//! What is read from a damaged checkpoint is what was written or nothing, never something else.
+//! Reading a damaged checkpoint returns what was written, or less, but never anything else.
 
 use std::path::Path;
 
@@ -145,7 +145,7 @@ fn records_of_an_earlier_file_are_ignored() {
     let (mut bytes, starts, stamp) = file(3, 2);
     let (old, old_starts, _) = file(9, 1);
     let whole = bytes.len();
-    // Whole records of an older file, with just the numbers that would come next.
+    // Undamaged records of an older file, with the numbers that would come next.
     bytes.extend_from_slice(&old[old_starts[3]..]);
     let decoded = decode(&bytes).unwrap();
     assert_eq!(decoded.records.len(), 3);
@@ -158,7 +158,7 @@ fn records_of_an_earlier_file_are_ignored() {
     assert_eq!(decoded.records.len(), 4);
     assert_eq!(decoded.damaged.len(), 6);
 
-    // A record that is there twice, or is already in the snapshot.
+    // A record that occurs twice, or is already in the snapshot.
     for seq in [8, 7] {
         let mut bytes = bytes[..starts[1]].to_vec();
         bytes.extend(encode_record(&record(seq), stamp).unwrap());
@@ -192,7 +192,7 @@ fn files_of_other_programs_are_recognised() {
         let error = decode(foreign.as_bytes()).unwrap_err();
         assert_eq!(error, DecodeError::NotACheckpoint, "{foreign}");
     }
-    // Files as a crash of the machine may leave them count as ours.
+    // Files that a crash of the computer may leave count as checkpoints.
     for ours in [&b""[..], &[0; 4096], b"# rosrescue check"] {
         assert_eq!(
             decode(ours).unwrap().checkpoint.unwrap_err(),
@@ -210,7 +210,7 @@ fn a_newer_format_is_recognised() {
         decode(&bytes).unwrap_err(),
         DecodeError::NewerVersion { version: 2 }
     );
-    // With a wrong check sum it counts as a damaged file of ours.
+    // With a wrong check sum it counts as a damaged checkpoint.
     bytes[line.len()] ^= 1;
     assert_eq!(
         decode(&bytes).unwrap().checkpoint.unwrap_err(),

@@ -26,7 +26,7 @@ const VALUES: &[&str] = &[
     "<a><b></a></b>", "<a:b>x</a:c>", "\u{1}", "\u{b}", "\u{1f}", "\u{fffe}", "\u{ffff}",
     "<!-- \u{1} -->", "<!-- \u{ffff} -->", "<?pi \u{2}?>", "<string a='\u{3}'/>",
     "<string a='\u{fffe}'/>", "<![CDATA[\u{0}]]>", "<![CDATA[\u{ffff}]]>", "\0",
-    // Where quick-xml alone is, or might be, more lenient than XML.
+    // Documents for which quick-xml alone is, or may be, more lenient than XML.
     "<!---> -->", "<!--->-->", "<!-->-->", "<!-- - -->", "<!--- -->", "<!-x-->", "<??>", "<?>",
     "<?>?>", "<?? ?>", "<![CDATA[]>]]>", "<![CDATA[>]]>", "<![CDATA[]]]>", "<![CDATA[]]]]>",
     "<![ CDATA[]]>", "<![]]>", "<a'>'>x</a'>'>", "<string><a/b></a/b></string>",
@@ -214,7 +214,7 @@ pub(crate) fn value(inside: &str) -> Vec<u8> {
     params(&format!("<param><value>{inside}</value></param>"))
 }
 
-/// Documents that CPython and our decoder must treat alike.
+/// Documents that CPython and this decoder must treat alike.
 pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     let mut documents = Vec::new();
     for inside in VALUES {
@@ -269,7 +269,7 @@ pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     documents
 }
 
-/// Documents that CPython accepts and our decoder refuses, so that they are only forwarded.
+/// Documents that CPython accepts and this decoder refuses, so that they are only forwarded.
 pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
     let utf16 = |mark: bool| {
         let text = "<?xml version='1.0'?><methodName>m</methodName>".encode_utf16();

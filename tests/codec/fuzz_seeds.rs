@@ -1,5 +1,5 @@
-//! Runs the checks of the fuzz targets on their seeds, which include every input that ever failed.
-//! `fuzz/README.md` says how to search for more.
+//! Runs the checks of the fuzz targets on their seeds, which include every input that ever failed. `fuzz/README.md`
+//! explains how to search for more.
 
 #[path = "../../fuzz/checks/checkpoint.rs"]
 mod checkpoint;

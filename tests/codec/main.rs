@@ -52,7 +52,7 @@ fn notation(value: &Value) -> String {
     }
 }
 
-/// The result of our decoder in the notation of `peer.py`.
+/// The result of this decoder in the notation of `peer.py`.
 fn verdict(verb: &str, document: &[u8]) -> Result<String, DecodeError> {
     if verb == "call" {
         let call = decode_call(document)?;
@@ -80,8 +80,8 @@ fn plain(document: &[u8]) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// Checks that both decoders give the same result, or that ours refuses for one of the permitted reasons. If
-/// our decoder predicts the fault, it must be the same too.
+/// Checks that both decoders give the same result, or that this one refuses for one of the permitted reasons. If this
+/// decoder predicts the fault, it must be the same too.
 fn compare(peer: &mut Peer, verb: &str, document: &[u8]) -> Result<(), String> {
     let theirs = peer.ask(verb, document);
     let shown = String::from_utf8_lossy(document);

@@ -1,4 +1,4 @@
-//! The model, which never crashes, against rosrescue before a rosmaster that does.
+//! Compares the model, which never crashes, with rosrescue in front of a rosmaster that crashes.
 
 use std::time::{Duration, Instant};
 
@@ -14,16 +14,16 @@ use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
 use crate::support::{Client, Rescue, Scratch, Setup, free_port, http_request, signal, status};
 
-/// A sequence with so many crashes.
+/// A random sequence with this many crashes.
 pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> Script {
     let mut dice = Dice(seed);
     let mut cast = Cast {
         apis: (0..nodes).map(node_api).collect(),
-        // What a master cannot return does not survive it: while there is such a value no crash
-        // happens, and before and after they do.
+        // A successor cannot get a value that no master can return. While there is such a value, no crash happens.
+        // Before and after it, crashes do happen.
         unreturnable: dice.once_in(4),
         errors: !dice.once_in(4),
-        // Another master is another process.
+        // Each master has a different process id.
         process: false,
     };
     cast.apis.push("rosrpc://h:1".to_owned());
@@ -51,20 +51,21 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
     }
 }
 
-/// rosrescue and what is behind it.
+/// rosrescue and the master behind it.
 struct Rig {
     /// Whether rosrescue runs the master.
     supervised: bool,
     master: Option<Rosmaster>,
     master_port: u16,
-    /// The process id of a master that was killed.
+    /// Process id of the master that was killed.
     killed: i32,
     rescue: Rescue,
     _scratch: Scratch,
 }
 
 impl Rig {
-    /// With `core`, rosrescue runs the master and rosout itself. `reads`: who answers them.
+    /// Starts rosrescue. With `core`, it runs the master and rosout itself. `reads` says whether the master or the
+    /// mirror answers reads.
     fn start(core: bool, reads: &str) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
@@ -76,7 +77,7 @@ impl Rig {
                 (Setup::proxy(&scratch, master_port), Some(master))
             }
         };
-        // What only a master answers waits as long as a busy computer needs.
+        // Calls that only a master can answer wait long enough for a busy computer.
         let rescue = setup.args(["--hold", "60", "--reads", reads]).start();
         Self {
             supervised: core,
@@ -92,18 +93,18 @@ impl Rig {
         Wire::connect(self.rescue.port()).expect("rosrescue listens all the time")
     }
 
-    /// The state that the sequence starts from: that of a core holds rosout and three parameters.
+    /// The state from which the sequence starts. A core's state contains rosout and three parameters.
     fn state(&self) -> Master {
         read_state(&mut self.wire(), |model| {
             !self.supervised || is_complete(model)
         })
     }
 
-    /// Whether rosrescue answers a read to the byte as the master behind it does.
+    /// Whether rosrescue answers a read with the same bytes as the master behind it.
     fn same_bytes(&self, read: &Call, parsed: &Request) -> Result<(), Failure> {
         let mut calls = parsed.calls().into_iter();
         if calls.any(|call| call.kind() == Kind::Identity) {
-            // The address is our own.
+            // The address is that of rosrescue.
             return Ok(());
         }
         let request = http_request(&encode_call(read));
@@ -117,14 +118,14 @@ impl Rig {
         }
     }
 
-    /// SIGKILL for the master. Another one is on its way when this returns.
+    /// Kills the master with SIGKILL, and starts the next one.
     fn crash(&mut self) -> Result<(), Failure> {
         self.kill()?;
         self.revive();
         Ok(())
     }
 
-    /// SIGKILL for the master. A core starts the next one by itself.
+    /// Kills the master with SIGKILL. A core starts the next one by itself.
     fn kill(&mut self) -> Result<(), Failure> {
         let deadline = Instant::now() + patience();
         let mut wire = self.wire();
@@ -152,13 +153,13 @@ impl Rig {
         }
     }
 
-    /// Whether calls pass to a master that lives.
+    /// Whether calls pass to a living master.
     fn is_open(&self) -> bool {
         let status = status(&self.rescue.client());
         status["open"] == true && status["last_recovery"]["master_pid"] != self.killed
     }
 
-    /// Waits until calls pass to a master, or no longer.
+    /// Waits until calls pass to a master, or until they no longer do.
     fn await_gate(&self, open: bool) -> Result<(), Failure> {
         let deadline = Instant::now() + patience();
         while self.is_open() != open {
@@ -171,7 +172,7 @@ impl Rig {
     }
 }
 
-/// The state there once it is `complete`.
+/// The state at the other end once it is `complete`.
 pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) -> Master {
     let deadline = Instant::now() + Duration::from_secs(60);
     let mut model = Master::default();
@@ -184,7 +185,7 @@ pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) ->
         let second = look
             .second_call(&nothing)
             .map(|call| wire.call(&call.into()).unwrap());
-        // A rosout that registers between the two looks is seen by the next.
+        // The next read sees a rosout that registers between the two requests.
         model = look
             .into_master(second.as_ref(), &nothing)
             .unwrap_or_default();
@@ -200,7 +201,7 @@ pub(crate) fn has_params(model: &Master) -> bool {
     keys.iter().all(|key| model.params().contains_key(*key))
 }
 
-/// Whether core has done all that roscore does.
+/// Whether core has done everything that roscore does.
 fn is_complete(model: &Master) -> bool {
     has_params(model)
         && model.counts().services == 2
@@ -208,21 +209,21 @@ fn is_complete(model: &Master) -> bool {
         && !model.subscribers_of("/rosout").is_empty()
 }
 
-/// So many of all.
+/// A number of cases, and how many of them there could have been.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Share {
     pub(crate) happened: usize,
     pub(crate) asked: usize,
 }
 
-/// What a run was.
+/// The totals of a run.
 #[derive(Default)]
 pub(crate) struct Tally {
-    /// Crashes that happened, and those that were asked for, in sequences of values that a master can return.
+    /// Crashes that happened and that were requested, in sequences of values that a master can return.
     pub(crate) sound: Share,
-    /// The same with others.
+    /// The same for sequences with values that a master cannot return.
     pub(crate) with_unreturnable: Share,
-    /// Crashes left out, since something could not have been brought back: what.
+    /// What prevented crashes, because a successor could not have got it.
     pub(crate) spared: Vec<Skipped>,
 }
 
@@ -250,11 +251,11 @@ pub(crate) fn run(
                 let request = Request::from(call.clone());
                 after.apply(&request);
                 if stage.away && !request.is_answerable() {
-                    // It waits for a master.
+                    // The handover needs a master.
                     rig.revive();
                 }
                 if stage.away && !skipped(&after).is_empty() {
-                    // What cannot be brought to another master is for one that is there.
+                    // Only a running master can answer for what a successor could not get.
                     rig.revive();
                     rig.await_gate(true)?;
                 }
@@ -275,7 +276,7 @@ pub(crate) fn run(
                 share.asked += 1;
                 rig.revive();
                 let mut skipped = skipped(&stage.model);
-                // The call that is under way may be part of the state.
+                // The running call may be part of the state.
                 if let (true, Some(Step::Call { call, .. })) = (during, script.steps.get(nth + 1)) {
                     let mut after = stage.model.clone();
                     after.apply(&stage.real(call).into());
@@ -287,7 +288,7 @@ pub(crate) fn run(
                 }
                 share.happened += 1;
                 in_flight = *during;
-                // What was queued is heard before; a crash loses it, which is nobody's fault.
+                // Everything queued arrives before the crash, which would lose it.
                 stage.settle().and_then(|()| {
                     let repeats = stage.repeats.get_or_insert_default();
                     repeats.crash(&stage.model);
@@ -295,7 +296,7 @@ pub(crate) fn run(
                     if *during { Ok(()) } else { rig.crash() }
                 })
             }
-            // A call that is to be in flight needs a master.
+            // A call that must be in flight needs a master.
             Step::Away
                 if !in_flight && skipped(&stage.model).is_empty() && rig.master.is_some() =>
             {
@@ -332,7 +333,7 @@ pub(crate) fn run(
     end.map_err(|why| format!("at the end: {why}"))
 }
 
-/// Sends a call and kills the master some moment after.
+/// Sends a call, and kills the master a moment later.
 fn crash_under(
     rig: &mut Rig,
     stage: &mut Stage<'_>,
@@ -349,7 +350,7 @@ fn crash_under(
     stage.answered(call, &reply, true)
 }
 
-/// What of that state cannot be brought to an empty master.
+/// The parts of this state that an empty master cannot get.
 pub(crate) fn skipped(model: &Master) -> Vec<Skipped> {
     let plan = Plan::new(model, &Master::default(), &Token::new("test", 1));
     plan.skipped().to_vec()

@@ -1,19 +1,19 @@
-//! Random calls, from names and values that collide.
+//! Random calls with few names and values, so that they collide often.
 
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
-/// A generator of numbers: splitmix64.
+/// A splitmix64 random number generator.
 pub(crate) struct Dice(pub(crate) u64);
 
-/// What the calls of one sequence may hold.
+/// The possible contents of the calls of one sequence.
 pub(crate) struct Cast {
-    /// Addresses of nodes.
+    /// The nodes' addresses.
     pub(crate) apis: Vec<String>,
     /// Whether values occur that a master cannot return.
     pub(crate) unreturnable: bool,
-    /// Whether parameters may be of the wrong kind and number, and multicalls malformed.
+    /// Whether parameters may have the wrong type or number, and multicalls may be malformed.
     pub(crate) errors: bool,
-    /// Whether the master is asked for its process id.
+    /// Whether calls ask the master for its process id.
     pub(crate) process: bool,
 }
 
@@ -89,7 +89,7 @@ impl Dice {
                 .pick(&["", "https://h", "h:1", "rosrpc://", "http://"])
                 .into();
         }
-        // Mostly one address a node, so that bumps stay rare.
+        // Most nodes have one address, so that few nodes are displaced.
         let nodes = cast.apis.len();
         let usual = caller.bytes().map(usize::from).sum::<usize>() % nodes;
         let index = if self.once_in(12) {
@@ -137,8 +137,8 @@ impl Dice {
     /// A call of any kind.
     pub(crate) fn call(&mut self, cast: &Cast, levels: usize) -> Call {
         let caller = match self.pick(CALLERS) {
-            // Only the node itself can say its name: while it is registered, nobody can bring in the
-            // type of a topic of that name.
+            // Only the node itself can use its name as a topic. While it is registered, no helper can restore the type
+            // of a topic with that name.
             "/o d" if !cast.process => "/x/",
             caller => caller,
         };
@@ -219,7 +219,7 @@ impl Dice {
                 read => read,
             },
             99 => {
-                // `shutdown` with two parameters would work.
+                // A `shutdown` with two parameters would succeed.
                 params.truncate(self.below(2));
                 self.pick(NO_METHODS)
             }
@@ -239,7 +239,7 @@ impl Dice {
             _ => {
                 let index = self.below(params.len());
                 params[index] = match self.value(cast, 2) {
-                    // Would pass as the type `*` does and be kept as a date.
+                    // rosmaster would accept it like the type `*` and keep it as a date.
                     Value::DateTime(_) => Value::Nil,
                     value => value,
                 };
@@ -247,7 +247,7 @@ impl Dice {
         }
     }
 
-    /// Reads and writes of few namespaces, which within one multicall see each other.
+    /// Reads and writes in a few namespaces, which affect each other within one multicall.
     fn churn(&mut self, cast: &Cast) -> Call {
         let key = self.pick(&["/a", "/a/b", "/a/b/c", "/"]).into();
         let mut params = vec!["/n0".into(), key];
@@ -293,7 +293,7 @@ impl Dice {
                 1 => drop(entry.shift_remove("methodName")),
                 2 => entries[index] = self.value(cast, 2),
                 3 | 4 => {
-                    // Attributes that are no methods show their own text when called so.
+                    // Calling an attribute that is not a method returns the attribute's own text.
                     let callable = entry["methodName"]
                         .as_str()
                         .is_none_or(|name| !NO_METHODS.contains(&name));

@@ -1,4 +1,4 @@
-//! The model against a bare rosmaster.
+//! Compares the model with a bare rosmaster.
 
 use rosrescue::master::{Master, Notice, Request};
 use rosrescue::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
@@ -11,10 +11,10 @@ use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
 use crate::support::unordered;
 
-/// Calls that a successor has answered before the state is brought to it, if any.
+/// Most calls that a successor has answered before it gets the state.
 const FOUND: usize = 15;
 
-/// A sequence, with one or two successors.
+/// A random sequence with one or two successors.
 pub(crate) fn script(seed: u64, calls: usize, nodes: usize) -> Script {
     let mut dice = Dice(seed);
     let mut cast = Cast {
@@ -25,7 +25,7 @@ pub(crate) fn script(seed: u64, calls: usize, nodes: usize) -> Script {
     };
     cast.apis.push("rosrpc://h:1".to_owned());
     let unreturnable = cast.unreturnable;
-    // What a master cannot return is not brought along, which ends the comparison of values.
+    // A successor does not get values that a master cannot return, so values can no longer be compared.
     let between = (!unreturnable && dice.once_in(2)).then(|| dice.below(calls.max(1)));
     let mut steps = Vec::with_capacity(calls + 2);
     for nth in 0..calls {
@@ -81,7 +81,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
     Ok(())
 }
 
-/// Compares all that can be heard, read and seen.
+/// Compares everything that can be heard or read.
 fn finish(stage: &mut Stage<'_>) -> Result<(), Failure> {
     stage.settle()?;
     let mut wire = stage.wires.remove(0);
@@ -92,7 +92,7 @@ fn finish(stage: &mut Stage<'_>) -> Result<(), Failure> {
     same
 }
 
-/// Brings the state to a master that has answered the calls `found`, and goes on with that one.
+/// Brings the state to a master that has answered the calls `found`, and continues with that master.
 fn succeed(
     stage: &mut Stage<'_>,
     wires: Vec<Wire>,
@@ -147,7 +147,7 @@ fn succeed(
     Ok(())
 }
 
-/// A look at the real master, with the model as the state known before, must show the model.
+/// Inspects the real master, with the model as the known state, and checks that the result equals the model.
 fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     let mark = Token::new("none", 1);
     let mut look = |call: Request| {

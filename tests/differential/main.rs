@@ -56,17 +56,17 @@ const CRASH_SEQUENCES: u64 = 30;
 const TAKEOVER_SEQUENCES: u64 = 8;
 const CALLS: u64 = 200;
 const CRASHES: u64 = 3;
-/// A core takes a while to start.
+/// Starting a core takes long, so only every sixth sequence uses one.
 const CORE_EACH: u64 = 6;
-/// Others have two computers.
+/// The other sequences use two computers.
 const THREE_EACH: u64 = 3;
-/// Who answers reads; the mirror in two of three sequences.
+/// Whether master or mirror answers reads; the mirror in two of three sequences.
 const READS: [&str; 2] = ["master", "mirror"];
-/// Nodes that listen.
+/// Number of nodes that receive callbacks.
 const NODES: usize = 5;
-/// Runs that are worth a shorter script,
+/// Most runs for finding a shorter script.
 const PATIENCE: usize = 300;
-/// and time. One run of a sequence with takeovers may take half a minute.
+/// Longest time for finding a shorter script. One run with takeovers may take half a minute.
 const SHRINKING: Duration = Duration::from_secs(120);
 
 fn number(name: &str, default: u64) -> u64 {
@@ -76,8 +76,7 @@ fn number(name: &str, default: u64) -> u64 {
     }
 }
 
-/// What is played before any random sequence: all that ever failed, or the one file that is given
-/// instead of everything else.
+/// The scripts to play before random sequences: all that ever failed, or only the file in `ROSRESCUE_SCRIPT`.
 fn scripts() -> (Vec<(String, Script)>, bool) {
     let read = |path: &Path| {
         let script = Script::parse(&std::fs::read_to_string(path).unwrap());
@@ -95,17 +94,17 @@ fn nodes() -> Vec<Node> {
     (0..NODES).map(|_| Node::start()).collect()
 }
 
-/// Plays `script`, and if that fails a shorter one and panics.
+/// Plays `script`. If that fails, searches for a shorter script that fails too, and panics.
 fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), Failure>) {
     let Err(first) = run(script) else { return };
-    // At once, and not with the test's output: a person who waits must know what for.
+    // Printed at once and not with the test's output, because the search takes long.
     let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
     say(format!(
         "{what} fails: {first}\n\n{}\nIt is made shorter now, for at most {SHRINKING:?}.",
         script.print()
     ));
     let deadline = Instant::now() + SHRINKING;
-    // Another failure that a busy machine causes is no shorter form of this one.
+    // A failure by timeout is not a shorter form of this failure.
     let is_late = |why: &Failure| why.contains("there is never");
     let late = is_late(&first);
     nodes::HURRIED.store(!late, Ordering::Relaxed);
@@ -205,7 +204,7 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
          {spared:?}, seeds from {first}, {:?}",
         start.elapsed()
     );
-    // A test without crashes would show nothing. A few sequences may have none by chance.
+    // A test without crashes would prove nothing. A few sequences may have none by chance.
     if count * crashes as u64 >= 50 {
         assert!(sound.happened * 4 >= sound.asked * 3, "{sound:?}");
         assert!(with_unreturnable.happened > 0, "{with_unreturnable:?}");
@@ -244,7 +243,7 @@ fn through_several_computers_no_takeover_can_be_told() {
         "{count} sequences, {played} calls, {tally:?}, seeds from {first}, {:?}",
         start.elapsed()
     );
-    // A test without takeovers would show nothing. A few sequences may have none by chance.
+    // A test without takeovers would prove nothing. A few sequences may have none by chance.
     if count * takeovers as u64 >= 24 {
         assert!(tally.deaths.happened * 2 >= tally.deaths.asked, "{tally:?}");
         assert!(tally.handovers.happened > 0, "{tally:?}");

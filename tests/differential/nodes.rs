@@ -1,4 +1,4 @@
-//! Nodes that only listen: they note every callback that a master sends them.
+//! Nodes that record every callback they get.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -9,10 +9,10 @@ use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
 use crate::support::FakeMaster;
 
-/// Whether a failure is known, and only its shortest script is looked for.
+/// Whether a failure was found, and only a shorter script is searched for.
 pub(crate) static HURRIED: AtomicBool = AtomicBool::new(false);
 
-/// Longest wait for callbacks. rosmaster's notifiers look for work ten times a second.
+/// Longest wait for callbacks. rosmaster's notifier threads look for work ten times a second.
 pub(crate) fn patience() -> Duration {
     Duration::from_secs(if HURRIED.load(Ordering::Relaxed) {
         3
@@ -21,10 +21,10 @@ pub(crate) fn patience() -> Duration {
     })
 }
 
-/// What the health check asks.
+/// The calls of the health check.
 const QUESTIONS: [&str; 3] = ["getPid", "getPublications", "getSubscriptions"];
 
-/// A listening node.
+/// A node that records callbacks.
 pub(crate) struct Node {
     pub(crate) api: String,
     heard: Arc<Mutex<Vec<Call>>>,
@@ -37,8 +37,8 @@ impl Node {
         let notes = Arc::clone(&heard);
         let server = FakeMaster::start(move |body| {
             let call = decode_call(body).unwrap();
-            // A question changes nothing in a node. It is alive and has no answer: what it registers is
-            // rolled with dice.
+            // A question changes nothing in a node. The node proves that it lives, but cannot answer, because its
+            // registrations are random.
             let reply = if QUESTIONS.contains(&call.method.as_str()) {
                 let text = "no such method".to_owned();
                 Reply::Fault { code: 1, text }
@@ -55,7 +55,7 @@ impl Node {
         }
     }
 
-    /// Waits until something heard is the `last` thing, and takes all that was heard.
+    /// Waits for a callback that `last` accepts, and takes all callbacks so far.
     pub(crate) fn take(&self, last: impl Fn(&Call) -> bool) -> Result<Vec<Call>, String> {
         let deadline = Instant::now() + patience();
         loop {
@@ -71,14 +71,14 @@ impl Node {
         }
     }
 
-    /// Takes what was heard up to now.
+    /// Takes the callbacks so far.
     pub(crate) fn take_now(&self) -> Vec<Call> {
         std::mem::take(&mut *self.heard.lock().unwrap())
     }
 }
 
-/// Who is called, and with what. Structs are blanked: rosmaster writes a callback when it sends it,
-/// and a dict of the parameter tree may have changed by then.
+/// The receiver and the call of a callback. Structs are left out: rosmaster encodes a callback when it sends it, and a
+/// dict of the parameter tree may have changed by then.
 pub(crate) fn as_call(notice: &Notice) -> (&str, Call) {
     let master = || Value::from("/master");
     match notice {

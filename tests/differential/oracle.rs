@@ -27,22 +27,22 @@ use crate::nodes::blank;
 #[derive(Clone, Debug)]
 pub(crate) struct Expected {
     pub(crate) call: Call,
-    /// A crash may have lost or doubled it.
+    /// Whether a crash may have lost or repeated it.
     pub(crate) risky: bool,
 }
 
 type List = (String, String, Vec<String>);
 
-/// A moment in the life of the model.
+/// An event in the life of the model.
 #[derive(Debug)]
 enum Moment {
-    /// It sends that to the node at this address. A multicall passes through states that nobody sees.
+    /// The model sends this call to the node at this address. No node sees the states inside a multicall.
     Notice(String, Call),
     State(Box<Master>),
 }
 
 impl Moment {
-    /// Whether the node at `api` may be told that now.
+    /// Whether the node at `api` may get this callback now.
     fn says(&self, api: &str, call: &Call) -> bool {
         match self {
             Self::Notice(to, notice) => to == api && notice == call,
@@ -55,31 +55,31 @@ impl Moment {
     }
 }
 
-/// Full lists of publishers, by subscriber and topic, as they have been true lately.
+/// Complete lists of publishers, by subscriber and topic, that were true recently.
 #[derive(Debug, Default)]
 pub(crate) struct TrueLists {
     before: HashSet<List>,
     since: HashSet<List>,
-    /// The states themselves, for the values of parameters.
+    /// Earlier states, for the values of parameters.
     states_before: Vec<Master>,
     states_since: Vec<Master>,
-    /// Since the call that was under way was answered.
+    /// Lists that were true after the running call was answered.
     after: HashSet<List>,
-    /// Those who have subscribed all the time since then.
+    /// Subscribers that have been registered all the time since then.
     faithful: Option<HashSet<(String, String)>>,
-    /// What was true, and told, since all that was heard was judged.
+    /// Events since the last comparison.
     course: Vec<Moment>,
 }
 
 impl TrueLists {
-    /// The master crashes in that state, and all that was heard has been judged.
+    /// The master crashes in this state, after all callbacks were compared.
     pub(crate) fn crash(&mut self, model: &Master) {
         self.before.clear();
         self.states_before.clear();
         self.crash_unjudged(model);
     }
 
-    /// The same, and what was heard is judged later.
+    /// The master crashes in this state. Its callbacks are compared later.
     pub(crate) fn crash_unjudged(&mut self, model: &Master) {
         self.before.extend(self.since.drain());
         self.states_before.append(&mut self.states_since);
@@ -88,25 +88,25 @@ impl TrueLists {
         self.add(model);
     }
 
-    /// The call that was under way led to that state.
+    /// The running call has led to this state.
     pub(crate) fn answered(&mut self, model: &Master) {
         self.after.clear();
         self.faithful = None;
         self.add(model);
     }
 
-    /// The model sends that to the node at `api`.
+    /// The model sends this call to the node at `api`.
     pub(crate) fn send(&mut self, api: &str, call: &Call) {
         let notice = Moment::Notice(api.to_owned(), call.clone());
         self.course.push(notice);
     }
 
-    /// All that was heard up to this state has been judged.
+    /// All callbacks up to this state were compared.
     pub(crate) fn settled(&mut self, model: &Master) {
         self.course = vec![Moment::State(Box::new(model.clone()))];
     }
 
-    /// The first call that tells the node at `api` what was over before another one, which it has heard earlier.
+    /// The first call that tells the node at `api` an older state than an earlier call did.
     pub(crate) fn goes_back<'c>(&self, api: &str, heard: &'c [Call]) -> Option<&'c Call> {
         let mut reached = BTreeMap::new();
         heard.iter().find(|call| {
@@ -123,7 +123,7 @@ impl TrueLists {
         })
     }
 
-    /// What is true in that state.
+    /// Adds what is true in this state.
     pub(crate) fn add(&mut self, model: &Master) {
         self.states_since.push(model.clone());
         self.course.push(Moment::State(Box::new(model.clone())));
@@ -153,8 +153,8 @@ impl TrueLists {
         list.is_some_and(|list| self.before.contains(&list) || self.since.contains(&list))
     }
 
-    /// Whether the node at `api` still must hear what the crash has swallowed: it subscribes,
-    /// and has not heard a list that was true after the call that was under way.
+    /// Whether the node at `api` still has to get what the crash has lost: it subscribes, and has not got a list that
+    /// was true after the running call.
     pub(crate) fn owes(&self, api: &str, swallowed: &Call, heard: &[Call]) -> bool {
         let Some((api, topic, _)) = as_list(api, swallowed) else {
             return false;
@@ -169,7 +169,7 @@ impl TrueLists {
     }
 }
 
-/// Whether the node at `api` subscribes what the `paramUpdate` is about, and that is so.
+/// Whether the `paramUpdate` is about a parameter to which the node at `api` subscribes, with its value in this state.
 fn is_true_param(state: &Master, api: &str, call: &Call) -> bool {
     let key = call.params.get(1).and_then(Value::as_str);
     key.is_some_and(|key| {
@@ -178,7 +178,7 @@ fn is_true_param(state: &Master, api: &str, call: &Call) -> bool {
     })
 }
 
-/// The subscriber, topic and publishers of a `publisherUpdate`.
+/// Subscriber, topic and publishers of a `publisherUpdate`.
 fn as_list(api: &str, call: &Call) -> Option<List> {
     let [
         Value::String(master),
@@ -198,15 +198,15 @@ fn as_list(api: &str, call: &Call) -> Option<List> {
     Some((api.to_owned(), topic.clone(), list?))
 }
 
-/// Whether what was heard is what had to be; gives what a crash has swallowed.
+/// Checks that the callbacks were those expected. Returns the ones that a crash has lost.
 ///
-/// Callbacks may be equal, so what was heard may be accounted for in several ways: all are followed.
+/// Callbacks may be equal, so they can be matched in several ways. All of them are tried.
 pub(crate) fn judge(
     expected: &[Expected],
     heard: &[Call],
     is_repeat: impl Fn(&Call) -> bool,
 ) -> Result<Vec<Call>, String> {
-    // How many of the expected ones may be done with.
+    // Numbers of expected callbacks that may have been matched so far.
     let mut done = BTreeSet::from([0]);
     let pass_over_lost = |done: &mut BTreeSet<usize>| {
         for (nth, it) in expected.iter().enumerate() {
@@ -364,7 +364,7 @@ mod tests {
         assert!(lists.has("http://s", &update(&["http://p1", "http://p2"])));
         assert!(!lists.has("http://s", &update(&["http://p1"])));
         assert!(!lists.has("http://p1", &update(&["http://p1", "http://p2"])));
-        // What is swallowed is owed to it until it hears what is true now.
+        // The node still has to get the lost callback until it hears what is true now.
         let late = update(&["http://p1"]);
         lists.answered(&model);
         assert!(lists.owes("http://s", &late, std::slice::from_ref(&late)));

@@ -1,4 +1,4 @@
-//! A real rosmaster, and talking to it.
+//! Starts real rosmasters and calls them.
 
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
 use crate::support::{self, Client, PATIENCE, Scratch, find_program, free_port, http_request};
 
-/// A rosmaster of its own, ended when this is dropped.
+/// A rosmaster that is killed when this is dropped.
 pub(crate) struct Rosmaster {
     process: Child,
     pub(crate) port: u16,
@@ -16,15 +16,15 @@ pub(crate) struct Rosmaster {
 }
 
 impl Rosmaster {
-    /// Starts one without waiting for it.
+    /// Starts a rosmaster without waiting for it.
     pub(crate) fn start() -> Self {
         Self::start_at(free_port())
     }
 
-    /// Starts one at `port` without waiting for it.
+    /// Starts a rosmaster at `port` without waiting for it.
     pub(crate) fn start_at(port: u16) -> Self {
         let scratch = Scratch::new();
-        // The default configuration's stream handler imports rospy, which doubles the start.
+        // The default configuration has a screen handler that imports rospy, which doubles the time to start.
         let logging = scratch.path("logging.conf");
         std::fs::write(&logging, LOGGING).unwrap();
         let mut command = Command::new(find_program("rosmaster"));
@@ -45,7 +45,7 @@ impl Rosmaster {
         }
     }
 
-    /// A connection, once it answers.
+    /// A connection, once the rosmaster answers.
     pub(crate) fn ready(&mut self) -> Wire {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -64,7 +64,7 @@ impl Rosmaster {
         }
     }
 
-    /// SIGKILL, and the end of the process.
+    /// Kills the rosmaster with SIGKILL and waits for its end.
     pub(crate) fn kill(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();
@@ -85,13 +85,13 @@ impl Wire {
         Client::new(port).connect().map(Self)
     }
 
-    /// Sends a call and does not wait for the reply.
+    /// Sends a call without waiting for the reply.
     pub(crate) fn send(&mut self, call: &Call) -> Result<(), String> {
         let sent = self.0.send(&http_request(&encode_call(call)));
         sent.map_err(|error| format!("the call cannot be sent: {error}"))
     }
 
-    /// The reply to the call that was sent.
+    /// Waits for the reply to the call that was sent.
     pub(crate) fn receive(&mut self) -> Result<Reply, String> {
         let answer = self.0.response();
         let answer = answer.map_err(|error| format!("no answer: {error}"))?;
@@ -114,7 +114,7 @@ impl Wire {
         (pid.as_int().unwrap(), uri.as_str().unwrap().to_owned())
     }
 
-    /// Makes the model answer and notify as this master does.
+    /// Makes the model answer and notify like this master.
     pub(crate) fn identify(&mut self, model: &mut Master) {
         let (pid, uri) = self.identity();
         model.set_identity(pid, uri);

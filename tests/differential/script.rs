@@ -1,9 +1,9 @@
-//! A sequence of calls as data: played, printed, read back and made shorter.
+//! A sequence of calls as data. It can be played, printed, read back and made shorter.
 
 use rosrescue::xmlrpc::{Call, Struct, Value};
 use serde_json::{Map, Value as Json, json};
 
-/// What happens, in order.
+/// A step of a sequence.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Step {
     /// A call on one of the clients' connections.
@@ -13,34 +13,34 @@ pub(crate) enum Step {
         /// The call, with the placeholders of [`node_api`] for addresses of nodes.
         call: Call,
     },
-    /// The master is killed: between two calls, or while the next one is under way.
+    /// The master is killed: between two calls, or while the next one is running.
     Crash {
-        /// Whether it is while the next call is under way.
+        /// Whether it is killed while the next call is running.
         in_flight: bool,
     },
-    /// The master is killed, and no other one comes before [`Step::Back`].
+    /// The master is killed, and stays away until [`Step::Back`].
     Away,
-    /// A master comes.
+    /// A master starts.
     Back,
-    /// The computer that leads has another one lead. Nothing where there is one computer.
+    /// The leader hands over to another computer. Without effect on a single computer.
     Handover {
-        /// Whether it is while the next call is under way.
+        /// Whether it hands over while the next call is running.
         in_flight: bool,
     },
-    /// The state is brought to a fresh master, on which others have made these calls before. The
-    /// sequence goes on with that one.
+    /// The state is brought to a new master that has answered these calls before. The sequence continues with that
+    /// master.
     Successor(Vec<Call>),
 }
 
 /// A whole sequence.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Script {
-    /// Whether values occur that a master cannot return, so that callbacks cannot be foretold.
+    /// Whether values occur that a master cannot return. Then callbacks cannot be predicted.
     pub(crate) unreturnable: bool,
     pub(crate) steps: Vec<Step>,
 }
 
-/// Stands for the address of a listening node, which is another one in each run.
+/// Placeholder for the address of a listening node, which differs in each run.
 pub(crate) fn node_api(index: usize) -> String {
     format!("http://node{index}/")
 }
@@ -73,7 +73,7 @@ fn real_value(value: &Value, apis: &[String]) -> Value {
 }
 
 impl Script {
-    /// One line a step; [`Script::parse`] reads it.
+    /// Prints one line per step. [`Script::parse`] reads them.
     pub(crate) fn print(&self) -> String {
         let mut text = String::new();
         if self.unreturnable {
@@ -99,7 +99,7 @@ impl Script {
         text
     }
 
-    /// The way back of [`Script::print`]. Empty lines and those with `#` are passed over.
+    /// Reverses [`Script::print`]. Skips empty lines and lines that begin with `#`.
     pub(crate) fn parse(text: &str) -> Self {
         let mut unreturnable = false;
         let mut steps = Vec::new();
@@ -145,7 +145,7 @@ impl Script {
     }
 }
 
-/// The same step with less in it: a multicall or a successor without one of its entries.
+/// Simpler versions of a step: a multicall or a successor without one of its entries.
 pub(crate) fn simpler(step: &Step) -> Vec<Step> {
     match step {
         Step::Call { by, call } => match call.params.as_slice() {
@@ -172,8 +172,8 @@ pub(crate) fn simpler(step: &Step) -> Vec<Step> {
     }
 }
 
-/// `whole` with as much left out as possible so that it still `fails`, which is asked at most
-/// `patience` times. Halves go first, then ever smaller pieces, then what is within the items.
+/// Removes as much from `whole` as possible while it still `fails`, which is called at most `patience` times. Removes
+/// halves first, then smaller pieces, then parts of the items.
 pub(crate) fn shrink<T: Clone>(
     whole: &[T],
     simpler: impl Fn(&T) -> Vec<T>,
@@ -189,7 +189,7 @@ pub(crate) fn shrink<T: Clone>(
     while piece > 0 {
         let mut removed = false;
         let mut end = rest.len();
-        // From the end: what comes late mostly does not matter to what comes before it.
+        // Begins at the end: late items rarely affect earlier ones.
         while end > 0 {
             let start = end.saturating_sub(piece);
             let mut fewer = rest.clone();
@@ -234,7 +234,7 @@ fn call_from_json(json: &Json) -> Call {
     Call::new(method.as_str().expect("a method"), params)
 }
 
-/// What JSON does not have is an object with one member, named after its type.
+/// Converts a value. Types that JSON lacks become an object with one member that is named after the type.
 fn to_json(value: &Value) -> Json {
     match value {
         Value::Nil => Json::Null,

@@ -1,4 +1,4 @@
-//! What makes failing sequences shorter, and how they are printed.
+//! Tests how failing sequences are made shorter, and how they are printed.
 
 use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Value};
@@ -22,7 +22,7 @@ fn the_least_that_fails_is_left() {
     );
     assert_eq!(least, [17, 150]);
     assert!(runs < 200, "{runs} runs");
-    // Even where pieces that go together lie side by side.
+    // This also works if pieces that need each other are neighbours.
     let least = shrink(
         &whole,
         |_| Vec::new(),
@@ -45,12 +45,12 @@ fn what_is_within_an_item_is_left_out_too() {
     assert_eq!(least, ["f"]);
 }
 
-/// A master with a mistake: it never lets go of a subscriber.
+/// A master with a defect: it never removes a subscriber.
 fn wrong(model: &mut Master, call: &Call) -> Option<rosrescue::xmlrpc::Reply> {
     (call.method != "unregisterSubscriber").then(|| model.apply(&call.clone().into()).reply)
 }
 
-/// Whether the wrong master is found out by an answer to one of the calls.
+/// Whether an answer to one of the calls reveals the defect.
 fn is_found_out(steps: &[Step]) -> bool {
     let (mut right, mut mistaken) = (Master::default(), Master::default());
     steps.iter().any(|step| match step {
@@ -71,7 +71,7 @@ fn a_mistake_of_the_model_is_shown_by_three_calls() {
     assert!(failing.len() > 20, "{} of 100", failing.len());
     for script in failing.iter().take(20) {
         let steps = shrink(&script.steps, simpler, usize::MAX, is_found_out);
-        // A registration, its end, and an answer that tells.
+        // A registration, its removal, and a call whose answer reveals the defect.
         assert!(is_found_out(&steps) && steps.len() <= 3, "{steps:?}");
     }
 }

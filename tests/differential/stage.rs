@@ -1,4 +1,4 @@
-//! What a run consists of: the model beside the real thing, clients, nodes, and what they must hear.
+//! The parts of a run: the model beside the real master, clients, nodes, and the callbacks that they must get.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -15,7 +15,7 @@ use crate::real::Wire;
 use crate::script::with_real_apis;
 use crate::support::{sorted, unordered};
 
-/// Clients of a run, each with a connection of its own. Their calls take turns.
+/// Number of clients. Each has its own connection, and they call in turn.
 pub(crate) const CLIENTS: usize = 3;
 
 /// Why a run failed.
@@ -27,13 +27,13 @@ pub(crate) struct Stage<'n> {
     pub(crate) apis: Vec<String>,
     pub(crate) model: Master,
     pub(crate) wires: Vec<Wire>,
-    /// Whether callbacks can be foretold.
+    /// Whether callbacks can be predicted.
     pub(crate) callbacks: bool,
-    /// What each node must hear since the last settling.
+    /// The callbacks that each node must get before the next comparison.
     told: Vec<Vec<Expected>>,
-    /// What may be repeated because of a crash.
+    /// The callbacks that may be repeated because of a crash.
     pub(crate) repeats: Option<TrueLists>,
-    /// Whether the master may be away: rosrescue notifies the nodes then.
+    /// Whether the master may be away. Then rosrescue notifies the nodes.
     pub(crate) away: bool,
 }
 
@@ -58,18 +58,18 @@ impl<'n> Stage<'n> {
         with_real_apis(call, &self.apis)
     }
 
-    /// Through rosrescue a node may be told the present state once more: `docs/decisions/0031`.
+    /// Allows that rosrescue tells a node the present state again, as in `docs/decisions/0031`.
     pub(crate) fn allow_repeats(&mut self) {
         self.repeats.get_or_insert_default().add(&self.model);
     }
 
-    /// Makes a call, which both must answer alike.
+    /// Makes a call. Both masters must answer alike.
     pub(crate) fn call(&mut self, by: usize, call: &Call) -> Result<(), Failure> {
         let reply = self.wires[by].call(call)?;
         self.answered(call, &reply, false)
     }
 
-    /// Compares the reply to `call` with the model's. `risky`: a crash may have lost or doubled the
+    /// Compares the reply to `call` with the model's. `risky` says that a crash may have lost or repeated the
     /// callbacks.
     pub(crate) fn answered(
         &mut self,
@@ -101,12 +101,12 @@ impl<'n> Stage<'n> {
         }
     }
 
-    /// The callbacks that the nodes must hear.
+    /// Notes the callbacks that the nodes must get.
     pub(crate) fn note(&mut self, notices: &[Notice], risky: bool) {
         for notice in notices {
             let (to, call) = nodes::as_call(notice);
-            // The mirror leaves out what is out of date when it is sent. rosrescue tells nobody to shut down without
-            // evidence that it is the one who is meant, and these nodes give none.
+            // The mirror leaves out outdated callbacks. rosrescue tells a node to shut down only with evidence that it
+            // is the right one, and these nodes give none.
             let risky = risky || self.away;
             if let Some(repeats) = &mut self.repeats {
                 repeats.send(to, &call);
@@ -122,7 +122,7 @@ impl<'n> Stage<'n> {
         }
     }
 
-    /// What the nodes have not heard yet may be lost or doubled.
+    /// From now on, callbacks that the nodes have not got yet may be lost or repeated.
     pub(crate) fn risk(&mut self) {
         self.told
             .iter_mut()
@@ -130,7 +130,7 @@ impl<'n> Stage<'n> {
             .for_each(|it| it.risky = true);
     }
 
-    /// Makes every node hear one last thing, and compares what they heard before it.
+    /// Sends every node one last callback, and compares the callbacks before it.
     pub(crate) fn settle(&mut self) -> Result<(), Failure> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let topic = format!("/last{}", COUNT.fetch_add(1, Ordering::Relaxed));
@@ -174,12 +174,12 @@ impl<'n> Stage<'n> {
         Ok(())
     }
 
-    /// Compares what a node heard, and waits until what a crash has swallowed is made good.
+    /// Compares the callbacks of a node, and waits until those that a crash has lost were replaced.
     fn judge(&self, node: &Node, expected: &[Expected], heard: Vec<Call>) -> Result<(), Failure> {
         let mut heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
         let mut expected = expected.to_vec();
         if unordered() {
-            // Whom rosmaster tells first is the order of a dictionary, too.
+            // The order in which rosmaster notifies nodes is that of a dictionary, too.
             heard.sort_by_key(|call| format!("{call:?}"));
             expected.sort_by_key(|it| format!("{:?}", it.call));
         }
@@ -207,7 +207,7 @@ impl<'n> Stage<'n> {
         }
     }
 
-    /// Every read that a client may send, of everything that was ever named.
+    /// Compares the answers to every read of all names that were ever used.
     pub(crate) fn same_reads(&self, wire: &mut Wire) -> Result<(), Failure> {
         let mut model = self.model.clone();
         let own = |method: &str| Call::new(method, vec!["/test".into()]);
@@ -250,8 +250,7 @@ impl<'n> Stage<'n> {
     }
 }
 
-/// Whether two replies say the same. Of a refusal only the text may differ, that of a fault or of an
-/// answer with another code than 1.
+/// Whether two replies are equal. Texts of refusals, in faults and in answers with another code than 1, may differ.
 pub(crate) fn alike(a: &Reply, b: &Reply) -> bool {
     match (a, b) {
         (Reply::Value(a), Reply::Value(b)) => blank(a) == blank(b),
@@ -260,7 +259,7 @@ pub(crate) fn alike(a: &Reply, b: &Reply) -> bool {
     }
 }
 
-/// The value without the texts of refusals, in a multicall too.
+/// The value without texts of refusals, including those inside multicalls.
 fn blank(value: &Value) -> Value {
     match value {
         Value::Array(elements) => match elements.as_slice() {
@@ -277,7 +276,7 @@ fn blank(value: &Value) -> Value {
     }
 }
 
-/// Lists and names in one order, if the master's dictionaries have none.
+/// Sorts lists of names, if the master's dictionaries are unordered.
 fn in_order(mut elements: Vec<Value>) -> Vec<Value> {
     let is_one = |it: &Value| matches!(it, Value::Array(_) | Value::String(_));
     if unordered() && elements.iter().all(is_one) {

@@ -1,8 +1,8 @@
-//! The model, which never crashes, against several rosrescues on one etcd, of which the one that leads is
-//! killed with all that it runs, or hands over.
+//! Compares the model, which never crashes, with several rosrescues on one etcd. Their leader is killed with everything
+//! that it runs, or hands over.
 //!
-//! Each client calls the computer that it was given, or another one while that one is dead. So calls come to
-//! the leader and to those that follow it.
+//! Each client calls its own computer, or another one while its own is dead. So calls reach the leader and its
+//! followers.
 
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -21,12 +21,12 @@ use crate::script::{Script, Step};
 use crate::stage::{CLIENTS, Failure, Stage};
 use crate::support::{Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal};
 
-/// On a busy computer a shorter one is over before etcd has answered.
+/// On a busy computer a shorter time would pass before etcd answers.
 const TTL: &str = "1.5";
-/// How long after a call was sent its leader may go: by then it may be anywhere.
+/// Within how many microseconds after a call was sent its leader may go. The call may be anywhere by then.
 const IN_FLIGHT_MICROS: u64 = 10_000;
 
-/// A sequence with so many takeovers.
+/// A random sequence with this many takeovers.
 pub(crate) fn script(seed: u64, calls: usize, takeovers: usize, nodes: usize) -> Script {
     let mut script = crashes::script(seed, calls, takeovers, nodes);
     let mut dice = Dice(!seed);
@@ -40,22 +40,22 @@ pub(crate) fn script(seed: u64, calls: usize, takeovers: usize, nodes: usize) ->
     script
 }
 
-/// How a computer stops leading.
+/// The way in which a computer stops leading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum End {
-    /// It dies, and is switched on again at once.
+    /// The computer dies and is switched on again at once.
     Restart,
-    /// It dies, and stays dead.
+    /// The computer dies and stays dead.
     Death,
     Handover,
 }
 
-/// What is killed together.
+/// The processes that are killed together.
 struct Computer {
     rescue: Rescue,
     uri: String,
     master_port: u16,
-    /// How often it was started; none while it is dead.
+    /// How often the computer was started. `None` while it is dead.
     life: Option<u32>,
     lives: u32,
     scratch: Scratch,
@@ -68,10 +68,10 @@ impl Computer {
         let rescue = Setup::core(&scratch, master_port)
             .args(["--cluster", cluster, "--cluster-ttl", TTL])
             .args(["--cluster-name", &format!("pc{index}")])
-            // A busy computer that is cut off for a moment may not answer writes by itself: what others write
-            // meanwhile would win over them, and no master does that.
+            // A busy computer that is cut off for a moment must not answer writes by itself. Changes by other computers
+            // would win over them, which no master does.
             .args(["--alone", "refuse", "--hold", "60"])
-            // Another computer's rosout is another node.
+            // Each computer's rosout would be a node of its own.
             .arg("--no-rosout")
             .guarded()
             .spawn();
@@ -85,7 +85,7 @@ impl Computer {
         }
     }
 
-    /// SIGKILL for rosrescue, its guardian, and its rosmaster.
+    /// Kills rosrescue, its guardian, and its rosmaster with SIGKILL.
     fn kill(&mut self) {
         self.life = None;
         loop {
@@ -96,7 +96,7 @@ impl Computer {
             all.iter().for_each(|(pid, _)| signal(*pid, Signal::KILL));
             let _ = self.rescue.exited();
         }
-        // A process that is killed has no environment any more before its sockets are closed.
+        // A killed process loses its environment before its sockets are closed.
         let port = self.rescue.port();
         eventually("nobody listens at its port", || {
             TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
@@ -127,7 +127,7 @@ impl Computer {
 
 struct Rig {
     computers: Vec<Computer>,
-    /// Where each client is, and in which life of that computer.
+    /// The computer of each client, and how often that computer had been started then.
     at: [(usize, u32); CLIENTS],
 }
 
@@ -146,7 +146,7 @@ impl Rig {
         }
     }
 
-    /// The state that the sequence starts from: three parameters.
+    /// The state from which the sequence starts: three parameters.
     fn state(&mut self) -> Result<Master, Failure> {
         self.await_all()?;
         for computer in &mut self.computers {
@@ -156,7 +156,7 @@ impl Rig {
         Ok(read_state(&mut wire, has_params))
     }
 
-    /// Connects clients whose computer is dead to others, and to their own when that is there again.
+    /// Connects clients of dead computers to other computers, and clients of computers that are back to these.
     fn attach(&mut self, stage: &mut Stage<'_>) -> Result<(), Failure> {
         (0..CLIENTS).try_for_each(|client| self.attach_one(stage, client, None))
     }
@@ -185,7 +185,7 @@ impl Rig {
         })
     }
 
-    /// The computer that leads, and whether calls pass to its master.
+    /// The leader, and whether calls pass to its master.
     fn leader(&self) -> Option<(usize, bool)> {
         let mut all = self.computers.iter().enumerate();
         all.find_map(|(index, computer)| {
@@ -202,7 +202,7 @@ impl Rig {
         await_some("a leader", || self.leader().map(|(index, _)| index))
     }
 
-    /// The computer that leads, when all others are switched on.
+    /// Waits for a leader, with all computers switched on.
     fn await_leader_and_another(&mut self) -> Result<usize, Failure> {
         let leader = self.await_leader()?;
         self.computers.iter_mut().for_each(Computer::revive);
@@ -215,7 +215,7 @@ impl Rig {
         })
     }
 
-    /// Waits until all are there: one leads, and the others have all that it has.
+    /// Waits until one computer leads and all others have its whole state.
     fn await_all(&mut self) -> Result<usize, Failure> {
         self.computers.iter_mut().for_each(Computer::revive);
         let leader = self.await_open()?;
@@ -229,7 +229,7 @@ impl Rig {
         Ok(leader)
     }
 
-    /// Has another computer lead, unless none does, in which case the same one may.
+    /// Makes another computer the leader. If there was no leader, the same computer may lead again.
     fn end(&mut self, end: End) -> Result<(), Failure> {
         if end == End::Handover {
             return self.hand_over();
@@ -242,7 +242,7 @@ impl Rig {
         Ok(())
     }
 
-    /// The one who is asked need not lead.
+    /// Asks any computer for a handover; it need not be the leader.
     fn hand_over(&self) -> Result<(), Failure> {
         let leader = self.await_leader()?;
         let others = (0..self.computers.len()).rev();
@@ -253,15 +253,15 @@ impl Rig {
             let reply = asked.wire()?.call(&call).ok()?;
             match &reply {
                 Reply::Value(Value::Array(answer)) if answer.first() == Some(&1.into()) => Some(()),
-                // Another one has not said yet that it is there, or the next leader does not lead yet.
+                // The other computer has not reported yet, or the next leader does not lead yet.
                 _ => None,
             }
         })
     }
 }
 
-/// Whether that state is the same at the next leader: it lacks what a master cannot return, and sets the three
-/// parameters of roscore if somebody has deleted them.
+/// Whether the next leader has the same state. It lacks values that a master cannot return, and sets roscore's three
+/// parameters if they were deleted.
 fn survives(model: &Master) -> bool {
     skipped(model).is_empty() && has_params(model)
 }
@@ -279,7 +279,7 @@ fn await_some<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> Result<T, F
     }
 }
 
-/// What a run was.
+/// The totals of a run.
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     pub(crate) deaths: Share,
@@ -349,7 +349,7 @@ fn steps(
         share.happened += 1;
         let ended = rig.attach(&mut stage).and_then(|()| {
             match step {
-                // The last callbacks may be lost with it, and are made good.
+                // The last callbacks may be lost with the leader, and are replaced later.
                 Step::Crash { .. } => stage.risk(),
                 _ => stage.settle()?,
             }
@@ -368,7 +368,7 @@ fn steps(
     end.map_err(|why| format!("at the end: {why}"))
 }
 
-/// Makes a call; with an `end` of the leader while it is under way.
+/// Makes a call. With `end`, the leader ends while the call is running.
 fn play(
     rig: &mut Rig,
     stage: &mut Stage<'_>,
@@ -382,12 +382,12 @@ fn play(
     let mut after = stage.model.clone();
     after.apply(&Request::from(call.clone()));
     if stage.away && !survives(&after) {
-        // What cannot be brought to another master is for one that is there.
+        // Only a running master can answer for what a successor could not get.
         rig.await_open()?;
     }
     rig.attach(stage)?;
     if let Some(End::Restart | End::Death) = end {
-        // A call to a computer that dies is not answered.
+        // A call to a computer that dies gets no answer.
         let leader = rig.await_leader_and_another()?;
         rig.attach_one(stage, by, Some(leader))?;
     }
@@ -407,7 +407,7 @@ fn play(
     stage.answered(&call, &reply, true)
 }
 
-/// Compares the state at each computer, and once more after the leader's death: that of the journal.
+/// Compares the state at each computer, and again after the leader's death. Then it is the state of the journal.
 fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     let leader = rig.await_all()?;
     rig.attach(stage)?;

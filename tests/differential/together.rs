@@ -1,12 +1,11 @@
-//! Many callers at the same time through rosrescue, where calls that queue up travel to the master as
-//! one multicall and get replies that rosrescue writes; and the same callers, one after the other, at
-//! a bare rosmaster. Each must get the same bytes from both.
+//! Compares many simultaneous callers through rosrescue with the same callers, one after the other, at a bare
+//! rosmaster. Each caller must get the same bytes from both. Calls that queue up travel to the master as one multicall,
+//! and rosrescue encodes the replies.
 //!
-//! Each caller has names of its own, since only then its replies do not depend on the others. So there
-//! is nothing here that several see: no `getSystemState`, `getTopicTypes`, `getParamNames` and
-//! `getParam('/')` (the lists and trees of all), no topic, service or parameter of two callers (who
-//! was first?), no caller in the root namespace (its names are everybody's), and no process id. One
-//! service is there from the start: a master that never had any answers otherwise to all.
+//! Each caller uses names of its own, so that its replies do not depend on other callers. So nothing is called that
+//! several callers share: not `getSystemState`, `getTopicTypes`, `getParamNames` or `getParam('/')`; no topic, service
+//! or parameter of two callers; no caller in the root namespace; and no process id. One service exists from the start,
+//! because a master that never had a service answers differently.
 
 use std::net::TcpListener;
 
@@ -20,14 +19,14 @@ use crate::support::{Client, Scratch, Setup, eventually, http_request, short, st
 
 const CALLERS: usize = 24;
 const CALLS: usize = 150;
-/// Calls of these methods may share a journey.
+/// Methods of calls that may share a batch.
 #[rustfmt::skip]
 const SHARE: [&str; 9] = [
     "registerPublisher", "registerSubscriber", "registerService", "unregisterPublisher",
     "unregisterSubscriber", "unregisterService", "unsubscribeParam", "setParam", "deleteParam",
 ];
 
-/// One caller's calls, from names that nobody else has.
+/// The calls of one caller, with names that no other caller uses.
 struct Caller {
     dice: Dice,
     cast: Cast,
@@ -35,7 +34,7 @@ struct Caller {
 }
 
 impl Caller {
-    /// Its nodes are at `silent`.
+    /// Creates a caller whose nodes are at `silent`.
     fn new(seed: u64, index: usize, silent: &str, unreturnable: bool) -> Self {
         let space = format!("/c{index}");
         let apis = (1..3).map(|node| format!("http://{silent}{space}/{node}/"));
@@ -146,7 +145,7 @@ impl Caller {
         Call::new(method, params)
     }
 
-    /// Too few parameters, too many, or one of a type that is no name.
+    /// Makes the parameters wrong: too few, too many, or one of a type that is not a name.
     fn spoil(&mut self, params: &mut Vec<Value>) {
         match self.dice.below(4) {
             0 => params.push(self.dice.value(&self.cast, 1)),
@@ -161,7 +160,7 @@ impl Caller {
         }
     }
 
-    /// What all of it has come to, as far as it can be asked for alone.
+    /// Calls that show the resulting state, without other callers' parts.
     fn state(&self) -> Vec<Call> {
         let ask = |method: &str, name: &str| {
             let name = format!("{}{name}", self.space);
@@ -181,7 +180,7 @@ impl Caller {
     }
 }
 
-/// The bodies of the answers to `calls` on one connection, one after the other.
+/// The bodies of the answers to `calls`, made one after the other on one connection.
 fn ask(port: u16, calls: &[Call]) -> Vec<Vec<u8>> {
     let mut wire = Client::new(port).connect().unwrap();
     let answers = calls.iter().map(|call| {
@@ -194,7 +193,7 @@ fn ask(port: u16, calls: &[Call]) -> Vec<Vec<u8>> {
     answers.collect()
 }
 
-/// The lists of `getSystemState` as far as they concern `space`.
+/// The entries of `getSystemState` in the namespace `space`.
 fn registrations(port: u16, space: &str) -> Vec<Vec<Value>> {
     let state = ask(port, &[Call::new("getSystemState", vec!["/test".into()])]);
     let Ok(Reply::Value(Value::Array(answer))) = decode_reply(&state[0]) else {
@@ -230,8 +229,9 @@ fn same(seed: u64, calls: &[Call], theirs: &[Vec<u8>], ours: &[Vec<u8>]) {
     assert_eq!(theirs.len(), ours.len());
 }
 
-/// Plays all callers. With `unreturnable` there are values that a master cannot return; without, the master
-/// behind rosrescue is killed at the end, and its successor has to answer as it did. `reads`: who answers them.
+/// Plays all callers. With `unreturnable` there are values that a master cannot return. Without them, the master behind
+/// rosrescue is killed at the end, and its successor must answer the same. `reads` says whether the master or the
+/// mirror answers reads.
 fn play(seed: u64, unreturnable: bool, reads: &str) {
     let mut bare = Rosmaster::start();
     let mut behind = Rosmaster::start();
@@ -240,7 +240,7 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
     let rescue = Setup::proxy(&scratch, behind.port)
         .args(["--reads", reads])
         .start();
-    // What nodes hear has its own tests. One that does not answer is not taken for dead.
+    // Other tests check the callbacks. A node that does not answer is not taken for dead.
     let silent = TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let address = silent.local_addr().unwrap().to_string();
     let mut callers: Vec<_> = (0..CALLERS)

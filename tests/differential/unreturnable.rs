@@ -1,11 +1,11 @@
-//! Values that rosmaster cannot return: the codec refuses to write the same ones.
+//! Values that rosmaster cannot return. The codec must refuse to encode the same ones.
 
 use rosrescue::xmlrpc::{Call, Reply, Struct, Value, encode_call, encode_reply};
 
 use crate::support::{Rosmaster, Scratch, http_request};
 
-/// What rosmaster does at the limit of Python's recursion depends on how deep its own calls are
-/// already, so only the real one can tell.
+/// At the limit of Python's recursion, rosmaster's behaviour depends on how deep its own calls are, so only a real one
+/// can tell.
 #[test]
 fn what_rosmaster_cannot_return_becomes_its_fault() {
     let leaves = [
@@ -42,7 +42,7 @@ fn what_rosmaster_cannot_return_becomes_its_fault() {
             let reply = Value::Array(vec![1.into(), "Parameter [/p]".into(), value]);
             let ours = encode_reply(&Reply::Value(reply));
             let ours = String::from_utf8(ours).unwrap();
-            // How it says that this is too deep depends on what Python was doing.
+            // The text of this error depends on what Python was doing.
             let too_deep = [&ours, &theirs].map(|text| text.contains("RecursionError"));
             assert!(
                 ours == theirs || too_deep == [true; 2],

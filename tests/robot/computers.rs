@@ -38,8 +38,7 @@ impl Document {
     }
 }
 
-/// A script that runs `text` on each of `computers`, with the first line changed for each as the document
-/// says.
+/// A script that runs `text` on each of `computers`. The first line is changed for each computer, as the document says.
 fn on(computers: &[&str], text: &str) -> String {
     let own = COMPUTERS
         .iter()
@@ -56,7 +55,7 @@ fn on(computers: &[&str], text: &str) -> String {
     scripts.collect()
 }
 
-/// Runs `script` in namespaces of its own, which end with the shell and everything that it has started.
+/// Runs `script` in namespaces of its own. They end with the shell and everything that it has started.
 #[track_caller]
 fn run(script: &str) -> String {
     let scratch = Scratch::new();
@@ -188,7 +187,7 @@ fn rosrescue_can_be_run_and_handed_over_as_documented() {
         on(&["head"], &look),
         // The exit status says whether the next master is there yet.
         on(&["base"], "rosrescue status || true"),
-        // On such a computer `check` has other findings as well.
+        // On such a computer `check` has further findings.
         on(&["head"], &format!("{} || true", check.trim_end())),
     ]
     .concat());

@@ -1,8 +1,8 @@
-//! Random deaths and stops under calls, on a disk that hangs, slows down, fills up and becomes read-only at
+//! Random deaths and stops while calls are made, on a disk that hangs, slows down, fills up and becomes read-only at
 //! random. Whenever the calls pause, the state must equal the acknowledged calls.
 //!
-//! When rosrescue and the master end together, only what was recorded is owed: everything acknowledged before
-//! a status that reported it as recorded.
+//! When rosrescue and the master end together, only recorded calls must survive: everything that was acknowledged
+//! before a status said that changes are recorded.
 //!
 //! `ROSRESCUE_SOAK_SECONDS` is the length. `ROSRESCUE_SEED` repeats the random numbers of an earlier run.
 
@@ -36,7 +36,7 @@ fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
     of.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Everything that one writer has in the master.
+/// Everything that belongs to one writer in the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Own {
     params: BTreeMap<String, i32>,
@@ -116,7 +116,7 @@ struct Past {
     /// The states after each call since the last pause. There is always at least one.
     states: Vec<Own>,
     last: Option<Step>,
-    /// Index of the oldest of them that may be restored after a loss of everything.
+    /// Index of the oldest state that may be restored after rosrescue and the master ended together.
     owed: usize,
 }
 
@@ -235,7 +235,7 @@ impl Writer {
         true
     }
 
-    /// From now on the node says of itself what `state` says of it: what it says and is not so, is mended.
+    /// Makes the node report what `state` contains, so that the health check corrects the rest.
     fn claim(&self, state: &Own) {
         const TYPE: &str = "std_msgs/String";
         for number in 0..NAMES {
@@ -250,8 +250,8 @@ impl Writer {
         lock(&self.past).states.last().unwrap().clone()
     }
 
-    /// Whether `found` is a state that may be restored: after the recorded calls up to some moment, and the
-    /// call that was under way then.
+    /// Whether `found` is a state that may be restored: the one after some number of recorded calls, perhaps with the
+    /// call that was running then.
     fn leads_to(&self, found: &Own) -> bool {
         let past = lock(&self.past);
         past.states[past.owed..].iter().any(|state| {
@@ -261,7 +261,8 @@ impl Writer {
         })
     }
 
-    /// In a silence, in which it is in `state`. What was not recorded may still be lost, so what came before counts.
+    /// Notes, during a pause, that the writer is in `state`. What was not recorded may still be lost, so earlier states
+    /// stay possible.
     fn is_in(&self, state: Own, is_recorded: bool) {
         let mut past = lock(&self.past);
         if is_recorded {
@@ -312,7 +313,7 @@ impl Stage<'_> {
         assert!(!never, "no calls pass to a master: {}", self.rescue.log());
     }
 
-    /// Marks everything acknowledged so far as owed, if rosrescue reports that it is recorded.
+    /// Marks everything acknowledged so far as required after a loss, if rosrescue reports that it is recorded.
     fn note_what_is_owed(&self) -> bool {
         let of = |writer: &Writer| lock(&writer.past).states.len() - 1;
         let counts: Vec<_> = self.writers.iter().map(of).collect();
@@ -325,7 +326,7 @@ impl Stage<'_> {
         is_recorded
     }
 
-    /// Pauses the calls. No call is under way when this returns.
+    /// Pauses the calls. No call is running when this returns.
     #[track_caller]
     fn pause(&self) {
         self.flags.pause.store(true, Ordering::SeqCst);
@@ -385,7 +386,7 @@ impl Stage<'_> {
     fn assert_what_is_owed(&mut self) {
         self.pause();
         self.await_service(None);
-        // A state that went back is no longer what the nodes say of themselves.
+        // A state that was lost differs from what the nodes report.
         eventually("all nodes have been asked", || {
             for writer in self.writers {
                 writer.claim(&Own::read(&self.client(), writer.index));

@@ -81,7 +81,7 @@ pub(crate) struct FailingDisk {
     state: PathBuf,
 }
 
-/// What is wrong with a [`FailingDisk`].
+/// What goes wrong on a [`FailingDisk`].
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Trouble {
     /// No operation is answered until the trouble is over.

@@ -106,8 +106,7 @@ impl Netns {
         ip(&format!("neigh del {}.{host} dev {}", self.net, self.near));
     }
 
-    /// Changes the address of this side, as DHCP may do: connections from [`near`](Self::near) are lost, and
-    /// nobody is told.
+    /// Changes the address of this side, as DHCP may do. Connections from [`near`](Self::near) are lost without notice.
     pub(crate) fn move_near(&self) {
         let Self { near, net, .. } = self;
         ip(&format!("addr del {net}.1/24 dev {near}"));

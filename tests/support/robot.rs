@@ -213,7 +213,7 @@ impl Robot {
         eventually("the mirror stands in", || !self.is_open());
     }
 
-    /// SIGKILL to a core's master of which the process id is known: it may be a zombie by now.
+    /// Kills a core's master whose process id is known, with SIGKILL. It may already be a zombie.
     pub(crate) fn kill_master_at_once(&mut self, pid: u32) {
         signal(pid, Signal::KILL);
         if let Some(master) = &mut self.master {
@@ -221,7 +221,7 @@ impl Robot {
         }
     }
 
-    /// A new master where the dead one was: by the test for a proxy, by rosrescue for a core.
+    /// Brings a new master: a proxy's is started by the test, a core's by rosrescue.
     #[track_caller]
     pub(crate) fn revive_master(&mut self) {
         if self.mode == Mode::Proxy {
@@ -233,7 +233,7 @@ impl Robot {
         }
     }
 
-    /// A new master where that is the test's task: a core has begun to start one already.
+    /// Starts a new master for a proxy. A core has begun to start one already.
     #[track_caller]
     pub(crate) fn revive_proxied_master(&mut self) {
         if self.mode == Mode::Proxy {
@@ -259,7 +259,7 @@ impl Robot {
         eventually("rosrescue lets calls pass", || self.is_open());
     }
 
-    /// The whole fault: SIGKILL to the master, a new one, and its state back.
+    /// Kills the master with SIGKILL, and waits for a new one with its state.
     #[track_caller]
     pub(crate) fn crash_master(&mut self) {
         let dead = self.master_pid();
@@ -268,7 +268,7 @@ impl Robot {
         self.await_recovery(dead);
     }
 
-    /// The status page; nothing while rosrescue is not there.
+    /// The status. `None` if rosrescue does not answer.
     pub(crate) fn status(&self) -> Option<serde_json::Value> {
         let page = super::rpc::request("GET /status.json HTTP/1.1", &[], b"");
         let page = self.client().exchange(&page).ok()?;
@@ -297,7 +297,7 @@ impl Robot {
     }
 }
 
-/// A proxy's master: `program` with its arguments.
+/// Starts a proxy's master: `program` with its arguments.
 #[track_caller]
 fn start_master(
     scratch: &Scratch,

@@ -59,8 +59,8 @@ impl Scratch {
         self.path("log")
     }
 
-    /// Prepares `command`: everything that ROS writes goes to this folder, the token is set, and its address
-    /// needs no name service. Of the caller's own ROS environment only the place of installation is kept.
+    /// Prepares `command`: everything that ROS writes goes to this folder, the token is set, and its address needs no
+    /// name server. Of the caller's ROS environment only the place of installation is kept.
     pub(crate) fn prepare(&self, command: &mut Command) {
         for (key, _) in std::env::vars_os() {
             let name = key.to_string_lossy();

@@ -1,4 +1,4 @@
-//! A bare master and one behind rosrescue that are asked the same.
+//! Asks a bare master and one behind rosrescue the same.
 
 use rosrescue::xmlrpc::{Reply, Value};
 

@@ -1,4 +1,4 @@
-//! Commands in documents name what there is. `tests/robot/documents.rs` runs their blocks.
+//! Checks that the commands in documents exist. `tests/robot/documents.rs` runs their blocks.
 
 use std::process::Command;
 
@@ -7,7 +7,7 @@ use super::{
     read, root,
 };
 
-/// What stands between backticks in a document, on one line.
+/// The texts between backticks in a document, on one line each.
 pub(crate) fn quoted(text: &str) -> impl Iterator<Item = &str> {
     text.lines()
         .flat_map(|line| line.split('`').skip(1).step_by(2))
@@ -24,7 +24,7 @@ fn what_is_not_run_is_tested_by_something_that_exists() {
     }
 }
 
-/// What `rosrescue COMMAND --help` prints; none if there is no such command.
+/// The output of `rosrescue COMMAND --help`. `None` if there is no such command.
 fn help(command: &[&str]) -> Option<String> {
     let output = Command::new(env!("CARGO_BIN_EXE_rosrescue"))
         .args(command)
@@ -36,7 +36,7 @@ fn help(command: &[&str]) -> Option<String> {
     output.status.success().then_some(text)
 }
 
-/// The commands that `line` runs, of those that are checked: each without what precedes it.
+/// The checked commands in `line`, each without what precedes it.
 fn commands(line: &str) -> impl Iterator<Item = Vec<&str>> {
     let line = line.split(" #").next().unwrap();
     line.split(['|', ';', '&']).filter_map(|command| {
@@ -50,7 +50,7 @@ fn commands(line: &str) -> impl Iterator<Item = Vec<&str>> {
     })
 }
 
-/// What is wrong with a command of a document.
+/// The mistake in a command of a document.
 fn mistake(words: &[&str]) -> Option<String> {
     let [program, arguments @ ..] = words else {
         return None;
@@ -66,7 +66,7 @@ fn mistake(words: &[&str]) -> Option<String> {
             let Some(help) = help(&command) else {
                 return Some("there is no such command".to_owned());
             };
-            // What follows `--` is another command's.
+            // What follows `--` belongs to another command.
             let own = arguments.iter().take_while(|word| **word != "--");
             let options = own.filter(|word| word.starts_with("--"));
             let mut options = options.map(|word| word.split('=').next().unwrap());
@@ -128,7 +128,7 @@ fn commands_in_documents_exist_with_their_options() {
     assert!(checked > 100, "{checked}");
 }
 
-/// A transcript is held to the program by the test of the help.
+/// The test of the help compares transcripts with the program.
 #[test]
 fn transcripts_are_of_help() {
     for document in documents() {

@@ -1,17 +1,17 @@
-//! Documents say what the program says, and name what there is.
+//! Checks documents against the program, and the names in them.
 
 use std::{collections::BTreeSet, fs, path::Path, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
-/// The most bytes of documents: people read no more. The last is all of `docs` without the decisions and the help.
+/// Most bytes of documents: people read no more. The last entry is all of `docs` without the decisions and the help.
 const BYTES_MOST: [(&str, usize); 3] = [
     ("README.md", 8 << 10),
     ("docs/architecture.md", 20 << 10),
     ("docs", 150 << 10),
 ];
 
-/// What `rosrescue ARGUMENTS` prints at a width of 100, without any setting of this computer.
+/// The output of `rosrescue ARGUMENTS` at a width of 100, without settings of this computer.
 fn printed(arguments: &[&str]) -> String {
     let output = Command::new(env!("CARGO_BIN_EXE_rosrescue"))
         .args(arguments)
@@ -25,7 +25,7 @@ fn printed(arguments: &[&str]) -> String {
     lines.join("\n")
 }
 
-/// The fenced block of `text` whose first line is `first`, without that line.
+/// The block of `text` fenced with `first` as its first line, without that line.
 fn block<'a>(text: &'a str, first: &str) -> &'a str {
     let start = format!("```\n{first}\n");
     let (_, rest) = text
@@ -34,7 +34,7 @@ fn block<'a>(text: &'a str, first: &str) -> &'a str {
     rest.split_once("\n```\n").expect("the block ends").0
 }
 
-/// The commands, as `rosrescue --help` lists them.
+/// The commands that `rosrescue --help` lists.
 fn commands() -> Vec<String> {
     let help = printed(&["--help"]);
     let (_, list) = help.split_once("\nCommands:\n").unwrap();
@@ -74,7 +74,7 @@ fn documents_stay_short() {
     }
 }
 
-/// The sentences of a document's prose. A block of commands is none, and a cell of a table is one at least.
+/// The sentences of a document's text. A block of commands is no sentence, and a table's cell is at least one.
 fn sentences(text: &str) -> Vec<String> {
     let mut fenced = false;
     let mut paragraphs = vec![String::new()];
@@ -105,7 +105,7 @@ fn sentences(text: &str) -> Vec<String> {
     sentences
 }
 
-/// What is between backticks is one word, and so is an address.
+/// Counts words. Text between backticks counts as one word, and so does an address.
 fn words(sentence: &str) -> usize {
     let spoken: String = sentence.split('`').step_by(2).collect::<Vec<_>>().join("X");
     let spoken = spoken
@@ -218,7 +218,7 @@ fn there_is_a_reason_for_every_dependency_and_for_no_other() {
     }
 }
 
-/// The anchors of a document's headings, as they are made of the headings' text.
+/// The anchors of a document's headings, made from their text.
 fn anchors(text: &str) -> BTreeSet<String> {
     let mut fenced = false;
     let mut anchors = BTreeSet::new();
@@ -271,7 +271,7 @@ fn links_in_documents_lead_somewhere() {
     assert!(links > 50);
 }
 
-/// Comments name documents by their path from the top, too.
+/// Comments name documents by their path from the top of the repository.
 #[test]
 fn documents_that_the_source_names_exist() {
     for file in sources() {

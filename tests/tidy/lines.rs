@@ -1,5 +1,5 @@
-//! `docs/operations.md` has each line of the log that may ask for something, `docs/monitoring.md` each metric; and no
-//! others.
+//! Checks that `docs/operations.md` has every warning and error of the log, that `docs/monitoring.md` has every metric,
+//! and that neither has others.
 
 use super::{code, read, sources};
 
@@ -25,7 +25,7 @@ fn arguments<'a>(code: &'a str, name: &str) -> Vec<&'a str> {
     calls.collect()
 }
 
-/// The last text among `arguments`, in one line; none if there is no text.
+/// The last text among `arguments`, in one line. `None` if there is no text.
 fn text(arguments: &str) -> Option<String> {
     let (before, _) = arguments.rsplit_once('"')?;
     let (_, rest) = before.rsplit_once('"')?;
@@ -33,7 +33,7 @@ fn text(arguments: &str) -> Option<String> {
     Some(lines.concat())
 }
 
-/// Messages of the warnings and errors of the source.
+/// The messages of warnings and errors in the source.
 fn messages() -> Vec<String> {
     let mut messages = Vec::new();
     for file in sources() {
@@ -53,12 +53,12 @@ fn messages() -> Vec<String> {
             }
         }
     }
-    // `log_once` itself, which is given the message, and the macro's own definition.
+    // `log_once` gets its message from its caller, and the macro is only a definition.
     messages.retain(|message| message != "{text}" && !message.starts_with('$'));
     messages
 }
 
-/// A message up to what differs from time to time, or to where it goes on explaining.
+/// The beginning of a message, without values and without the explanation that follows.
 fn beginning(message: &str) -> &str {
     let ends = ["{", "; ", ". ", ": nodes keep", "…"];
     let end = ends.iter().filter_map(|end| message.find(end)).min();

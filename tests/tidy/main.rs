@@ -1,5 +1,4 @@
-//! What no compiler checks: documents say what the program says, modules import downward only, files
-//! stay small.
+//! Checks what no compiler checks: documents match the program, modules import downward only, files stay small.
 
 #![allow(
     clippy::unwrap_used,
@@ -22,7 +21,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// A longer file holds more than one idea.
+/// A longer file contains more than one idea.
 const LINES_MOST: usize = 800;
 
 fn root() -> &'static Path {
@@ -70,8 +69,7 @@ fn sources() -> Vec<PathBuf> {
     files
 }
 
-/// The text of a source file without comments and without the tests at its end; none if all of it
-/// is tests.
+/// The text of a source file without comments and without the tests at its end. `None` if all of it is tests.
 fn code(path: &Path) -> Option<String> {
     let relative = path.strip_prefix(root()).unwrap();
     let is_test = |part: &std::ffi::OsStr| part == "tests" || part == "tests.rs";
@@ -86,7 +84,7 @@ fn code(path: &Path) -> Option<String> {
     Some(lines.collect::<Vec<_>>().join("\n"))
 }
 
-/// What `code` names directly below `root`: `a` and `b` of `root::{a, b::{c}}`, `d` of `root::d::e`.
+/// The names directly below `root` in `code`: `a` and `b` of `root::{a, b::{c}}`, `d` of `root::d::e`.
 fn named<'a>(code: &'a str, root: &str) -> Vec<&'a str> {
     let mut names = Vec::new();
     let first = |name: &'a str| {
@@ -151,7 +149,7 @@ fn modules_import_downward_only() {
     }
 }
 
-/// Decisions hang on the monotonic clock: the wall clock is read in one place, for people.
+/// Decisions depend on the monotonic clock. The wall clock is read in one place, for people.
 #[test]
 fn only_the_clock_reads_the_wall_clock() {
     let mut readers = Vec::new();
@@ -169,7 +167,7 @@ fn only_the_clock_reads_the_wall_clock() {
         }
     }
     assert_eq!(readers, [root().join("src/clock.rs")]);
-    // Who asks it: for reports and the start of a session, both read by people only.
+    // These use it for reports and for the start of a session, which only people read.
     let mut users = Vec::new();
     for file in sources() {
         let code = code(&file).unwrap_or_default();

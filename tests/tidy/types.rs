@@ -1,4 +1,4 @@
-//! Types have names of their own, few fields and one place, and the map has every crate and folder.
+//! Checks that types have names of their own, few fields and one place, and that the map has every crate and folder.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -7,29 +7,30 @@ use std::{
 
 use super::{code, read, root, sources};
 
-/// Most visible types, in percent, whose name another one has. The goal is 5; it was 30 before the crates.
+/// Highest percentage of visible types that share their name with another one. The goal is 5; it was 30 before the
+/// crates.
 const SHARED_PERCENT_MOST: usize = 29;
 const FIELDS_MOST: usize = 20;
-/// Types with more fields, and how many they have. None may get more, and no other type may join them.
+/// Types with too many fields, and how many they have. No other type may be added, and none may grow.
 const LARGE: [(&str, usize); 7] = [
-    // Options of the command line, and what they come to: each is a field by nature.
+    // Options of the command line and the configuration made from them: each option is a field.
     ("CommonArgs", 23),
     ("Config", 23),
-    // What people and programs read, as flat JSON and as flat facts of a computer.
+    // Facts that people and programs read, as flat JSON.
     ("Facts", 25),
     ("Status", 40),
-    // To be split by responsibility.
+    // These must be split by responsibility.
     ("Drain", 22),
     ("Lifecycle", 21),
     ("Member", 43),
 ];
 const IMPL_FILES_MOST: usize = 3;
-/// Types with `impl` blocks in more files, and in how many.
+/// Types with `impl` blocks in too many files, and in how many.
 const SPREAD: [(&str, usize); 6] = [
-    // One file for each room of the Master API, and for each subject of `check`.
+    // One file for each part of the Master API, and for each subject of `check`.
     ("Findings", 4),
     ("Master", 7),
-    // To be split by responsibility.
+    // These must be split by responsibility.
     ("Inner", 4),
     ("Ledger", 7),
     ("Member", 7),
@@ -58,7 +59,7 @@ fn declared<'a>(line: &'a str, keywords: &[&str]) -> Option<(&'a str, &'a str)> 
     Some(rest.split_at(end.unwrap_or(rest.len())))
 }
 
-/// A line without its visibility; none if it has no visibility.
+/// A line without its visibility. `None` if it has none.
 fn visible(line: &str) -> Option<&str> {
     let rest = line.strip_prefix("pub")?;
     match rest.strip_prefix('(') {
@@ -72,7 +73,7 @@ fn few_types_share_their_name() {
     let mut names: BTreeMap<String, usize> = BTreeMap::new();
     for (_, code) in codes() {
         let keywords = ["struct ", "enum ", "trait ", "type "];
-        // A type that is declared twice in one file is one type with and without a feature.
+        // A type that is declared twice in one file is one type, with and without a feature.
         let lines = code.lines().filter_map(visible);
         let here: BTreeSet<_> = lines.filter_map(|line| declared(line, &keywords)).collect();
         for (name, _) in here {
@@ -110,7 +111,7 @@ fn types_have_few_fields_and_one_place() {
                 let is_field = line.starts_with("    ") && !line.starts_with("     ");
                 *count += usize::from(is_field && line.contains(": "));
             }
-            // An `impl` of a trait is where the trait is of use.
+            // An `impl` of a trait may be wherever the trait is used.
             let inherent = line.starts_with("impl") && !line.contains(" for ");
             if inherent && line.ends_with('{') {
                 let generic = line

@@ -57,9 +57,9 @@ const PHRASES: &[(&str, &str)] = &[
     ("whoever", "(name the program or person)"),
 ];
 
-/// The most words of a sentence in `--help`.
+/// Most words of a sentence in `--help`.
 const HELP_WORDS: usize = 25;
-/// The most words of a sentence in the documents that a new user reads first.
+/// Most words of a sentence in the documents that a new user reads first.
 const GUIDE_WORDS: usize = 30;
 
 /// Files and folders whose words are not checked: this list, history, the examples of how to write, and what still says

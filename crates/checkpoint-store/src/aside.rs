@@ -1,4 +1,4 @@
-//! Keeps files under other names: damaged files, files found at the path, and files of ended sessions.
+//! Keeps files under other names: damaged files, foreign files at the checkpoint's path, and files of ended sessions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,18 +9,18 @@ use super::storage::FileId;
 use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
-    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes
-    /// its previous generation, or renames that too if the file may lack records. Nothing can be recorded
-    /// before the next [`begin`](Self::begin). Returns the new path, if there was a file.
+    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes its
+    /// previous generation, or renames that too if the file may lack records. Afterwards nothing can be recorded before
+    /// the next [`begin`](Self::begin). Returns the new path, if there was a file.
     ///
     /// # Errors
     ///
-    /// If the files cannot be renamed. They may still have their old names then.
+    /// If the files cannot be renamed. They may then still have their old names.
     pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
         self.active = None;
         self.overtake();
         self.unprotected = Some("its file has been set aside".to_owned());
-        // A usable file has everything that the previous generation has.
+        // A usable file contains everything that the previous generation contains.
         let whole = self.present.take().is_some_and(|present| present.usable);
         let kind: String = reason
             .chars()
@@ -34,7 +34,7 @@ impl<S: Storage> Store<S> {
             .collect();
         let (storage, path) = (&self.storage, &self.names.path);
         let moved = self.names.aside(storage, &kind).and_then(|aside| {
-            // The previous generation comes first, because it could be restored if it was left alone.
+            // The previous generation is moved first. If it stayed, a later start could restore it.
             let before = self.names.previous();
             match whole {
                 true => if_there(storage.remove(&before))?,
@@ -49,8 +49,8 @@ impl<S: Storage> Store<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Moves the file at `fresh` to the checkpoint's path. A file that is there is kept under another name,
-    /// unless it is already kept as the `previous` generation, or is our own and of no use.
+    /// Moves the file at `fresh` to the checkpoint's path. Keeps a file that is there under another name, unless it is
+    /// already kept as the `previous` generation, or is an unusable file of this store.
     pub(super) fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
         let (storage, path) = (&self.storage, &self.names.path);
         let there = storage.id_at(path)?;
@@ -100,7 +100,7 @@ pub(super) fn set_aside_previous(
     if_there(storage.rename(&previous, &aside)).map(|_| ())
 }
 
-/// Turns the error that the file does not exist into `false`.
+/// Turns a "not found" error into `false`.
 fn if_there(done: io::Result<()>) -> io::Result<bool> {
     match done {
         Ok(()) => Ok(true),

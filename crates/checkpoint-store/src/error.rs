@@ -8,7 +8,7 @@ use thiserror::Error;
 use super::Change;
 use rescue_core::checkpoint::format::EncodeError;
 
-/// Why a checkpoint cannot be opened. Nothing has been changed.
+/// Why a checkpoint cannot be opened. The files are unchanged.
 #[derive(Debug, Error)]
 pub enum OpenError {
     #[error(
@@ -57,10 +57,10 @@ impl OpenError {
     }
 }
 
-/// Why something was not recorded. Calls are forwarded nevertheless.
+/// Why a call was not recorded. Calls are forwarded nevertheless.
 #[derive(Debug, Error)]
 pub enum StoreError {
-    /// An earlier failure, or [`begin`](super::Store::begin) was not called yet.
+    /// An earlier operation failed, or [`begin`](super::Store::begin) was not called yet.
     #[error("`{}` records nothing: {reason}", path.display())]
     Unprotected { path: PathBuf, reason: String },
     /// The operating system reported an error.
@@ -73,7 +73,7 @@ pub enum StoreError {
     /// Another process has changed the file.
     #[error("another process changed `{}`: {change}", path.display())]
     Changed { path: PathBuf, change: Change },
-    /// The lock file was removed, and then another rosrescue took the lock.
+    /// Another rosrescue took the lock after the lock file had been removed.
     #[error(
         "`{}` is in use by another rosrescue{} now; stop one of the two",
         path.display(),
@@ -97,8 +97,8 @@ pub enum StoreError {
     /// A new generation is already being written.
     #[error("another generation of the checkpoint is being written; finish that one first")]
     Busy,
-    /// The new generation is obsolete: a later one was begun, the file was set aside, or too much was
-    /// recorded in the meantime.
+    /// The new generation is obsolete. A later one was begun, the file was set aside, or too much was recorded
+    /// meanwhile.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken { path: PathBuf },
     /// The state or the record cannot be encoded.

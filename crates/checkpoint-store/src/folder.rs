@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// The mode bit that lets only the owner of a file rename or remove it.
+/// Mode bit of a folder in which only the owner of a file can rename or remove it.
 const STICKY: u32 = 0o1000;
 
 /// Owner and mode of a folder.
@@ -27,7 +27,7 @@ impl Access {
         })
     }
 
-    /// Who else than the user `own` may create files in the folder. `None` if no other user may.
+    /// Which other users than `own` may create files in the folder. `None` if none may.
     fn others(self, own: u32) -> Option<&'static str> {
         // Many distributions give each user a group with the same number and no other members.
         let is_private = self.group == self.user || self.group == 0;
@@ -43,8 +43,8 @@ impl Access {
     }
 }
 
-/// The first folder above the checkpoint at `path` in which other users may plant or swap files, and the
-/// reason. `None` if all folders are safe or cannot be examined.
+/// The nearest folder above the checkpoint at `path` in which other users may create or replace files, with the reason.
+/// `None` if all folders are safe or cannot be examined.
 pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
     let own = rustix::process::geteuid().as_raw();
     let path = std::path::absolute(path).ok()?;
@@ -59,7 +59,7 @@ pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
     folders
         .flatten()
         .enumerate()
-        // In a sticky folder others may plant a file beside the checkpoint, but not swap a folder below it.
+        // In a sticky folder other users may create a file beside the checkpoint, but not replace a folder below it.
         .filter(|(level, (_, access))| *level == 0 || access.mode & STICKY == 0)
         .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.others(own)?)))
 }

@@ -1,4 +1,4 @@
-//! Writes a new generation of the file while records are still being appended.
+//! Writes a new generation of the checkpoint while records are appended to the present one.
 
 use std::io;
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// Size of a journal that makes a new generation worth writing.
+/// Least size of a journal for which a new generation is written.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
 /// Maximum size of the records that are kept in memory while a new generation is written. Beyond it the new
 /// generation is dropped and the present file stays in use.
@@ -17,21 +17,21 @@ pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
 pub(super) struct Pending {
     generation: u64,
-    /// The records appended since the new generation was begun, each with a line feed.
+    /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// Its `Arc` is gone if the job or its result was dropped unfinished.
+    /// Whether this generation is still wanted. The `Arc` is gone if the job or its result was dropped.
     ticket: Weak<Ticket>,
 }
 
-/// Whether a generation is still wanted. It is locked while the generation's job renames files, so that an
-/// obsolete job cannot touch its successor's files.
+/// Whether a generation is still wanted. Locked while the generation's job renames files, so that an obsolete job
+/// cannot touch its successor's files.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
 impl Ticket {
     fn lock(&self) -> MutexGuard<'_, bool> {
-        // A boolean is valid even if the lock is poisoned.
+        // A boolean stays valid even if the lock is poisoned.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -50,8 +50,8 @@ struct Plan<S: Storage> {
     generation: u64,
     /// The present file, if it is to become the previous generation.
     keep_present: Option<FileId>,
-    /// Runs first if the present file is kept. Some of its records may not be durable anywhere but in the
-    /// older generation, which is about to be replaced.
+    /// A sync that runs first if the present file is kept. Some of its records may be durable only in the older
+    /// generation, which is about to be replaced.
     settle: Option<SyncJob<S>>,
     ticket: Arc<Ticket>,
 }
@@ -72,13 +72,13 @@ struct Written<S: Storage> {
     crc: u32,
     /// The file that has become the previous generation.
     previous: Option<FileId>,
-    /// Whether the previous generation is the present file itself, under a second name. Then it also receives
-    /// the records that are appended until the new generation replaces it.
+    /// Whether the previous generation is the present file under a second name. Then it also receives the records that
+    /// are appended before the new generation replaces it.
     linked: bool,
 }
 
 impl<S: Storage> CompactionJob<S> {
-    /// Encodes, writes and syncs. Blocks for as long as the disk does.
+    /// Encodes, writes and syncs. Blocks as long as the disk does.
     pub fn run(self) -> Compacted<S> {
         self.plan.run(&self.checkpoint)
     }
@@ -126,8 +126,8 @@ impl<S: Storage> Plan<S> {
                 .map_err(failed("keep", &path))?;
             previous = self.keep_present;
         }
-        // Both names are durable before the new generation takes the path. So whatever a loss of power undoes
-        // later, all records are in one of the two files.
+        // Both names are durable before the new generation takes the path. So all records are in one of the two files,
+        // whatever a loss of power undoes.
         storage
             .sync_dir(names.folder())
             .map_err(failed("sync the folder of", &path))?;
@@ -158,8 +158,8 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the previous generation, which is about to be replaced anyway. Never removes the present file,
-    /// which is the only copy until there is a new one.
+    /// Removes the previous generation, which would be replaced anyway. Never removes the present file, which is the
+    /// only copy until the new one is complete.
     fn make_room(&self) -> bool {
         let wanted = self.ticket.lock();
         *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
@@ -195,13 +195,12 @@ impl<S: Storage> Store<S> {
     }
 
     /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] equals
-    /// [`seq`](Self::seq). Run the job on any thread, continue to append, then pass the result to
-    /// [`finish_compaction`](Self::finish_compaction). This also re-arms an unprotected store while calls go
-    /// on.
+    /// [`seq`](Self::seq). Run the job in any thread, continue to append, then pass the result to
+    /// [`finish_compaction`](Self::finish_compaction). This also ends the unprotected state while calls continue.
     ///
     /// # Errors
     ///
-    /// If the checkpoint is behind the journal or another generation is being written.
+    /// If the checkpoint is behind the journal, or another generation is being written.
     pub fn begin_compaction(
         &mut self,
         checkpoint: Checkpoint,
@@ -261,13 +260,13 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Appends the records made in the meantime to the new generation, and moves it to the path. This is
-    /// quick: it waits for the disk only if the file system has no hard links.
+    /// Appends the records made meanwhile to the new generation, and moves it to the path. This is quick: it waits for
+    /// the disk only if the file system has no hard links.
     ///
     /// # Errors
     ///
-    /// If there is no new generation. The present file stays in use, and the next compaction is due when it
-    /// has doubled in size.
+    /// If there is no new generation. The present file stays in use, and the next compaction is due when it has doubled
+    /// in size.
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
@@ -276,7 +275,7 @@ impl<S: Storage> Store<S> {
         let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
         let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
-            // The file may not exist. If it stays, the next start removes it.
+            // The file may not exist. If removing it fails, the next start does it.
             let _ = self.storage.remove(&fresh);
             let journal = self
                 .active
@@ -306,7 +305,7 @@ impl<S: Storage> Store<S> {
         append_all(&self.storage, &written.file, &journal)
             .and_then(|()| match written.linked {
                 true => Ok(()),
-                // This is the only wait, on file systems such as FAT.
+                // Only file systems without hard links, such as FAT, wait here.
                 false => self.storage.sync(&written.file),
             })
             .map_err(failed("write", &fresh))?;
@@ -340,7 +339,7 @@ impl<S: Storage> Store<S> {
         Ok(())
     }
 
-    /// Ends the unprotected state. Does the same as [`begin`](Self::begin).
+    /// Ends the unprotected state, in the same way as [`begin`](Self::begin).
     ///
     /// # Errors
     ///
@@ -386,7 +385,7 @@ pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) 
     Ok(())
 }
 
-/// Adds to an error what was being done, and to which file.
+/// Adds the operation and the file to an error.
 pub(super) fn failed(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> StoreError {
     move |source| StoreError::Io {
         doing,

@@ -1,4 +1,4 @@
-//! The checkpoints that are kept beside the present one: those of the last sessions and of the last rescues.
+//! The checkpoints kept beside the present one: those of the last sessions and of the last rescues.
 
 use std::fs;
 use std::io;
@@ -22,9 +22,9 @@ pub const DRILLS: &str = "/rosrescue_drill_";
 /// Why a checkpoint is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// It was the last one of a session when another session began.
+    /// The session's last checkpoint, kept when the next session began.
     Session,
-    /// It is the state that was given to a new master.
+    /// The state that a new master got in a rescue.
     Rescue,
 }
 
@@ -50,7 +50,7 @@ pub struct Kept {
     pub written: i64,
 }
 
-/// The checkpoints kept beside the one at `path`, whose links must be resolved: sessions first, newest first.
+/// Lists the checkpoints kept beside the one at `path`: sessions first, newest first. Links in `path` must be resolved.
 ///
 /// # Errors
 ///
@@ -86,13 +86,13 @@ pub fn last_rescue(path: &Path) -> u64 {
         .unwrap_or(0)
 }
 
-/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. It is not synced,
-/// because it is only a copy, and memory cards wear out. Nodes and parameters of drills are left out, so that
-/// `rosrescue restore` does not bring them back.
+/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. Nodes and parameters of drills
+/// are left out, so that `rosrescue restore` does not bring them back. The file is not synced: it is only a copy, and
+/// syncs wear out memory cards.
 ///
 /// # Errors
 ///
-/// If it cannot be written. Nothing is left of it then.
+/// If it cannot be written. Then no file remains.
 pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
     checkpoint.snapshot.remove_named(DRILLS);
     checkpoint.pending.retain(|call| {
@@ -114,8 +114,8 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
     written.map(|()| kept)
 }
 
-/// Removes surplus files: all but the last sessions and rescues, and of these the oldest until the rest take
-/// no more than `bytes_most`. The last session always stays.
+/// Removes surplus files: first all but the last sessions and rescues, then the oldest until the rest takes
+/// `bytes_most` or less. The last session always stays.
 ///
 /// # Errors
 ///
@@ -126,7 +126,7 @@ pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
         all.into_iter().partition(|kept| kept.kind == Kind::Session);
     let mut surplus = sessions.split_off(SESSIONS_MAX.min(sessions.len()));
     surplus.extend(rescues.split_off(RESCUES_MAX.min(rescues.len())));
-    // By age: the last one of each kind, the last but one of each kind, and so on.
+    // Ranks by age: first the newest of each kind, then the second newest of each kind, and so on.
     let mut ranked: Vec<_> = sessions.into_iter().enumerate().collect();
     ranked.extend(rescues.into_iter().enumerate());
     ranked.sort_by_key(|(rank, _)| *rank);

@@ -19,11 +19,11 @@ pub(super) struct Active<S: Storage> {
     pub(super) snapshot_bytes: u64,
     pub(super) journal_bytes: u64,
     pub(super) id: FileId,
-    /// Check sum of everything that was written.
+    /// Check sum of all bytes written so far.
     pub(super) crc: u32,
-    /// Modification time of the file after our last write.
+    /// Modification time of the file after this store's last write.
     pub(super) modified: i128,
-    /// Whether another process may have written to the file, so that its content must be read.
+    /// Whether another process may have written to the file. Then its content must be read.
     pub(super) suspect: bool,
     /// Whether everything that was appended has been synced.
     pub(super) clean: bool,
@@ -32,9 +32,9 @@ pub(super) struct Active<S: Storage> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Records `entries` with one write. Each entry gets a number, even if it cannot be recorded; returns the
-    /// last one. After this call the entries survive the death of any process; a [`sync_job`](Self::sync_job)
-    /// makes them survive a loss of power as well.
+    /// Records `entries` with one write. Each entry gets a number, even if it cannot be recorded. Returns the last
+    /// number. Afterwards the entries survive the death of any process. A [`sync_job`](Self::sync_job) makes them
+    /// survive a loss of power as well.
     ///
     /// # Errors
     ///
@@ -71,7 +71,8 @@ impl<S: Storage> Store<S> {
                 });
             }
         };
-        // A record after another process's bytes, or in a truncated file, must not be acknowledged.
+        // Before a record is acknowledged, make sure that it is not in a truncated file or behind another process's
+        // bytes.
         if let Ok(status) = self.storage.status(&active.file)
             && let Err(change) = active.compare(&status)
         {
@@ -80,13 +81,13 @@ impl<S: Storage> Store<S> {
         active.clean &= self.buffer.is_empty();
         let length = active.length() + self.buffer.len() as u64;
         let appended = match length > self.file_bytes_max {
-            // A larger file could not be read again.
+            // A start could not read a larger file.
             true => Err(io::ErrorKind::FileTooLarge.into()),
             false => self.storage.append(&active.file, &self.buffer),
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
-            // Not retried, because writing the rest would fail too, only with a clearer error.
+            // The rest is not retried: that write would fail too, with a clearer error.
             Ok(taken) => Err(io::Error::new(
                 io::ErrorKind::StorageFull,
                 format!("only {taken} of {} bytes were written", self.buffer.len()),
@@ -110,8 +111,8 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Stops recording to the present file for good, because the disk did not answer and so records are
-    /// missing in it. `reason` is shown to the user.
+    /// Stops recording to the present file for good. The disk did not answer, so the file lacks records. `reason` is
+    /// shown to the user.
     pub fn give_up(&mut self, reason: &str) {
         self.latch(failed("write", &self.names.path)(io::Error::new(
             io::ErrorKind::TimedOut,
@@ -125,7 +126,7 @@ impl<S: Storage> Store<S> {
         if self.active.take().is_some_and(|active| !active.named)
             && let Some(present) = &mut self.present
         {
-            // It is unknown how much of the file is durable. The previous generation has everything that was.
+            // It is unknown how much of the file is durable. The previous generation is durable.
             present.usable = false;
         }
         error
@@ -166,8 +167,8 @@ impl<S: Storage> Store<S> {
                 Ok(())
             }
             (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
-            // It was a file that has been replaced since. Its successor holds the same records and has not
-            // been synced yet.
+            // The sync was of a file that has been replaced since. The new file has the same records and is not synced
+            // yet.
             (Err(_), None) => Ok(()),
         }
     }
@@ -194,7 +195,7 @@ pub struct Synced {
 }
 
 impl<S: Storage> SyncJob<S> {
-    /// Syncs. Blocks for as long as the disk does.
+    /// Syncs. Blocks as long as the disk does.
     pub fn run(self) -> Synced {
         let mut result = self.storage.sync(&self.file);
         if let (Ok(()), Some(names)) = (&result, &self.names) {

@@ -1,15 +1,15 @@
-//! The store of a checkpoint on disk.
+//! Stores a checkpoint on disk.
 //!
-//! A [`Store`] owns one file and its companions: it takes the lock, loads the file ([`Loaded`]), appends
-//! records, and replaces the file by a new generation when the journal is too large or the disk has failed.
-//! It is synchronous and never decides by itself when to do so. It returns slow work ([`SyncJob`],
-//! [`CompactionJob`]) as a job for a blocking thread, and can append records meanwhile. `docs/checkpoint.md`
-//! describes the commit procedure and the assumptions about the disk.
+//! A [`Store`] owns one file and its companions. It takes the lock, loads the file ([`Loaded`]), appends records, and
+//! replaces the file by a new generation when the journal is too large or the disk has failed. It is synchronous, and
+//! its caller decides when to do all that. Slow work is returned as a job ([`SyncJob`], [`CompactionJob`]) for a
+//! blocking thread. Meanwhile the store can append records. `docs/checkpoint.md` describes the commit procedure and the
+//! assumptions about the disk.
 //!
-//! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only
-//! once that data was lost. The store is then [unprotected](Store::unprotected) until [`Store::rearm`] has
-//! written a new file. When another process changes the file, its folder or its lock, no write fails, but a
-//! [`CheckJob`] notices, and that latches too.
+//! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only once that
+//! data was lost. The store is then [unprotected](Store::unprotected) until [`Store::rearm`] has written a new file. If
+//! another process changes the file, its folder or its lock, writes still succeed. A [`CheckJob`] notices such a
+//! change, which latches as well.
 
 mod aside;
 mod error;
@@ -48,11 +48,11 @@ const BROKEN: &str = "broken";
 /// Part of the name under which an unreadable file is kept.
 const UNREADABLE: &str = "unreadable";
 
-/// The file known to be at the checkpoint's path.
+/// The known file at the checkpoint's path.
 #[derive(Clone, Copy, Debug)]
 struct Present {
     id: FileId,
-    /// Whether it can become the previous generation.
+    /// Whether the file can become the previous generation.
     usable: bool,
 }
 
@@ -65,17 +65,16 @@ pub struct Store<S: Storage = Disk> {
     /// Why nothing is being recorded. `None` only if `active` is set.
     unprotected: Option<String>,
     pending: Option<Pending>,
-    /// The number of the last record, even if it could not be recorded. No number is used twice.
+    /// Number of the last entry, recorded or not. No number is used twice.
     seq: u64,
     synced_seq: u64,
     /// The highest generation that was begun.
     generation: u64,
-    /// The file known to be at the path. Any other file there is kept under another name before it is
-    /// replaced.
+    /// The known file at the path. Any other file there is kept under another name before it is replaced.
     present: Option<Present>,
-    /// Part of the name under which the next such file is kept.
+    /// Part of the name under which the next foreign file is kept.
     aside_kind: &'static str,
-    /// The name under which the last such file was kept.
+    /// The name under which the last foreign file was kept.
     kept: Option<PathBuf>,
     compact_above: u64,
     file_bytes_max: u64,
@@ -84,8 +83,8 @@ pub struct Store<S: Storage = Disk> {
     lock_id: FileId,
 }
 
-/// Reads the checkpoint at `path` without changing anything: takes no lock, creates no folder, makes no
-/// copies. Meant for a disk on which [`Store::open`] fails because it is read-only.
+/// Reads the checkpoint at `path` without changing anything: takes no lock, creates no folder, makes no copies. It
+/// works on a read-only disk, where [`Store::open`] fails.
 ///
 /// # Errors
 ///
@@ -132,20 +131,20 @@ fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) 
 }
 
 impl<S: Storage> Store<S> {
-    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. Copies a
-    /// damaged file and an incomplete append to other names. Keeps an unreadable file under another name when
-    /// it is replaced. Nothing can be recorded before [`begin`](Self::begin).
+    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. Copies a damaged file and
+    /// an incomplete append to other names. Keeps an unreadable file under another name when it is replaced. Nothing
+    /// can be recorded before [`begin`](Self::begin).
     ///
     /// # Errors
     ///
-    /// If the folder or the file cannot be used, if another rosrescue uses it, or if the file is not a
-    /// checkpoint or was written by a newer version. The file is unchanged in all these cases.
+    /// If the folder or the file cannot be used, if another rosrescue uses it, if the file is not a checkpoint, or if a
+    /// newer version wrote it. Then the file is unchanged.
     pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
         let Some(found) = load::load(storage, names)? else {
-            // The operator has removed the file in order to start afresh, so the previous generation must not
-            // be restored later.
+            // The operator has removed the file to start without it, so the previous generation must not be restored
+            // later.
             names
                 .remove_unfinished(storage)
                 .and_then(|()| set_aside_previous(storage, names, "old"))
@@ -157,7 +156,7 @@ impl<S: Storage> Store<S> {
         if store.present.is_none() {
             store.aside_kind = UNREADABLE;
         }
-        // A failure does not matter here: a read-only disk can still be read.
+        // A failure here does not matter: a read-only disk can still be read.
         let _ = names.remove_unfinished(storage);
         let kept = match store.present {
             Some(_) => keep_aside(storage, names, &mut loaded, found.torn),
@@ -170,7 +169,7 @@ impl<S: Storage> Store<S> {
             loaded.damage.push(format!(
                 "the damaged part of `{path}` could not be kept: {error}"
             ));
-            // So it will be kept when it is replaced.
+            // Then it is kept when it is replaced.
             store.present = store.present.filter(|present| present.usable);
         }
         store.set_counts(found.seq, found.generation);
@@ -186,7 +185,7 @@ impl<S: Storage> Store<S> {
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
-        // The numbers that the file has used must not be used again.
+        // Numbers that the old file has used must not be used again.
         let found = load::load(storage, names)?.unwrap_or_default();
         let _ = names.remove_unfinished(storage);
         set_aside_previous(storage, names, UNREADABLE)
@@ -242,12 +241,12 @@ impl<S: Storage> Store<S> {
         &self.names.path
     }
 
-    /// The number of the last record, even if it could not be recorded.
+    /// Number of the last entry, recorded or not.
     pub fn seq(&self) -> u64 {
         self.seq
     }
 
-    /// The number of the last record known to survive a loss of power.
+    /// Number of the last record that is known to survive a loss of power.
     pub fn synced_seq(&self) -> u64 {
         self.synced_seq
     }

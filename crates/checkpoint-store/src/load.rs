@@ -12,18 +12,18 @@ use rescue_core::checkpoint::format::{
 /// Maximum size of a file that is read. No checkpoint is larger.
 pub(super) const FILE_BYTES_MAX: u64 = 1 << 30;
 
-/// Everything that was found on disk.
+/// Everything found on disk.
 #[derive(Debug, Default)]
 pub struct Loaded {
-    /// The newest whole snapshot. Without one, only `records` are left of the state.
+    /// The newest complete snapshot. Without one, only `records` is left of the state.
     pub checkpoint: Option<Checkpoint>,
-    /// The whole records after the snapshot, in order.
+    /// The undamaged records after the snapshot, in order.
     pub records: Vec<Record>,
-    /// Whether this is exactly the recorded state. If not, something is missing.
+    /// Whether this is exactly the recorded state. Otherwise a part is missing.
     pub exact: bool,
     /// Describes an append that a crash cut short. It was never acknowledged.
     pub torn: Option<String>,
-    /// Describes any other damage, one sentence each. To be logged as errors.
+    /// Describes any other damage, one sentence each, to be logged as errors.
     pub damage: Vec<String>,
 }
 
@@ -41,7 +41,7 @@ impl Loaded {
     }
 }
 
-/// What [`Loaded`] holds, and what the store needs to continue.
+/// The content for [`Loaded`], and what the store needs to continue.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     pub(super) loaded: Loaded,
@@ -53,7 +53,7 @@ pub(super) struct Found {
     usable: bool,
     /// The present file, if it was readable.
     pub(super) present: Option<Present>,
-    /// For a previous generation that is no usable fallback: part of the name under which to keep it.
+    /// If the previous generation cannot be used: part of the name under which to keep it.
     pub(super) bad_previous: Option<&'static str>,
     /// The bytes of an incomplete append.
     pub(super) torn: Option<Vec<u8>>,
@@ -62,7 +62,7 @@ pub(super) struct Found {
 /// Reads the checkpoint of `names`. `None` if there is none.
 pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
     let path = &names.path;
-    // Taken before reading: a file that replaces this one later has another id, and so is kept.
+    // Taken before reading. A file that replaces this one later has another id, and is kept under another name.
     let id = storage.id_at(path).ok().flatten();
     let bytes = match read(storage, path) {
         Ok(None) => return Ok(None),
@@ -97,7 +97,7 @@ pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found
             );
             let nothing = Framed::unreadable(&[]);
             let mut found = join(names, &nothing, Err(why), Some(&previous), &[]);
-            // The next generation must not get the number of the unreadable one.
+            // The next generation must not reuse the unreadable one's number.
             found.generation += 1;
             found
         }
@@ -118,7 +118,7 @@ fn load_present(
             let path = path.clone();
             return Err(OpenError::NewerVersion { path, version });
         }
-        // Because there is a previous generation of ours, this file was ours too.
+        // A valid previous generation shows that the damaged file was a checkpoint as well.
         (Err(DecodeError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
         (Err(DecodeError::NotACheckpoint), None) => {
             return Err(OpenError::NotACheckpoint { path: path.clone() });
@@ -164,11 +164,11 @@ fn join(
     };
     let base = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.seq);
 
-    // The previous generation may hold records that the present one has lost, or lacks after a loss of power
-    // just after a compaction.
+    // The previous generation may have records that the present one has lost, or lacks after a loss of power just after
+    // a compaction.
     let mut records = present.records(base, &mut damaged);
     let own = records.len();
-    // If the present file was restored from a copy, it does not follow the previous generation.
+    // A present file that was copied back from elsewhere does not follow the previous generation.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {
         generation(present).is_none_or(|present| generation(previous).is_some_and(|g| g < present))
@@ -176,7 +176,7 @@ fn join(
     if let Some(previous) = older {
         let mut ignored: Vec<Damage> = Vec::new();
         records.extend(previous.records(base, &mut ignored));
-        // The sort is stable: of two records with the same number, the one of the present generation is kept.
+        // The sort is stable, so of two records with the same number the present generation's is kept.
         records.sort_by_key(|record| record.seq);
         records.dedup_by_key(|record| record.seq);
     }
@@ -184,7 +184,7 @@ fn join(
         format!("`{}` is damaged at byte {offset}: {why}", path.display())
     }));
 
-    // The record number at which the present file was begun.
+    // The record number at which the present generation begins.
     let begun = present.header.map(|header| header.seq);
     let begun = begun.or_else(|| Some(present.lines.first()?.seq.saturating_sub(1)));
     let mut exact = checkpoint.is_some() && !present.end_lost && begun.is_some();
@@ -203,8 +203,8 @@ fn join(
         expected = begun.saturating_add(1);
     }
     let torn = present.torn.clone();
-    // Above every number in either file, usable or not: parts of a file may stay beside later generations,
-    // and must not be taken for their records.
+    // Higher than every number in either file, usable or not. Parts of a file may remain beside later generations, and
+    // must not be taken for their records.
     let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
     let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
     Found {
@@ -213,7 +213,7 @@ fn join(
             .and_then(generation)
             .max(generation(present))
             .unwrap_or(0),
-        // Not while the file lacks records that the previous generation has.
+        // The file must not lack records that the previous generation has.
         usable: whole && records.len() == own,
         present: None,
         bad_previous: None,

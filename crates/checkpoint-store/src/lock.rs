@@ -1,9 +1,9 @@
-//! The lock of a checkpoint on this computer's disk, which no other process can remove.
+//! The lock of a checkpoint on this computer's disk.
 //!
-//! A lock file alone is not enough: it can be deleted, or renamed with its folder, and then the next
-//! rosrescue would create a new one. So there are three locks. The lock file works for every process that
-//! sees the folder, including those in other containers. A socket in the abstract namespace, named after the
-//! checkpoint, cannot be removed while rosrescue lives. The checkpoint itself is locked too; see [`claim`].
+//! A lock file alone is not enough. It can be deleted, or renamed together with its folder, and then the next rosrescue
+//! would create a new one. So there are three locks. The lock file works for every process that sees the folder,
+//! including processes in other containers. A socket in the abstract namespace, named after the checkpoint, cannot be
+//! removed while rosrescue lives. The checkpoint itself is locked too; see [`claim`].
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -19,15 +19,14 @@ use rustix::fs::FlockOperation;
 use super::storage::FileId;
 use crate::regular_file;
 
-/// How long to wait for the locks of a process that was killed. If it was starting another process at that
-/// moment, they last until that one has closed the descriptors that it inherited. A rosrescue that starts
-/// then must not be refused.
+/// How long to wait for the locks of a killed process. If it was starting a child process when it was killed, its locks
+/// last until the child has closed the inherited descriptors. Then a rosrescue that starts must not be refused.
 const LINGER: Duration = Duration::from_millis(500);
 
 #[derive(Debug)]
 pub struct DiskLock {
     file: File,
-    /// `None` if the kernel does not have such sockets.
+    /// `None` if the kernel does not support such sockets.
     _name: Option<UnixDatagram>,
 }
 
@@ -59,7 +58,7 @@ impl DiskLock {
         Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
     }
 
-    /// Makes a new lock file, and its folder if needed, when the one at `path` is not ours any more.
+    /// Makes a new lock file, and its folder if needed, if another file is at `path` than the one that is locked.
     pub(super) fn renew(&mut self, path: &Path) -> io::Result<Result<(), Refused>> {
         if FileId::at(path)? == Some(self.id()?) {
             return Ok(Ok(()));
@@ -75,7 +74,7 @@ impl DiskLock {
     }
 }
 
-/// Locks the file of a checkpoint while it is open, if the file system can.
+/// Locks the checkpoint file while it is open, if the file system supports that.
 pub(super) fn claim(file: &File) {
     let _ = rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive);
 }
@@ -100,7 +99,7 @@ fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
     let mut file = regular_file::open_or_create(path)?;
     match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {
-            // This is for the user and for error messages; the lock holds without it.
+            // The content is for users and error messages. The lock holds without it.
             let _ = file
                 .set_len(0)
                 .and_then(|()| writeln!(file, "{}", std::process::id()));
@@ -123,12 +122,12 @@ fn holder(file: File) -> Option<u32> {
     text.trim().parse().ok()
 }
 
-/// Binds the socket named after the checkpoint. It is a datagram socket, because that has no queue of
-/// connections which another process could fill.
+/// Binds the socket named after the checkpoint. A datagram socket has no queue of connections that another process
+/// could fill.
 fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     let root = FileId::of(&fs::metadata("/")?);
-    // Within one mount namespace a path means one file. Containers that share a network namespace each have
-    // their own mount namespace.
+    // Within one mount namespace a path stands for one file. Containers that share a network namespace each have their
+    // own mount namespace.
     let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();
     let folder = checkpoint.parent().unwrap_or_else(|| Path::new("/"));
     let path = fs::canonicalize(folder)?.join(checkpoint.file_name().unwrap_or_default());
@@ -138,8 +137,8 @@ fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
-/// Computes a 64-bit FNV-1a hash. A path can be longer than the name of a socket, and every version of
-/// rosrescue must compute the same name.
+/// Computes a 64-bit FNV-1a hash. A path can be longer than a socket's name. All versions of rosrescue must compute the
+/// same name.
 fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
         (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)

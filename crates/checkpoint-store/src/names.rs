@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use super::{Storage, StoreError};
 
-/// Number of files to keep of one kind. Older ones are removed, so that daily starts do not fill the disk.
+/// Number of files of one kind to keep. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
 
-/// The path of a checkpoint and of its companions, which are all in one folder.
+/// The paths of a checkpoint and of its companions, all in one folder.
 #[derive(Clone, Debug)]
 pub(super) struct Names {
     pub(super) path: PathBuf,
@@ -40,7 +40,7 @@ impl Names {
         self.path.parent().unwrap_or_else(|| Path::new("/"))
     }
 
-    /// The rest of each name in the folder that starts with the checkpoint's name and a dot.
+    /// What follows the checkpoint's name and a dot, for each such name in the folder.
     fn endings(&self, storage: &impl Storage) -> io::Result<Vec<String>> {
         let stem = self.path.file_name().unwrap_or_default().to_string_lossy() + ".";
         let names = storage.list(self.folder())?.into_iter();
@@ -67,8 +67,8 @@ impl Names {
         self.with(&format!(".{kind}-{number}"))
     }
 
-    /// A new name for a file of this kind. Removes surplus old files. Names are numbered, because the clock
-    /// may be wrong.
+    /// A new name for a file of this kind. Removes surplus old files. Names contain numbers and not dates, because the
+    /// clock may be wrong.
     pub(super) fn aside(&self, storage: &impl Storage, kind: &str) -> io::Result<PathBuf> {
         let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
@@ -82,7 +82,7 @@ impl Names {
         Ok(self.numbered(kind, number))
     }
 
-    /// Removes files that a crash left unfinished: new generations, and files that were being renamed.
+    /// Removes unfinished files that a crash left behind: new generations, and files that were being renamed.
     pub(super) fn remove_unfinished(&self, storage: &impl Storage) -> io::Result<()> {
         for generation in self.numbers(storage, "new")? {
             storage.remove(&self.fresh(generation))?;

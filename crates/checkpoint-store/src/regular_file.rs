@@ -1,6 +1,5 @@
-//! Opens regular files in folders that other users may write to. It never follows a planted
-//! symbolic link, waits for the other end of a pipe, or changes a file that is hard-linked
-//! elsewhere.
+//! Opens regular files safely in folders that other users may write to. It never follows a symbolic link to another
+//! file, waits for the other end of a pipe, or changes a file that is hard-linked elsewhere.
 
 use std::{
     fs::{self, File, OpenOptions},
@@ -105,7 +104,7 @@ mod tests {
         }
         assert!(open(&fifo).is_err());
         assert!(open(&path("link")).is_ok());
-        // Only one of the two names is removed; the content remains under the other.
+        // One of the two names is removed. The content remains under the other.
         create(&path("second")).unwrap().write_all(b"new").unwrap();
         assert_eq!(fs::read_to_string(path("target")).unwrap(), "kept");
         assert_eq!(fs::read_to_string(path("second")).unwrap(), "new");

@@ -1,4 +1,4 @@
-//! A simulated disk that can stop, lose everything that was not synced, and fail.
+//! Simulates a disk that can stop, lose everything that was not synced, and fail.
 
 mod storage;
 
@@ -12,7 +12,7 @@ use super::FileId;
 /// How an operation fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// The process dies before this operation. A write still writes this many eighths of its bytes.
+    /// The process is killed before this operation. A write still writes this many eighths of its bytes.
     Kill(usize),
     /// This operation and all later ones fail with this error number. A write first writes half of its bytes
     /// and reports that.
@@ -23,7 +23,7 @@ pub(super) enum Fault {
     Once(i32),
 }
 
-/// A file: its durable content, and the writes since the last sync.
+/// A file with its durable content, and the writes since the last sync.
 #[derive(Clone, Default)]
 struct Inode {
     durable: Vec<u8>,
@@ -32,8 +32,7 @@ struct Inode {
     modified: i128,
     /// Whether the disk fails to read it.
     unreadable: bool,
-    /// Whether a sync of it failed. Using the file again is an error, because its unwritten pages may be
-    /// lost.
+    /// Whether a sync of it failed. Using the file again is an error, because its unwritten pages may be lost.
     poisoned: bool,
 }
 
@@ -98,7 +97,7 @@ impl SimFile {
     }
 }
 
-/// Whether an operation may proceed; if not, its error.
+/// Whether an operation may proceed.
 enum Step {
     Go,
     Partly(usize),
@@ -240,8 +239,7 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// The disk as the next process finds it after a kill: all writes are there, and none is more durable
-    /// than before.
+    /// The disk that the next process finds after a kill: all writes are there, but no more of them are durable.
     pub(super) fn after_kill(&self) -> Self {
         let mut world = self.0.lock().unwrap().clone();
         (world.fault, world.dead, world.ops) = (None, false, 0);
@@ -252,9 +250,9 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// The disks that a loss of power may leave: any subset of the renames, and for each file what was
-    /// synced, followed by nothing or by each later write either unchanged or as zeros, the last one whole or
-    /// cut at an eighth. Returns all combinations, or about `limit` of them if there are more.
+    /// The disks that a loss of power may leave. Any subset of the renames may have happened. Each file has its synced
+    /// content, followed by nothing or by each later write, unchanged or as zeros; the last write may be cut at any
+    /// eighth. Returns all combinations, or about `limit` of them if there are more.
     pub(super) fn after_power_loss(&self, limit: usize) -> Vec<Self> {
         let world = self.0.lock().unwrap().clone();
         let unsynced: Vec<usize> = (0..world.inodes.len())
@@ -262,7 +260,7 @@ impl SimFs {
             .collect();
         let ways = |nth: &usize| (8_usize << world.inodes[*nth].writes.len()) + 1;
         let combinations = unsynced.iter().map(ways).product::<usize>() << world.pending.len();
-        // Odd, so that every choice of names is combined with every other choice.
+        // An odd stride combines every choice of names with every other choice.
         let stride = (combinations / limit) | 1;
         let mut seen = BTreeSet::new();
         let mut images = Vec::new();

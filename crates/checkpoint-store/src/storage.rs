@@ -11,7 +11,7 @@ use rustix::io::Errno;
 use super::lock::{self, DiskLock};
 use crate::regular_file;
 
-/// Identifies a file, whatever its name.
+/// Identifies a file independently of its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileId {
     pub device: u64,
@@ -43,44 +43,44 @@ fn is_absence(error: &io::Error) -> bool {
     )
 }
 
-/// Shows whether another process has written to a file.
+/// The properties of a file that show whether another process has written to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileStatus {
     pub id: FileId,
     pub length: u64,
-    /// Time of the last write in nanoseconds. Only compared with itself.
+    /// Time of the last write, in nanoseconds. It is only compared with other values of this field.
     pub modified: i128,
 }
 
-/// The disk operations that a checkpoint needs. `append` makes one `write(2)`. Names are whole paths in one
-/// folder. Nothing is durable before `sync` (for contents) and `sync_dir` (for names).
+/// The disk operations that a checkpoint needs. `append` makes one `write(2)`. Names are complete paths in one folder.
+/// Contents are durable after `sync`, names after `sync_dir`.
 pub trait Storage: Clone + Send + Sync + 'static {
     type File: Send + Sync + 'static;
     type Lock: Send + 'static;
 
-    /// Creates the folder of `path` if needed. Returns the real path of the file.
+    /// Creates the folder of `path` if needed, and returns the file's real path.
     fn locate(&self, path: &Path) -> io::Result<PathBuf>;
-    /// Takes the lock of `checkpoint` and writes our process id to the lock file at `path`. If the lock is
-    /// taken, returns its holder.
+    /// Takes the lock of `checkpoint`, and writes this process's id to the lock file at `path`. If the lock is taken,
+    /// returns its holder.
     fn lock(&self, checkpoint: &Path, path: &Path) -> io::Result<Result<Self::Lock, Option<u32>>>;
-    /// Makes a new lock file at `path`, and its folder, if the present one is not ours any more. If the lock
-    /// is taken, returns its holder.
+    /// Makes a new lock file at `path`, and its folder, if another file is there than the one that is locked. If the
+    /// lock is taken, returns its holder.
     fn renew_lock(&self, lock: &mut Self::Lock, path: &Path)
     -> io::Result<Result<(), Option<u32>>>;
     /// The id of the lock file.
     fn lock_id(&self, lock: &Self::Lock) -> io::Result<FileId>;
-    /// Reads the whole content, but at most `limit` + 1 bytes.
+    /// Reads the whole content, up to `limit` + 1 bytes.
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
     /// Creates an empty file, readable and writable for its owner only. Replaces an existing one.
     fn create(&self, path: &Path) -> io::Result<Self::File>;
-    /// Writes at the end of the file. Returns how many bytes were written.
+    /// Writes at the end of the file, and returns how many bytes were written.
     fn append(&self, file: &Self::File, bytes: &[u8]) -> io::Result<usize>;
-    /// Returns when the content is durable.
+    /// Waits until the content is durable.
     fn sync(&self, file: &Self::File) -> io::Result<()>;
     /// Renames `from` to `to`. Replaces an existing file atomically.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Makes a hard link `to` to the file `from` and returns `true`. Replaces an existing file atomically. If
-    /// the file system has no hard links, makes a copy and returns `false`.
+    /// Makes a hard link `to` to the file `from`, and returns `true`. If the file system has no hard links, makes a
+    /// copy and returns `false`. Replaces an existing file atomically.
     fn link(&self, from: &Path, to: &Path) -> io::Result<bool>;
     /// Renames `from` to `path`, and the file that was at `path` to `aside`, an unused name.
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()>;
@@ -90,7 +90,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
     /// The CRC-32C of the first `length` bytes of the file at `path`.
     fn checksum(&self, path: &Path, length: u64) -> io::Result<u32>;
     fn remove(&self, path: &Path) -> io::Result<()>;
-    /// Returns when the names in `folder` are durable.
+    /// Waits until the names in `folder` are durable.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;
     /// The names in `folder` that are valid text.
     fn list(&self, folder: &Path) -> io::Result<Vec<String>>;
@@ -99,7 +99,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Disk;
 
-/// Number of symbolic links that Linux follows at most.
+/// Most symbolic links that Linux follows for one path.
 const SYMLINKS_MAX: usize = 40;
 
 impl Disk {
@@ -125,7 +125,7 @@ impl Storage for Disk {
         let mut path = std::path::absolute(path)?;
         for _ in 0..SYMLINKS_MAX {
             match fs::read_link(&path) {
-                // A relative target starts at the folder of the link; an absolute one replaces the path.
+                // A relative target starts at the link's folder. An absolute one replaces the path.
                 Ok(target) => {
                     path.pop();
                     path.push(target);
@@ -164,10 +164,10 @@ impl Storage for Disk {
     }
 
     fn create(&self, path: &Path) -> io::Result<File> {
-        // Remove it first, so as never to write to a file that has another name too.
+        // Removed first, so that a file with another name is never written to.
         remove_if_there(path)?;
         let file = Self::private().append(true).create_new(true).open(path)?;
-        // The umask can only have removed bits from the mode.
+        // The umask can only have removed permissions.
         file.set_permissions(fs::Permissions::from_mode(0o600))?;
         lock::claim(&file);
         Ok(file)
@@ -203,13 +203,13 @@ impl Storage for Disk {
             copy.sync_data()?;
         }
         fs::rename(&aside, to)?;
-        // The rename does nothing if both are names of the same file.
+        // The rename has no effect if both are names of the same file.
         remove_if_there(&aside)?;
         Ok(linked)
     }
 
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
-        // This goes through `aside`, which remains: after a crash our file is there, and nothing is lost.
+        // The file goes through `aside`. If a crash happens in between, it is there, and nothing is lost.
         fs::rename(from, aside)?;
         let exchanged = rustix::fs::renameat_with(CWD, aside, CWD, path, RenameFlags::EXCHANGE);
         let Err(error) = exchanged else {

@@ -1,4 +1,4 @@
-//! Crashes at every operation, losses of power, and disks that fail.
+//! Crashes at every operation, losses of power, and failing disks.
 
 mod faults;
 mod moved;
@@ -13,15 +13,14 @@ use ros1_master::xmlrpc::{Call, Value};
 
 const PATH: &str = "/log/latest-chkpt.yaml";
 
-/// What a store must hold: record `n` sets the parameter `n`, so a state is the list of the numbers that it
-/// contains.
+/// What a store must contain. Record `n` sets the parameter `n`, so a state is a list of numbers.
 #[derive(Default)]
 struct Model {
     session: &'static str,
     applied: Vec<u64>,
     /// The last record that was acknowledged.
     acked: u64,
-    /// The last record that was reported to survive a loss of power.
+    /// The last record reported to survive a loss of power.
     synced: u64,
     /// Which calls of [`Model::sync`] do nothing, one bit per call.
     lazy: u32,
@@ -99,7 +98,7 @@ fn open(fs: &SimFs) -> Result<(Store<SimFs>, Option<Loaded>), OpenError> {
     Store::open_on(fs.clone(), Path::new(PATH))
 }
 
-/// Does everything that a store does in its life. Each step follows whatever became of the step before.
+/// Does everything that a store does in its life. Each step runs whatever the result of the step before.
 fn life(fs: &SimFs, model: &mut Model) {
     model.session = "a";
     let Ok((mut store, _)) = open(fs) else { return };
@@ -108,7 +107,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     model.append(&mut store, 3);
     model.sync(&mut store);
     model.append(&mut store, 1);
-    // A compaction, with records appended before, while and after its file is written.
+    // A compaction. Records are appended before, during and after the writing of its file.
     if let Ok(job) = store.begin_compaction(model.checkpoint(store.seq())) {
         model.append(&mut store, 1);
         model.sync(&mut store);
@@ -126,7 +125,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     model.append(&mut store, 2);
     model.begin(&mut store);
     model.append(&mut store, 1);
-    // A compaction that becomes obsolete because of a new beginning.
+    // A compaction that becomes obsolete because of a new `begin`.
     if let Ok(job) = store.begin_compaction(model.checkpoint(store.seq())) {
         model.append(&mut store, 1);
         model.begin(&mut store);
@@ -147,8 +146,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     let _ = store.close(&model.checkpoint(store.seq()));
 }
 
-/// Checks that the loaded state has everything that was acknowledged up to `least`, and nothing that was
-/// never recorded.
+/// Checks that the loaded state has everything acknowledged up to `least`, and nothing that was never recorded.
 fn check(model: &Model, loaded: Option<&Loaded>, least: u64, context: &str) {
     let Some(loaded) = loaded else {
         assert_eq!(least, 0, "{context}: no checkpoint is left");
@@ -199,7 +197,7 @@ fn go_on(fs: &SimFs, context: &str) {
     assert_eq!(state(&loaded), model.applied, "{context}");
 }
 
-/// The number of operations in a whole [`life`].
+/// Number of operations in a complete [`life`].
 fn operations() -> usize {
     let fs = SimFs::default();
     let mut model = Model::default();
@@ -212,8 +210,8 @@ fn operations() -> usize {
     operations
 }
 
-/// Starts on what is left of `fs` and is killed, once at each operation of the start. Checks each time that
-/// everything up to `least` is still found. Returns the number of kills.
+/// Starts from what is left of `fs` and is killed, once at each operation of the start. Checks each time that
+/// everything up to `least` is still there. Returns the number of kills.
 fn starts_killed(fs: &SimFs, least: u64, context: &str) -> usize {
     let mut model = Model {
         session: "a",

@@ -1,8 +1,8 @@
-//! Checks whether the file at the path is still ours and unchanged.
+//! Checks whether the file at the path is unchanged and still the one that this store writes.
 //!
-//! Renaming the folder, unmounting the file system, and truncating or overwriting the file make no write
-//! fail: all writes succeed, into a file that cannot be found any more. So the path, the open file and the
-//! lock are compared with what is known, and a difference latches like a failed write.
+//! Writes still succeed after the folder was renamed, the file system unmounted, or the file truncated or overwritten.
+//! But nobody can find the written file any more. So path, open file and lock are compared with what is known, and a
+//! difference latches like a failed write.
 
 use std::io;
 use std::path::PathBuf;
@@ -34,7 +34,7 @@ pub enum Change {
     Lock,
 }
 
-/// Why the file cannot be relied on.
+/// Why the file cannot be trusted.
 #[derive(Debug)]
 enum Finding {
     Changed(Change),
@@ -47,7 +47,7 @@ impl From<io::Error> for Finding {
     }
 }
 
-/// A job that compares the disk with what should be there; see [`Store::check_job`](super::Store::check_job).
+/// A job that compares the disk with what the store expects; see [`Store::check_job`](super::Store::check_job).
 #[must_use = "nothing is checked until it has run"]
 pub struct CheckJob<S: Storage> {
     storage: S,
@@ -55,7 +55,7 @@ pub struct CheckJob<S: Storage> {
     generation: u64,
     id: FileId,
     lock_id: FileId,
-    /// Length and check sum, if the content must be read.
+    /// Length and check sum to compare, if the content must be read.
     content: Option<(u64, u32)>,
 }
 
@@ -66,7 +66,7 @@ pub struct Checked {
 }
 
 impl<S: Storage> CheckJob<S> {
-    /// Checks with a few system calls. Reads the file only if it may have been overwritten.
+    /// Makes a few system calls. Reads the file only if it may have been overwritten.
     pub fn run(self) -> Checked {
         Checked {
             generation: self.generation,
@@ -98,9 +98,8 @@ impl<S: Storage> Active<S> {
         self.snapshot_bytes + self.journal_bytes
     }
 
-    /// Compares the status of the file with that after our last write. A different modification time alone
-    /// proves nothing, because `touch` sets it and some file systems update it late; in that case the content
-    /// is read.
+    /// Compares the file's status with that after this store's last write. If only the modification time differs, the
+    /// content is read: `touch` changes that time too, and some file systems update it late.
     pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), Change> {
         let expected = self.length();
         if status.length != expected {
@@ -116,8 +115,8 @@ impl<S: Storage> Active<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// The check that the file at the path is ours and unchanged, and that the lock is ours. `None` if
-    /// nothing is being recorded, or if recording stops now because the length differs.
+    /// A check that the file at the path and the lock are those of this store, and unchanged. `None` if nothing is
+    /// being recorded, or if recording stops now because the length differs.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
         let active = self.active.as_mut()?;
         let status = self.storage.status(&active.file);
@@ -146,7 +145,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the file is not as expected. The store is now unprotected.
+    /// If the check found a difference. The store is now unprotected.
     pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
         let active = self.active.as_ref();
         let current = active.is_some_and(|active| active.generation == done.generation);
@@ -160,11 +159,11 @@ impl<S: Storage> Store<S> {
     /// Like [`latch`](Self::latch), after a change by another process.
     pub(super) fn changed(&mut self, change: Change) -> StoreError {
         if matches!(change, Change::Lock) {
-            // Taken again now, while the open file, which is locked too, keeps others out. If this fails, the
-            // next generation will report it.
+            // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
+            // this fails, the next generation reports it.
             let _ = self.hold_lock();
         } else {
-            // Another process's file may be at the path now. It must be kept when it is replaced.
+            // Another process's file may be at the path now. It is kept when it is replaced.
             self.present = None;
         }
         let path = self.names.path.clone();
@@ -178,7 +177,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Makes sure that the lock at the path is ours, before anything is written there.
+    /// Makes sure that this store holds the lock at the path, before anything is written there.
     pub(super) fn hold_lock(&mut self) -> Result<(), StoreError> {
         let path = self.names.lock();
         let renewed = self.storage.renew_lock(&mut self.lock, &path);
@@ -197,7 +196,7 @@ impl<S: Storage> Store<S> {
         Err(self.latch(error))
     }
 
-    /// The name under which a file found at the path was kept. Each name is returned once.
+    /// Takes the name under which a foreign file at the checkpoint's path was kept.
     pub fn take_kept(&mut self) -> Option<PathBuf> {
         self.kept.take()
     }

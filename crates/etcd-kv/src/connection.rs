@@ -1,4 +1,4 @@
-//! One endpoint of etcd: connections, TLS, and the token of a session.
+//! One endpoint of etcd: its connections, TLS, and session token.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -25,22 +25,22 @@ use super::{
     wire,
 };
 
-/// How long a connect may take, for each address. On one network it takes a millisecond.
+/// Longest time to connect to one address. In a local network it takes a millisecond.
 const CONNECT_LIMIT: Duration = Duration::from_secs(1);
-/// The largest answer: a page of a range.
+/// Largest answer, in bytes: a page of a range.
 const ANSWER_BYTES_MAX: usize = 64 << 20;
 /// Most idle connections that are kept.
 const IDLE_MOST: usize = 4;
 
-/// How etcd knows this computer.
+/// The credentials of this computer at etcd.
 #[derive(Clone, Default)]
 pub struct Access {
     pub tls: Tls,
-    /// Name and password.
+    /// User name and password.
     pub user: Option<(String, String)>,
 }
 
-/// Without the password.
+/// Hides the password.
 impl std::fmt::Debug for Access {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let user = self.user.as_ref().map(|(name, _)| name);
@@ -76,8 +76,8 @@ impl Endpoint {
     ) -> Result<Self, EtcdError> {
         let refused =
             |why: &str| EtcdError::Options(format!("`{url}` is no endpoint of etcd: {why}"));
-        let uri: hyper::Uri = url.parse().map_err(|_| refused("it is no URL"))?;
-        let host = uri.host().ok_or_else(|| refused("it names no host"))?;
+        let uri: hyper::Uri = url.parse().map_err(|_| refused("it is not a URL"))?;
+        let host = uri.host().ok_or_else(|| refused("it has no host"))?;
         let host = host
             .trim_start_matches('[')
             .trim_end_matches(']')
@@ -86,12 +86,12 @@ impl Endpoint {
             (Some("http"), _) => None,
             (Some("https"), Some(config)) => {
                 let secured = Secured::new(config, &host);
-                Some(secured.ok_or_else(|| refused("its host is no name of a host"))?)
+                Some(secured.ok_or_else(|| refused("its host is not a valid host name"))?)
             }
             (Some("https"), None) => {
-                return Err(refused("https needs the certificate of its authority"));
+                return Err(refused("https needs the certificate of etcd's authority"));
             }
-            _ => return Err(refused("it begins with neither http:// nor https://")),
+            _ => return Err(refused("it must begin with http:// or https://")),
         };
         Ok(Self {
             url: url.to_owned(),
@@ -108,7 +108,7 @@ impl Endpoint {
         &self.url
     }
 
-    /// The answer's body.
+    /// Makes a request and returns the answer's body.
     pub(super) async fn call(
         &self,
         path: &str,
@@ -134,7 +134,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether this is the port for etcd's other members: only that one lists them at `/members`.
+    /// Whether this is etcd's port for other members. Only that port lists them at `/members`.
     async fn is_for_peers(&self) -> bool {
         let ask = async {
             let mut connection = self.connect().await.ok()?;
@@ -157,7 +157,7 @@ impl Endpoint {
         self.exchange(path, body, token.as_deref()).await
     }
 
-    /// The token of this session; none without a user.
+    /// The token of this session. `None` if there is no user.
     async fn token(&self) -> Result<Option<String>, EtcdError> {
         let Some((name, password)) = &self.access.user else {
             return Ok(None);
@@ -183,7 +183,7 @@ impl Endpoint {
         body: Bytes,
         token: Option<&str>,
     ) -> Result<Bytes, EtcdError> {
-        // One that was idle may have been closed meanwhile.
+        // An idle connection may have been closed meanwhile.
         let idle = lock(&self.idle)
             .pop()
             .filter(|connection| !connection.is_closed());
@@ -220,7 +220,7 @@ impl Endpoint {
         Err(EtcdError::refused(&self.url, status, &body))
     }
 
-    /// A stream of answers, on a connection of its own.
+    /// Opens a stream of answers on a connection of its own.
     pub(super) async fn stream(
         &self,
         path: &str,
@@ -250,7 +250,7 @@ impl Endpoint {
         opened.unwrap_or(Err(EtcdError::Silent { limit }))
     }
 
-    /// The next stream begins with a new token.
+    /// Drops the token, so that the next stream gets a new one.
     pub(super) fn forget_token(&self) {
         *lock(&self.token) = None;
     }
@@ -315,7 +315,7 @@ impl Endpoint {
     ) -> Result<Connection, EtcdError> {
         let opened = http1::handshake(TokioIo::new(stream)).await;
         let (connection, driver) = opened.map_err(|error| self.lost(&error))?;
-        // Ends with the connection's handle.
+        // The task ends with the connection's handle.
         tokio::spawn(driver);
         Ok(connection)
     }
@@ -328,7 +328,7 @@ impl Endpoint {
             source = error.source();
         }
         let endpoint = self.url.clone();
-        // rustls speaks of alerts and certificates; nobody else does.
+        // Only rustls uses these words in its errors.
         match ["certificate", "alert", "Certificate"]
             .iter()
             .any(|word| why.contains(word))

@@ -1,4 +1,4 @@
-//! What goes wrong with etcd, for the person who runs it.
+//! Errors of etcd, in words for its operator.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use hyper::StatusCode;
 use serde::Deserialize;
 use thiserror::Error;
 
-/// Codes of gRPC.
+/// A gRPC status code.
 const INVALID_ARGUMENT: i64 = 3;
 const PERMISSION_DENIED: i64 = 7;
 const UNAVAILABLE: i64 = 14;
@@ -30,13 +30,13 @@ pub enum EtcdError {
     #[error("etcd at {endpoint} has no majority: {why}; it needs more than half of its members")]
     NoMajority { endpoint: String, why: String },
     #[error(
-        "etcd is full, so that nothing can be committed: make room (`etcdctl compact`, `etcdctl defrag`) or \
+        "etcd is full and commits nothing: make room (`etcdctl compact`, `etcdctl defrag`) or \
          raise --quota-backend-bytes, then run `etcdctl alarm disarm`"
     )]
     Full,
     #[error("etcd refuses a request of this size; its --max-request-bytes is below 1.5 MiB")]
     TooLarge,
-    #[error("etcd has forgotten revision {revision:?}: the state must be read again")]
+    #[error("etcd has compacted revision {revision:?}: the state must be read again")]
     Compacted { revision: Option<u64> },
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },
@@ -61,7 +61,7 @@ pub enum EtcdError {
 }
 
 impl EtcdError {
-    /// Of an answer that is no success.
+    /// Reads an answer with an HTTP error status.
     pub(super) fn refused(endpoint: &str, status: StatusCode, body: &[u8]) -> Self {
         if let Ok(answer) = serde_json::from_slice::<ErrorAnswer>(body)
             && answer.code != 0
@@ -69,7 +69,7 @@ impl EtcdError {
             return Self::answered(endpoint, answer.code, &answer.message);
         }
         let endpoint = endpoint.to_owned();
-        // Plain text, and the one error of the gateway's own.
+        // Plain text is the gateway's own error.
         if body.starts_with(b"CommonName of client") {
             return Self::CommonName { endpoint };
         }
@@ -77,7 +77,7 @@ impl EtcdError {
         Self::NotEtcd { endpoint, why }
     }
 
-    /// Of an answer that is an error.
+    /// Reads an answer that contains an error.
     pub(super) fn answered(endpoint: &str, code: i64, message: &str) -> Self {
         let endpoint = endpoint.to_owned();
         let why = message.to_owned();
@@ -99,7 +99,7 @@ impl EtcdError {
         }
     }
 
-    /// Whether the endpoint has not answered.
+    /// Whether the endpoint gave no answer.
     pub(super) fn is_unreachable(&self) -> bool {
         matches!(
             self,
@@ -107,7 +107,7 @@ impl EtcdError {
         )
     }
 
-    /// Whether no other member would answer otherwise.
+    /// Whether every other member would give the same answer.
     pub(super) fn is_final(&self) -> bool {
         matches!(
             self,
@@ -121,7 +121,7 @@ impl EtcdError {
     }
 }
 
-/// The body of an answer that is no success.
+/// The body of an answer with an HTTP error status.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct ErrorAnswer {
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_gateway_that_refuses_a_name_in_a_certificate_is_explained() {
-        // Of etcd 3.4.23 with `--client-cert-auth`, after `etcdctl auth enable`.
+        // The answer of etcd 3.4.23 with `--client-cert-auth`, after `etcdctl auth enable`.
         let body = b"CommonName of client sending a request against gateway will be ignored and not used as expected\n";
         let error = EtcdError::refused("https://a:2379", StatusCode::BAD_REQUEST, body);
         assert!(error.to_string().contains("one without"), "{error}");

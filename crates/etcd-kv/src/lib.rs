@@ -1,7 +1,7 @@
-//! A client of etcd's JSON gateway: transactions, ranges, leases and watches over HTTP/1, with TLS.
+//! A client for etcd's JSON gateway: transactions, ranges, leases and watches over HTTP/1, with TLS.
 //!
-//! A request goes to the endpoint that has answered last. If it does not answer soon, the next one gets it as
-//! well: everything that is sent here may be done twice with the same effect.
+//! A request goes to the endpoint that answered last. If that one does not answer soon, the next one gets the request
+//! as well. So requests may run twice, and must have the same effect then.
 
 mod connection;
 mod error;
@@ -29,61 +29,61 @@ pub use tls::Tls;
 pub use watch::{Change, Watch, WatchEnd};
 pub use wire::{Kv, Txn, TxnOp, TxnResult};
 
-/// After this time without an answer the next endpoint is asked as well. A transaction takes 1 to 20 ms.
+/// Time without an answer after which the next endpoint is asked as well. A transaction takes 1 to 20 ms.
 const NEXT_AFTER: Duration = Duration::from_millis(250);
-/// Pause after all endpoints have failed, within the time of a request.
+/// Pause after all endpoints have failed. It counts as part of the request's time limit.
 const ROUND_PAUSE: Duration = Duration::from_millis(100);
-/// Most keys of one page of a range. The values of so many are 16 MiB at most.
+/// Most keys in one page of a range. Their values take 16 MiB at most.
 const PAGE: usize = 32;
 
-/// What a client has to know about a cluster of etcd.
+/// Settings of a client.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// `http://HOST:PORT` or `https://HOST:PORT` each.
+    /// Each is `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
     pub access: Access,
 }
 
-/// A client of a cluster of etcd.
+/// A client for an etcd cluster.
 #[derive(Clone, Debug)]
 pub struct Client {
     endpoints: Arc<[Endpoint]>,
-    /// The endpoint that has answered last.
+    /// The endpoint that answered last.
     preferred: Arc<AtomicUsize>,
 }
 
-/// Keys of one moment.
+/// Keys that were read at the same moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Found {
     pub revision: u64,
     pub kvs: Vec<Kv>,
 }
 
-/// An endpoint that was tried on its own.
+/// The result of trying one endpoint on its own.
 #[derive(Debug)]
 pub struct Tried {
     pub endpoint: String,
-    /// The id of its cluster, or why it does not serve clients.
+    /// The id of the endpoint's cluster, or why the endpoint does not serve clients.
     pub cluster: Result<u64, EtcdError>,
 }
 
-/// What a member of etcd says of itself.
+/// The status that an etcd member reports.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Status {
     pub endpoint: String,
     pub version: String,
     pub db_bytes: u64,
     pub is_leader: bool,
-    /// What is wrong with it, in its own words.
+    /// The problems that the member reports.
     pub errors: Vec<String>,
 }
 
 impl Client {
-    /// A client; connects when something is asked.
+    /// Creates a client. It connects at its first request.
     ///
     /// # Errors
     ///
-    /// If an endpoint is no URL, or certificates cannot be read.
+    /// If an endpoint is not a URL, or certificates cannot be read.
     pub fn new(options: &Options) -> Result<Self, EtcdError> {
         let access = Arc::new(options.access.clone());
         let tls = access.tls.settings()?;
@@ -101,11 +101,11 @@ impl Client {
         })
     }
 
-    /// Carries out a transaction, once or several times.
+    /// Carries out a transaction, perhaps several times.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether it was carried out.
+    /// Why it is unknown whether the transaction was carried out.
     pub async fn txn(&self, txn: &Txn, limit: Duration) -> Result<TxnResult, EtcdError> {
         let answer: wire::TxnAnswer = self.ask("kv/txn", &txn.request(), limit).await?;
         answer.read()
@@ -115,7 +115,7 @@ impl Client {
     ///
     /// # Errors
     ///
-    /// Why it is not known.
+    /// Why the key could not be read.
     pub async fn first_key(
         &self,
         range: &Range<String>,
@@ -127,11 +127,12 @@ impl Client {
         Ok(kvs.into_iter().next().map(|kv| kv.key))
     }
 
-    /// All keys in `range` and their values, in order, as of one moment.
+    /// All keys in `range` with their values, in order and as of one moment.
     ///
     /// # Errors
     ///
-    /// [`EtcdError::Compacted`] if that moment is gone before all were read; other reasons.
+    /// [`EtcdError::Compacted`] if etcd has compacted that moment before all keys were read. Otherwise why they could
+    /// not be read.
     pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
         let mut found: Option<Found> = None;
         let mut from = range.start.clone();
@@ -148,28 +149,28 @@ impl Client {
             let Some(last) = found.kvs.last().filter(|_| more) else {
                 return Ok(found.clone());
             };
-            // The first key after it.
+            // The next page begins with the first key after this one.
             from = format!("{}\0", last.key);
         }
     }
 
-    /// A lease that goes by itself after about `ttl`, and is 2 s long at least. What is written with it goes
-    /// with it.
+    /// Creates a lease that ends by itself after about `ttl`, but after 2 s at the earliest. etcd then deletes the keys
+    /// written with it.
     ///
     /// # Errors
     ///
-    /// Why there is none.
+    /// Why there is no lease.
     pub async fn grant(&self, ttl: Duration, limit: Duration) -> Result<i64, EtcdError> {
         let request = json!({ "TTL": ttl.as_secs().max(1) });
         let lease: wire::LeaseAnswer = self.ask("lease/grant", &request, limit).await?;
         Ok(lease.id)
     }
 
-    /// Writes a key that goes with `lease`.
+    /// Writes a key that etcd deletes when `lease` ends.
     ///
     /// # Errors
     ///
-    /// Why it is not known whether it was written.
+    /// Why it is unknown whether the key was written.
     pub async fn put_with_lease(
         &self,
         key: &str,
@@ -183,11 +184,11 @@ impl Client {
         Ok(())
     }
 
-    /// Lets etcd forget what was before `revision`. It does not do so by itself, and grows.
+    /// Makes etcd discard everything before `revision`. Without this etcd keeps growing.
     ///
     /// # Errors
     ///
-    /// Why it did not.
+    /// Why etcd did not do so.
     pub async fn compact(&self, revision: u64, limit: Duration) -> Result<(), EtcdError> {
         let request = json!({ "revision": revision.to_string() });
         match self
@@ -199,7 +200,7 @@ impl Client {
         }
     }
 
-    /// What each endpoint says of itself.
+    /// The status that each endpoint reports.
     pub async fn status(&self, limit: Duration) -> Vec<Result<Status, EtcdError>> {
         let mut asked = JoinSet::new();
         for index in 0..self.endpoints.len() {
@@ -221,7 +222,7 @@ impl Client {
         wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
     }
 
-    /// Tries each endpoint on its own, with a look at `key`. Needs no majority.
+    /// Tries each endpoint on its own: reads `key` from each. Needs no majority.
     pub async fn try_each(&self, key: &str, limit: Duration) -> Vec<Tried> {
         let mut asked = JoinSet::new();
         for index in 0..self.endpoints.len() {
@@ -256,8 +257,7 @@ impl Client {
         })
     }
 
-    /// What changes in `range`, after revision `after`. Nothing for `quiet` means that the endpoint is cut off,
-    /// and another one is asked.
+    /// Watches `range` for changes after revision `after`. If an endpoint is silent for `quiet`, another one is asked.
     pub fn watch(&self, range: Range<String>, after: u64, quiet: Duration) -> Watch {
         Watch::new(self.clone(), range, after + 1, quiet)
     }
@@ -266,7 +266,7 @@ impl Client {
         self.preferred.load(Ordering::Relaxed) % self.endpoints.len()
     }
 
-    /// Sends a request, to one endpoint after the other, until one has answered.
+    /// Sends a request to one endpoint after the other until one answers.
     async fn ask<T: serde::de::DeserializeOwned>(
         &self,
         path: &'static str,
@@ -296,7 +296,7 @@ impl Client {
                         let round = next % self.endpoints.len() == self.preferred();
                         let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
                         ask_at = ask_at.min(tokio::time::Instant::now() + pause);
-                        // One that answers knows more than one that does not.
+                        // The error of an endpoint that answers tells more than that of one that does not.
                         if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
                             failure = Some(error);
                         }

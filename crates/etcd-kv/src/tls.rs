@@ -1,13 +1,13 @@
-//! Encrypted connections to etcd. Without the feature `tls` there are none, and asking for one is an error.
+//! Encrypted connections to etcd. Without the feature `tls`, asking for one is an error.
 
 use std::path::PathBuf;
 
-/// Certificates, as files in PEM form.
+/// Certificates, as PEM files.
 #[derive(Clone, Debug, Default)]
 pub struct Tls {
-    /// Those that etcd's certificate is signed with.
+    /// The certificates of the authority that signed etcd's certificate.
     pub ca: Option<PathBuf>,
-    /// The certificate of this computer and its key.
+    /// This computer's certificate.
     pub cert: Option<PathBuf>,
     pub key: Option<PathBuf>,
 }
@@ -41,23 +41,23 @@ mod with {
     use super::Tls;
     use crate::EtcdError;
 
-    /// What all connections share.
+    /// TLS settings that all connections share.
     #[derive(Clone, Debug)]
     pub(crate) struct TlsSettings {
         files: Tls,
         read: Arc<Mutex<Read>>,
     }
 
-    /// What was read, and from which files.
+    /// The certificates that were read, and their files.
     #[derive(Debug)]
     struct Read {
         config: Arc<ClientConfig>,
         stamps: Vec<Option<Stamp>>,
-        /// Those of files that could not be used, so that it is logged once.
+        /// The files that could not be used, so that this is logged only once.
         refused: Vec<Option<Stamp>>,
     }
 
-    /// Tells a file from the one that was at its place before.
+    /// Tells a file from its predecessor at the same path.
     type Stamp = (u64, i64, i64);
 
     impl Read {
@@ -70,12 +70,12 @@ mod with {
         }
     }
 
-    /// How to connect to one endpoint.
+    /// The TLS settings for one endpoint.
     #[derive(Debug)]
     pub(crate) struct Secured(TlsSettings, ServerName<'static>);
 
     impl Tls {
-        /// None without certificates.
+        /// Reads the certificates. `None` if none are configured.
         pub(crate) fn settings(&self) -> Result<Option<TlsSettings>, EtcdError> {
             let stamps = self.stamps();
             let Some(config) = self.read()? else {
@@ -139,7 +139,8 @@ mod with {
     }
 
     impl TlsSettings {
-        /// Read again if a file has changed, because an expiring certificate is replaced while rosrescue runs.
+        /// The present TLS configuration. Files are read again when they change, because certificates are replaced
+        /// while rosrescue runs.
         fn config(&self) -> Arc<ClientConfig> {
             let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
             let stamps = self.files.stamps();
@@ -147,9 +148,9 @@ mod with {
                 match self.files.read() {
                     Ok(Some(config)) => *read = Read::new(config, stamps),
                     Ok(None) => {}
-                    // It may be only half there.
+                    // A file may be half written.
                     Err(error) if stamps != read.refused => {
-                        tracing::warn!(%error, "new certificates for etcd are not used");
+                        tracing::warn!(%error, "cannot use the new certificates for etcd; the old ones stay in use");
                         read.refused = stamps;
                     }
                     Err(_) => {}
@@ -160,7 +161,7 @@ mod with {
     }
 
     impl Secured {
-        /// None if `host` is no name of a host.
+        /// Creates the settings for `host`. `None` if `host` is not a valid host name.
         pub(crate) fn new(settings: &TlsSettings, host: &str) -> Option<Self> {
             let name = ServerName::try_from(host.to_owned()).ok()?;
             Some(Self(settings.clone(), name))

@@ -1,4 +1,4 @@
-//! What changes in etcd, as it changes; across lost connections, members and restarts.
+//! Watches etcd for changes, across lost connections, members and restarts.
 
 use std::{ops::Range, pin::Pin, time::Duration};
 
@@ -14,7 +14,7 @@ use super::{
     wire::{self, Streamed, WatchAnswer},
 };
 
-/// The longest message: etcd parts them at 2 MiB, which is 2.7 MiB in base64.
+/// Longest message, in bytes. etcd splits messages at 2 MiB, which is 2.7 MiB in base64.
 const MESSAGE_BYTES_MAX: usize = 8 << 20;
 /// Pause before a watch is opened again.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -24,16 +24,16 @@ const PAUSE: Duration = Duration::from_millis(100);
 pub struct Change {
     pub key: String,
     pub revision: u64,
-    /// None if it was deleted.
+    /// The new value. `None` if the key was deleted.
     pub kv: Option<Kv>,
 }
 
 /// Why a watch has ended.
 #[derive(Debug)]
 pub enum WatchEnd {
-    /// etcd has forgotten the next revision: the state must be read again.
+    /// etcd has compacted the next revision, so the state must be read again.
     Compacted,
-    /// It would not help to ask again.
+    /// Asking again would not help.
     Failed(EtcdError),
 }
 
@@ -41,22 +41,22 @@ struct Open {
     endpoint: usize,
     body: Incoming,
     buffer: BytesMut,
-    /// When it is given up if nothing is heard.
+    /// When the watch is closed if etcd stays silent.
     until: Instant,
 }
 
 type Opening = Pin<Box<dyn Future<Output = Result<Incoming, EtcdError>> + Send>>;
 
-/// A watch. Changes come in their order; after a lost connection some may come twice.
+/// A watch. Changes arrive in order. After a lost connection some may arrive twice.
 pub struct Watch {
     client: Client,
     range: Range<String>,
-    /// The next revision.
+    /// The next revision to receive.
     next: u64,
     quiet: Duration,
     open: Option<Open>,
-    /// Which endpoint is being opened. Kept here, as [`Open::until`] is: a task that waits for changes may give up at
-    /// any time and wait again, and a member that is silent must be noticed all the same.
+    /// The endpoint that is being opened. Kept in this struct, like [`Open::until`]: `next` may be cancelled and called
+    /// again at any time, and a silent member must be noticed all the same.
     opening: Option<(usize, Opening)>,
     failures: usize,
 }
@@ -74,11 +74,11 @@ impl Watch {
         }
     }
 
-    /// The next changes. May be cancelled.
+    /// Waits for the next changes. Cancel safe.
     ///
     /// # Errors
     ///
-    /// Why there will be none.
+    /// Why no more changes will come.
     pub async fn next(&mut self) -> Result<Vec<Change>, WatchEnd> {
         loop {
             let read = match &mut self.open {
@@ -94,7 +94,7 @@ impl Watch {
             let answer = match read {
                 Ok(Ok(Some(line))) => wire::parse::<Streamed<WatchAnswer>>(&line),
                 Ok(Ok(None)) => {
-                    self.close("its stream has ended");
+                    self.close("the stream has ended");
                     continue;
                 }
                 Ok(Err(why)) => {
@@ -102,7 +102,7 @@ impl Watch {
                     continue;
                 }
                 Err(_) => {
-                    self.close("nothing was heard");
+                    self.close("etcd was silent");
                     continue;
                 }
             };
@@ -115,7 +115,7 @@ impl Watch {
                         return Ok(changes);
                     }
                 }
-                // An error in the stream: the member stops.
+                // The stream reports an error when the member stops.
                 Err(error) => self.close(&error.to_string()),
             }
         }
@@ -146,7 +146,7 @@ impl Watch {
             .as_ref()
             .and_then(|open| self.client.endpoints.get(open.endpoint))
         {
-            // Perhaps it is too old.
+            // The token may be too old.
             endpoint.forget_token();
         }
         self.close(reason);
@@ -215,7 +215,7 @@ impl Watch {
 }
 
 impl Open {
-    /// The next line.
+    /// Reads the next line.
     async fn message(&mut self) -> Result<Option<Bytes>, String> {
         loop {
             if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {

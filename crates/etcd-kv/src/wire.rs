@@ -1,4 +1,4 @@
-//! Requests and answers as the gateway has them: bytes in base64, and most integers as text.
+//! Requests and answers in the gateway's form: bytes as base64, and most integers as text.
 
 use std::ops::Range;
 
@@ -13,22 +13,23 @@ use super::{EtcdError, Status};
 pub struct Kv {
     pub key: String,
     pub value: Vec<u8>,
-    /// The revision of its last change.
+    /// Revision of the last change.
     pub revision: u64,
 }
 
-/// Changes and reads of one moment, on a condition.
+/// Writes and reads that run at one moment if a condition holds.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Txn {
-    /// Keys, each with the revision of its last change; 0 for a key that does not exist. All must hold.
+    /// The condition: keys, each with the revision of its last change, or 0 for a key that does not exist. All must
+    /// match.
     pub compare: Vec<(String, u64)>,
-    /// What is done then,
+    /// Operations if the condition holds.
     pub success: Vec<TxnOp>,
-    /// and what otherwise.
+    /// Operations if it does not hold.
     pub failure: Vec<TxnOp>,
 }
 
-/// A part of a transaction.
+/// An operation of a transaction.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum TxnOp {
     /// Reads a key.
@@ -39,14 +40,14 @@ pub enum TxnOp {
     Delete(Range<String>),
 }
 
-/// What a transaction has done.
+/// The result of a transaction.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TxnResult {
     /// Whether the condition held.
     pub succeeded: bool,
-    /// etcd's revision after it.
+    /// etcd's revision afterwards.
     pub revision: u64,
-    /// What each [`TxnOp::Get`] found: a key, or nothing.
+    /// The results of the [`TxnOp::Get`]s. `None` for a key that does not exist.
     pub gets: Vec<Option<Kv>>,
 }
 
@@ -88,7 +89,7 @@ pub(super) fn leased(key: &str, value: &[u8], lease: i64) -> Value {
     json!({ "key": base64(key), "value": base64(value), "lease": lease.to_string() })
 }
 
-/// `revision` 0: the present one.
+/// Requests a range. Revision 0 stands for the present one.
 pub(super) fn range(range: &Range<String>, revision: u64, limit: usize) -> Value {
     json!({
         "key": base64(&range.start), "range_end": base64(&range.end),
@@ -96,14 +97,14 @@ pub(super) fn range(range: &Range<String>, revision: u64, limit: usize) -> Value
     })
 }
 
-/// The first key in `range`, without its value.
+/// Requests the first key in `range`, without its value.
 pub(super) fn first_key(range: &Range<String>) -> Value {
     json!({
         "key": base64(&range.start), "range_end": base64(&range.end), "limit": "1", "keys_only": true,
     })
 }
 
-/// Whether `key` exists, as the asked member alone knows: it needs no majority.
+/// Asks whether `key` exists, according to the asked member alone. Needs no majority.
 pub(super) fn local_count(key: &str) -> Value {
     json!({ "key": base64(key), "serializable": true, "count_only": true })
 }
@@ -125,7 +126,7 @@ fn not_etcd(why: &str) -> EtcdError {
     }
 }
 
-/// An integer, as a number or as a text.
+/// Reads an integer that is written as a number or as text.
 fn number<'de, T, D>(from: D) -> Result<T, D::Error>
 where
     T: std::str::FromStr + Default,
@@ -153,7 +154,7 @@ pub(super) struct Header {
 #[derive(Debug, Deserialize)]
 pub(super) struct RawKv {
     key: String,
-    /// An empty value is left out.
+    /// etcd leaves out an empty value.
     #[serde(default)]
     value: String,
     #[serde(default, deserialize_with = "number")]
@@ -189,7 +190,7 @@ impl RangeAnswer {
     /// The id of the cluster that the asked member belongs to.
     pub(super) fn cluster(&self) -> Result<u64, EtcdError> {
         match self.header.cluster_id {
-            0 => Err(not_etcd("its answer names no cluster")),
+            0 => Err(not_etcd("its answer has no cluster id")),
             id => Ok(id),
         }
     }
@@ -229,7 +230,7 @@ impl TxnAnswer {
     }
 }
 
-/// A member of etcd, as the port for its peers lists them.
+/// An etcd member, as the port for peers lists it.
 #[derive(Debug, Deserialize)]
 pub(super) struct Peer {
     #[serde(rename = "peerURLs")]
@@ -242,7 +243,7 @@ pub(super) struct LeaseAnswer {
     pub(super) id: i64,
 }
 
-/// An answer of a stream.
+/// One answer of a stream.
 #[derive(Debug, Deserialize)]
 pub(super) struct Streamed<T> {
     pub(super) result: T,
@@ -279,7 +280,7 @@ impl StatusAnswer {
 #[serde(default)]
 pub(super) struct WatchAnswer {
     pub(super) canceled: bool,
-    /// The next message goes on with the same revision.
+    /// Whether the next message continues the same revision.
     pub(super) fragment: bool,
     pub(super) cancel_reason: String,
     #[serde(deserialize_with = "number")]
@@ -289,7 +290,7 @@ pub(super) struct WatchAnswer {
 
 #[derive(Debug, Deserialize)]
 pub(super) struct WatchEvent {
-    /// `DELETE`, or nothing.
+    /// `DELETE`, or empty.
     #[serde(rename = "type", default)]
     pub(super) kind: String,
     pub(super) kv: RawKv,

@@ -1,5 +1,5 @@
-//! Resolves host names. Concurrent lookups of one name share a lookup, each in a thread of its own,
-//! so neither the runtime nor the end of the process waits for a name server that does not answer.
+//! Resolves host names. Concurrent lookups of one name share a lookup. Each lookup runs in a thread of its own, so
+//! neither the runtime nor the end of the process waits for a dead name server.
 
 use std::{
     collections::BTreeMap,
@@ -10,7 +10,7 @@ use std::{
 
 use tokio::sync::{Semaphore, watch};
 
-/// Most lookups at a time. A name server that does not answer blocks a thread for some ten seconds.
+/// Most lookups at the same time. A dead name server blocks a thread for some ten seconds.
 const LOOKUPS: usize = 64;
 
 /// The addresses of a name without a port, or why there are none.
@@ -54,8 +54,7 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     }
 }
 
-/// Whether an address belongs to this computer: then the kernel uses it as the source address of a
-/// route to itself. Nothing is sent.
+/// Whether an address belongs to this computer: then the kernel routes to it from that same address. Nothing is sent.
 pub fn is_own(address: IpAddr) -> bool {
     let any = match address {
         IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
@@ -88,12 +87,11 @@ async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
             addresses.dedup();
             addresses.into()
         });
-        // The entry is removed before the result is sent, so that later callers look the name up
-        // afresh.
+        // The entry is removed before the result is sent, so that later callers start a new lookup.
         under_way().remove(&name);
         tell.send_replace(Some(found));
     };
-    // If no thread can be started, the sender is dropped, and the waiters notice.
+    // If no thread can be started, the sender is dropped, and the waiting callers get an error.
     let named = std::thread::Builder::new().name("lookup".to_owned());
     if named.spawn(search).is_err() {
         under_way().remove(&host);

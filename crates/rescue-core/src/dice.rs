@@ -1,6 +1,6 @@
-//! Random numbers for simulations, from a seed that a failure prints.
+//! Random numbers for simulations. A failure prints their seed.
 
-/// SplitMix64.
+/// The SplitMix64 generator.
 #[derive(Debug)]
 pub(crate) struct Dice(pub(crate) u64);
 

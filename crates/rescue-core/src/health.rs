@@ -1,8 +1,7 @@
-//! Judges a node's answers: whether it is the node that has registered, and where the mirror differs from its
-//! report.
+//! Judges a node's answers: whether it is the node that has registered, and where the mirror differs from its report.
 //!
-//! Unless there is evidence against it, a node counts as the one that has registered: losing a healthy node
-//! is worse than keeping a dead one.
+//! Without evidence against it, a node counts as the one that has registered: losing a healthy node is worse than
+//! keeping a dead one.
 
 mod backoff;
 mod liveness;
@@ -24,7 +23,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Topics that all kinds of nodes have, so they are no evidence.
+/// Topics that most nodes have, so they are no evidence.
 const COMMON: [&str; 6] = [
     "/rosout",
     "/clock",
@@ -34,12 +33,12 @@ const COMMON: [&str; 6] = [
     "/diagnostics",
 ];
 
-/// How a node reacts to a call.
+/// The reaction of a node to a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sign {
     /// It answered.
     Alive,
-    /// Its port refuses connections, so the process is gone.
+    /// The node's port refuses connections, so its process is gone.
     Dead,
     /// There was no valid answer in time. That does not prove that the node is dead.
     Silent,
@@ -48,8 +47,8 @@ pub enum Sign {
 /// Types by topic, as a node reports them.
 type Topics = BTreeMap<String, String>;
 
-/// The part of a node's address that says where to connect, without what follows the port. Nodes whose
-/// addresses differ only in that rest share a port and are asked together.
+/// The part of a node's address up to the port. Nodes whose addresses differ only behind the port share it and are
+/// asked together.
 pub fn port_of(api: &str) -> &str {
     let api = api.trim();
     let host = api.find("//").map_or(0, |at| at + 2);
@@ -57,7 +56,7 @@ pub fn port_of(api: &str) -> &str {
     end.map_or(api, |(end, _)| api.split_at(end).0)
 }
 
-/// The topics that a node reports to publish and to subscribe to.
+/// The topics that a node says it publishes and subscribes to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Claims {
     publications: Topics,
@@ -65,8 +64,8 @@ pub struct Claims {
 }
 
 impl Claims {
-    /// Reads the results of `getPublications` and `getSubscriptions`, which are lists of topic and type.
-    /// `None` if any entry could not be registered as it is, because then it is unclear what the node means.
+    /// Reads the results of `getPublications` and `getSubscriptions`, which are lists of topic and type. `None` if any
+    /// entry could not be registered as it is: then the whole answer is doubtful.
     pub fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
         Some(Self {
             publications: topics(publications)?,
@@ -74,7 +73,7 @@ impl Claims {
         })
     }
 
-    /// Whether the node reports one of these topics, not counting common ones.
+    /// Whether the node reports one of these topics. Common ones do not count.
     pub fn shares(&self, topics: &[String]) -> bool {
         let mut own = self.all().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
@@ -99,33 +98,33 @@ fn topics(list: &Value) -> Option<Topics> {
     topics.collect()
 }
 
-/// Whether the node behind a port is the one that is registered under a name.
+/// Whether the node that answers at a port is the one registered under a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// There is evidence that the node has this name.
+    /// There is evidence that the answering node has this name.
     Itself,
-    /// There is evidence that another node is there.
+    /// There is evidence that another node answers.
     Another,
-    /// There is no evidence either way.
+    /// There is no evidence in either direction.
     Unknown,
 }
 
-/// A name that is registered at a port.
+/// A name registered at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Name {
     /// The caller id.
     pub node: String,
-    /// The process id that was found at the port when it was last asked.
+    /// The process id that the port gave last time.
     pub known_pid: Option<i32>,
-    /// Whether the name has registered anything since then. If so, another process may have taken the port
-    /// under the same name.
+    /// Whether the name has registered anything since then. If so, another process may have taken the port under the
+    /// same name.
     pub registered_since: bool,
     /// A number that grows with each registration; 0 if unknown.
     pub registered: u64,
 }
 
-/// Judges each of `names`, which are all registered at the same port. `pid` and `claims` are what the node at
-/// the port answers now.
+/// Judges each of `names`, which are all registered at the same port. `pid` and `claims` are the present answers from
+/// that port.
 pub fn judge(
     mirror: &Master,
     names: &[Name],
@@ -134,7 +133,7 @@ pub fn judge(
 ) -> Vec<Verdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
-    // How many topics of the node are reported, and whether these are all of them.
+    // Whether the node's topics are reported, and whether all of them are.
     let match_of = |node: &str| {
         let held = mirror.publications(node).chain(mirror.subscriptions(node));
         let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
@@ -149,11 +148,11 @@ pub fn judge(
     let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
         None => Verdict::Unknown,
         Some((0, _)) => Verdict::Another,
-        // It only shares topics with a node that came later.
+        // The answer only has topics in common with a later node.
         Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Another,
         Some(_) => Verdict::Itself,
     };
-    // A new node at the port may have been asked while only the previous node's name was known.
+    // If only the previous node's name was known then, the process id may be that of a newer node.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
     let last_of_pid = of_pid.map(|name| name.registered).max();
     let last = names.iter().map(|name| name.registered).max();
@@ -163,8 +162,8 @@ pub fn judge(
             Verdict::Another if last_of_pid > Some(name.registered) => Verdict::Another,
             _ => Verdict::Itself,
         },
-        // All its topics are reported, and no node came later. The process id can change nevertheless, with
-        // some client libraries or when a node is restarted at the same port.
+        // All its topics are reported, and no later node registered. Nevertheless the process id can differ, with some
+        // client libraries or after a restart at the same port.
         (Some(_), Some(_)) if matches!(found, Some((_, true))) && last == Some(name.registered) => {
             Verdict::Itself
         }
@@ -172,7 +171,7 @@ pub fn judge(
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
-    // A port has only one process behind it, so nodes that registered earlier are gone.
+    // A port belongs to one process, so nodes that registered earlier are gone.
     let present = names.iter().zip(&verdicts);
     let present = present.filter(|(_, verdict)| **verdict == Verdict::Itself);
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
@@ -185,10 +184,10 @@ pub fn judge(
     verdicts
 }
 
-/// What to conclude when a port refuses connections.
+/// What to do when a port refuses connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// Nothing: keep the nodes at the port as unreachable, and ask again later.
+    /// Keep the nodes at the port as unreachable, and ask again later.
     Keep,
     /// Ask the port again after a pause.
     AskAgain,
@@ -196,12 +195,11 @@ pub enum Refusal {
     Dead,
 }
 
-/// Judges a port that refuses connections. `calls` are the last calls of its nodes, and `before` their last
-/// calls when the port refused for the first time. A node may close its port before it unregisters, as
-/// roslisp does.
+/// Judges a port that refuses connections. `calls` are the last calls of its nodes. `before` are their last calls when
+/// the port refused for the first time. A node may close its port before it unregisters, as roslisp does.
 pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, calls: &C) -> Refusal {
     match before {
-        // No master would have noticed. The health check after the recovery decides.
+        // A real master would not have noticed. The health check after the recovery decides.
         _ if !master_serves => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
@@ -211,7 +209,7 @@ pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, call
 /// A topic that a node publishes or subscribes to.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Registration {
-    /// Whether the node publishes the topic; otherwise it subscribes to it.
+    /// Whether the node publishes the topic. Otherwise it subscribes to it.
     pub publishes: bool,
     pub topic: String,
     topic_type: String,
@@ -245,7 +243,7 @@ impl Registration {
         format!("{node} {verb} {}", self.topic)
     }
 
-    /// Whether both are the same apart from the topic type.
+    /// Whether both are equal apart from the topic type.
     pub fn is_same(&self, other: &Self) -> bool {
         self.publishes == other.publishes && self.topic == other.topic
     }
@@ -254,18 +252,16 @@ impl Registration {
 /// The differences between the mirror and a node's report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reconciliation {
-    /// Topics that the node reports and the mirror lacks. That is no reason to register them: the node may
-    /// have another master, and be known here only because a program synchronises the two masters.
+    /// Topics that the node reports and the mirror lacks. They must not be registered for it. The node may have another
+    /// master, and be known here only because a program synchronises the two masters.
     pub missing: Vec<Registration>,
-    /// Topics that the mirror has and the node does not report. They must be confirmed, because a node may
-    /// register a topic first and report it later. Empty if the node reports no topic at all, because then it
-    /// may be unable to tell.
+    /// Topics that the mirror has and the node does not report. They must be confirmed, because a node may register a
+    /// topic before it reports it. Empty if the node reports no topic at all: such a node may be unable to tell.
     pub extra: Vec<Registration>,
 }
 
 impl Reconciliation {
-    /// Compares the mirror with the report of `node`. Services are left out, because nodes cannot be asked
-    /// for theirs.
+    /// Compares the mirror with the report of `node`. Services are left out, because nodes do not report them.
     pub fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
         let mut reconciliation = Self::default();
         let publications: Vec<&str> = mirror.publications(node).collect();
@@ -284,7 +280,7 @@ impl Reconciliation {
                     topic: topic.clone(),
                     topic_type: topic_type.clone(),
                 }));
-            // A topic that was changed by a malformed node name cannot be compared.
+            // A topic that a node with a malformed name has changed cannot be compared.
             let extra = held.iter().filter(|topic| {
                 !said.is_empty() && master::is_plain_topic(topic) && !said.contains_key(**topic)
             });

@@ -1,4 +1,4 @@
-//! Which parameter values are hidden. Passwords and the like must not appear on a page or in a terminal.
+//! Decides which parameter values are hidden. Passwords and the like must not appear on a page or in a terminal.
 
 use std::str::FromStr;
 
@@ -12,11 +12,11 @@ pub const DEFAULT: &str =
 /// Replaces a hidden value.
 pub const HIDDEN: &str = "(hidden)";
 
-/// Decides by their full names which parameters have hidden values.
+/// Chooses the parameters with hidden values by their full names.
 #[derive(Clone, Debug)]
 pub struct Hide(Option<Regex>);
 
-/// Parses a regular expression, which will ignore case. An empty one hides nothing.
+/// Parses a regular expression, which ignores case. An empty one hides nothing.
 impl FromStr for Hide {
     type Err = String;
 
@@ -32,17 +32,16 @@ impl FromStr for Hide {
 }
 
 impl Hide {
-    /// Whether the value of the parameter `name`, such as `/robot/wifi/password`, is hidden, because its own
-    /// name or the name of a namespace above it matches.
+    /// Whether the value of the parameter `name`, such as `/robot/wifi/password`, is hidden. It is if its own name or
+    /// the name of a namespace above it matches.
     pub fn hides(&self, name: &str) -> bool {
         let above = name.match_indices('/').map(|(end, _)| end).skip(1);
         let mut names = above.filter_map(|end| name.get(..end)).chain([name]);
         names.any(|name| self.matches(name))
     }
 
-    /// The `value` of the parameter `name`, with [`HIDDEN`] in place of everything that is hidden. That may
-    /// be a part of the value: members of structs have names of their own, also inside lists. The name of the
-    /// root is the empty string.
+    /// The `value` of the parameter `name`, with [`HIDDEN`] in place of everything hidden. That may be a part of the
+    /// value: members of structs have their own names, also inside lists. The root's name is the empty string.
     pub fn mask(&self, name: &str, value: &Value) -> Value {
         self.mask_below(name, value, self.hides(name))
     }
@@ -56,7 +55,7 @@ impl Hide {
         members.collect()
     }
 
-    /// Like [`mask`](Self::mask), when it is already known whether `name` is hidden.
+    /// Like [`mask`](Self::mask), if it is already known whether `name` is hidden.
     fn mask_below(&self, name: &str, value: &Value, hidden: bool) -> Value {
         match value {
             Value::Struct(members) if !members.is_empty() => {

@@ -19,36 +19,35 @@ mod types;
 pub use patience::Patience;
 pub use types::{Action, Cause, Input, Probing, Supervision};
 
-/// Older deaths do not count towards a crash loop.
+/// How long a death counts towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);
-/// Number of deaths within [`DEATH_MEMORY`] after each of which a new master is started at once.
+/// Number of deaths within [`DEATH_MEMORY`] up to which a new master is started at once.
 const DEATHS_AT_ONCE: usize = 5;
 /// The first pause in a crash loop. It doubles with each further death.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause in a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that has served for this time ends the crash loop. The pauses continue as long as more
-/// than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
+/// A master that serves for this time ends the crash loop. The pauses continue while more than [`DEATHS_AT_ONCE`]
+/// deaths are within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// A spawned master that has used this many times [`Probing::start_limit`] of processor time will
-/// never listen.
+/// A new master that has used this many times [`Probing::start_limit`] of processor time will never listen.
 const STARTS_AT_MOST: u32 = 10;
 /// Pause between two samples of a master that starts slowly.
 const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
-/// Pause before the next attempt after a server that is not a master.
+/// Pause before the next attempt if the server is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     /// No master is connected.
     Seeking,
-    /// A master is connected, but not known to hold the state yet.
+    /// A master is connected. It is not yet known to hold the state.
     Examining,
     /// The gate is open.
     Serving,
-    /// The mirror answers until the late master answers.
+    /// The master is late, and the mirror answers in its place.
     Late,
-    /// The late master is given what the mirror has answered.
+    /// The late master gets the writes that the mirror has answered.
     CatchingUp,
     Stopped,
 }
@@ -60,7 +59,7 @@ enum Timer {
     Spawn,
 }
 
-/// Decides what happens to the master; see the [module](self).
+/// The state machine that decides what happens to the master.
 #[derive(Debug)]
 pub struct Lifecycle {
     supervision: Supervision,
@@ -71,28 +70,26 @@ pub struct Lifecycle {
     restored: bool,
     /// Whether the mirror is known to be a master's state.
     known: bool,
-    /// When our child was spawned; for an orphan, when rosrescue started. None while there is no
-    /// child.
+    /// When the child was started; for an orphan, when rosrescue started. `None` if there is no child.
     child: Option<Instant>,
     /// Since when no master has been connected.
     seeking_since: Option<Instant>,
     /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
     deaths: VecDeque<Instant>,
     total_deaths: u64,
-    /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`],
-    /// and no master that has served for [`CALM`] since.
+    /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`], and no master has
+    /// served for [`CALM`] since.
     crash_loop: bool,
-    /// When the gate was opened; none while it is shut.
+    /// When the gate was opened. `None` while it is shut.
     serving_since: Option<Instant>,
-    /// Whether an external master has closed its connection and it is not yet known whether it
-    /// died.
+    /// Whether an external master has closed its connection and may have died.
     lost: bool,
-    /// Whether an external master was counted as dead, and since then its port has not refused and
-    /// no master has been examined there.
+    /// Whether an external master was counted as dead, and since then its port has not refused and no master was
+    /// examined there.
     dying: bool,
     missed: u32,
     patience: Patience,
-    /// The samples of our silent master.
+    /// The samples of a child that does not answer.
     evidence: Evidence,
     /// Number of consecutive failed spawns.
     failed_spawns: usize,
@@ -104,7 +101,7 @@ pub struct Lifecycle {
 }
 
 impl Lifecycle {
-    /// Creates a machine that does nothing until [`Input::Start`].
+    /// Creates a state machine that waits for [`Input::Start`].
     pub fn new(supervision: Supervision, probing: Probing) -> Self {
         Self {
             supervision,
@@ -131,13 +128,13 @@ impl Lifecycle {
         }
     }
 
-    /// When to pass in [`Input::Wake`]. It changes with every input.
+    /// When to pass in [`Input::Wake`]. It may change with every input.
     pub fn deadline(&self) -> Option<Instant> {
         let timer = self.timer.map(|(at, _)| at);
         timer.into_iter().chain(self.calm_at()).min()
     }
 
-    /// When the crash loop ends, unless the master dies before.
+    /// When the crash loop ends, unless the master dies before that.
     fn calm_at(&self) -> Option<Instant> {
         let since = self.serving_since.filter(|_| self.crash_loop)?;
         Some(since + CALM)
@@ -148,8 +145,7 @@ impl Lifecycle {
         self.total_deaths
     }
 
-    /// Whether the mirror may stand in while the gate is shut, because it is known to be a master's
-    /// state.
+    /// Whether the mirror may stand in while the gate is shut: it is known to be a master's state.
     pub fn may_stand_in(&self) -> bool {
         self.known
     }
@@ -164,7 +160,7 @@ impl Lifecycle {
         &self.patience
     }
 
-    /// Whether the decision about `input` needs a [`Sample`] of our master.
+    /// Whether the decision about `input` needs a [`Sample`] of the child.
     pub fn needs_sample(&self, now: Instant, input: Input) -> bool {
         let sampled = self.evidence.last_at();
         let is_old = sampled.is_none_or(|at| now.duration_since(at) >= SAMPLE_PAUSE);
@@ -176,7 +172,7 @@ impl Lifecycle {
             }
     }
 
-    /// Takes a sample of our master.
+    /// Takes a sample of the child.
     pub fn observe(&mut self, sample: Sample) {
         self.evidence.add(sample);
     }
@@ -239,8 +235,7 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
-            // The master died during the examination or closes every connection, so wait before
-            // connecting.
+            // The master died during the examination, or closes every connection. Either way, wait before connecting.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
                 let again = std::mem::replace(&mut self.dying, true);
@@ -271,8 +266,8 @@ impl Lifecycle {
             Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
             Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
             Input::Slow => self.probe_now().into_iter().collect(),
-            // If the master was killed, the rest of its end follows within milliseconds. If not,
-            // the next connection shows that it lives.
+            // If the master was killed, the rest of its end follows within milliseconds. Otherwise the next connection
+            // shows that it lives.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
@@ -344,8 +339,7 @@ impl Lifecycle {
     fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
         self.restored = restored;
-        // A new master of ours is empty, so the mirror is right. The state of an orphan must be
-        // read first.
+        // A new child is empty, so the mirror is right. An orphan's state must be read first.
         self.known = restored || (self.supervision == Supervision::Ours && !left);
         if self.supervision == Supervision::Ours && !left {
             return vec![Action::Spawn];
@@ -354,7 +348,7 @@ impl Lifecycle {
         vec![Action::Connect]
     }
 
-    /// Whether calls pass to the master, or would if it were not late.
+    /// Whether calls pass to the master, or would if it was not late.
     fn is_serving(&self) -> bool {
         matches!(self.phase, Phase::Serving | Phase::Late | Phase::CatchingUp)
     }
@@ -366,7 +360,7 @@ impl Lifecycle {
         self.timer = Some((now + self.probing.interval, Timer::Probe));
     }
 
-    /// Probes before the next regular time, unless a probe is under way.
+    /// Probes now instead of at the next regular time, unless a probe is running.
     fn probe_now(&mut self) -> Option<Action> {
         let due = self.timer.take_if(|(_, timer)| *timer == Timer::Probe);
         due.map(|_| Action::Probe)
@@ -379,13 +373,13 @@ impl Lifecycle {
         self.seeking_since.get_or_insert(now);
     }
 
-    /// Handles the loss of the master: shuts the gate, then does `then`.
+    /// Handles the loss of the master: shuts the gate, then takes the actions `then`.
     fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
         let was_serving = self.is_serving();
         self.seek(now);
         if cause == Cause::Exited {
-            // `spawn` has set this timer.
+            // `spawn` has set this timer, which stays.
             self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
         }
         let shut = was_serving.then_some(Action::ShutGate(cause));
@@ -406,21 +400,21 @@ impl Lifecycle {
         actions
     }
 
-    /// Whether our child has had enough time to listen, given that it was not busy. A rosmaster
-    /// whose port was taken stays alive without ever listening.
+    /// Whether the child has had enough time to start listening, without having been busy. A rosmaster whose port was
+    /// taken never listens and does not end.
     fn is_slow_to_start(&self, now: Instant) -> bool {
         let limit = self.probing.start_limit;
         self.child
             .is_some_and(|since| now.duration_since(since) > limit)
     }
 
-    /// Whether our child has had enough time, and there is still no master at its port.
+    /// Whether the child has had enough time, and still no master answers at its port.
     fn is_hopeless(&self, now: Instant) -> bool {
         let since = self.seeking_since.filter(|_| self.child.is_some());
         since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
     }
 
-    /// Kills our silent child if it [hangs](Evidence::judge), and connects again otherwise.
+    /// Kills the silent child if it [hangs](Evidence::judge). Otherwise connects again.
     fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
         match self.evidence.judge(busy_limit) {
             Verdict::Hung => self.give_up(now),
@@ -431,7 +425,7 @@ impl Lifecycle {
         }
     }
 
-    /// Kills our useless child. Its end arrives as `Exited`, which spawns the next one.
+    /// Kills the useless child. Its end arrives as `Exited`, which starts the next one.
     fn give_up(&mut self, now: Instant) -> Vec<Action> {
         self.seek(now);
         vec![Action::Kill]
@@ -479,7 +473,7 @@ impl Lifecycle {
         actions
     }
 
-    /// Starts the next master after one of ours has died.
+    /// Starts the next master after a child has died.
     fn spawn(&mut self, now: Instant) -> Vec<Action> {
         self.count_death(now);
         let pause = self.pause_before_spawn();
@@ -491,7 +485,7 @@ impl Lifecycle {
         vec![Action::ReportCrashLoop(self.deaths.len())]
     }
 
-    /// Handles the end of a master that never got its port. This does not count as a death.
+    /// Handles the end of a child that never got its port. It does not count as a death.
     fn spawn_elsewhere(&mut self, now: Instant) -> Vec<Action> {
         match self.taken_ports.checked_sub(DEATHS_AT_ONCE + 1) {
             None => vec![Action::Spawn],
@@ -502,8 +496,7 @@ impl Lifecycle {
         }
     }
 
-    /// Counts the death of an external master. rosrescue does not slow its restarts; a crash loop
-    /// is reported once.
+    /// Counts the death of an external master. rosrescue cannot slow down its restarts, but reports a crash loop once.
     fn their_death(&mut self, now: Instant) -> Option<Action> {
         self.lost = false;
         let said = self.crash_loop;
@@ -538,15 +531,15 @@ fn spare(verdict: Verdict) -> Option<Action> {
     }
 }
 
-/// The pause after the first failure and `further` ones.
+/// The pause after the first failure and `further` failures.
 fn pause_after(further: usize) -> Duration {
     let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
     (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
 }
 
-/// The pause before the next connect. It is short at first, when a restart may take only
-/// milliseconds, and longer later. A refused connect on the same computer costs some 20 µs. `far`
-/// means that the connect itself has waited for an answer.
+/// The pause before the next connection attempt. It is short at first, because a restart may take only milliseconds,
+/// and longer later. A refused attempt on the same computer costs some 20 µs. `far` means that connecting itself has
+/// waited for an answer.
 fn pause_before_connect(waited: Duration, far: bool) -> Duration {
     let pause = match waited.as_millis() {
         0..2_000 => Duration::from_millis(1),

@@ -39,36 +39,36 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long our notification waits after an answer about the same subject was written. rosmaster takes at
+/// How long a notification of rosrescue waits after an answer about the same subject was written. rosmaster takes at
 /// least 0.3 ms, because its notifications go through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
-/// A notification that follows an answer within this time may be read before it. With thirty runnable
-/// processes on two cores, a node took 42 ms from one to the other.
+/// A notification that follows an answer within this time may be read before it. With thirty runnable processes on two
+/// cores, a node took 42 ms to switch threads.
 pub const RECENT: Duration = Duration::from_millis(500);
-/// How long after such a notification the node is told the state once more. Idle threads of rosmaster look
-/// for work every 100 ms, so by then a master without a backlog has sent everything.
+/// How long after such a notification the node is told the state again. Idle threads of rosmaster look for work every
+/// 100 ms, so by then a master without a backlog has sent everything.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
-/// How long a master may take for one notification while many wait. Python passes its lock on every 5 ms.
+/// Longest time of a master for one notification while many wait. A Python thread gives up its lock every 5 ms.
 const MASTER_TAKES: Duration = Duration::from_millis(5);
-/// The longest backlog of the master's notifications for which ours wait.
+/// Longest backlog of the master for which rosrescue's notifications wait.
 const BACKLOG_MAX: Duration = Duration::from_secs(10);
-/// How long a client that does not read its answer can delay the writes of others.
+/// How long a client that does not read its answer can delay other nodes' writes.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(1);
-/// How long a node that does not take a notification can delay writes about the subject. With thirty runnable
-/// processes on two cores, a node took more than 100 ms, and the master's newer value came first.
+/// How long a node that does not take a notification can delay writes about its subject. With thirty runnable processes
+/// on two cores, a node took more than 100 ms, and the master's newer value came first.
 pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
 
-/// Answers and notifications that are under way to nodes, and whatever waits for them.
+/// Answers and notifications on their way to nodes, and the notifications and calls that wait for them.
 #[derive(Debug, Default)]
 pub struct Order {
     under_way: UnderWay,
     outbox: Outbox,
     /// The calls that the master has not answered yet. It may be notifying nodes because of them.
     in_flight: InFlight,
-    /// The subjects of which the master has notified nodes lately.
+    /// The subjects about which the master has recently notified nodes.
     told: Told,
     repeats: Repeats,
-    /// Whether a call or a notification waits for a change of any of the above.
+    /// Whether a call or a notification waits for any of the above to change.
     awaited: bool,
 }
 
@@ -87,21 +87,21 @@ pub struct Held {
 }
 
 impl Order {
-    /// Notes that an answer about `heard` is under way. Returns its number, for [`Self::written`]. `None` if
-    /// nodes are never notified of what it is about.
+    /// Adds an answer about `heard` that is on its way. Returns its number, for [`Self::written`]. `None` if nodes are
+    /// never notified of its subjects.
     pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
         self.under_way.forget(now);
         if heard.is_empty() {
             return None;
         }
         for Heard { port, subject } in &heard {
-            // The notifications that wait there are older than the answer.
+            // Notifications that wait there are older than the answer.
             self.outbox.renew(port, subject);
         }
         Some(self.under_way.add(under_way::Kind::Answer, heard, None))
     }
 
-    /// Notes that the answer is ready. From now on it delays others for a limited time only.
+    /// Notes that the answer is ready. From now on it delays others only for a limited time.
     pub fn ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
@@ -113,8 +113,8 @@ impl Order {
         std::mem::take(&mut self.awaited)
     }
 
-    /// Whether a call must wait before it goes to the master, because it may notify a node while an answer to
-    /// that node about the same subject is under way.
+    /// Whether a call must wait before it goes to the master. It must if it may notify a node while an answer to that
+    /// node about the same subject is on its way.
     pub fn hold(&mut self, now: Instant, concern: &Concern) -> Option<Held> {
         let held = match concern.is_anything() {
             true => self.under_way.any(now),
@@ -127,8 +127,8 @@ impl Order {
         held.map(|until| Held { until })
     }
 
-    /// Whether a read must wait for a call that the master has not answered. Otherwise its answer could be
-    /// older than a notification that the master sends to the reader.
+    /// Whether a read must wait until the master has answered a call. Otherwise the read's answer could be older than a
+    /// notification that the master sends to the reader.
     pub fn holds_read(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
         let held = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
@@ -136,10 +136,10 @@ impl Order {
         held
     }
 
-    /// Notes that the master is given calls that may notify nodes of `tells`. `answers` are the numbers of
-    /// the answers to them.
+    /// Notes that the master gets calls that may notify nodes of `tells`. `answers` are the numbers of these calls'
+    /// answers.
     pub fn sent<'a>(&mut self, tells: impl IntoIterator<Item = &'a Subject>, answers: Vec<u64>) {
-        // A node never displaces itself, so its other calls need not wait for its own name.
+        // A call never displaces its own node, so the node's other calls need not wait for its own name.
         let told = tells
             .into_iter()
             .filter(|it| !matches!(it, Subject::Name(_)));
@@ -149,8 +149,8 @@ impl Order {
         self.in_flight.answers = answers;
     }
 
-    /// Notes that the master has no unanswered calls any more, or that the mirror has answered them. Returns
-    /// whether anything waits for that.
+    /// Notes that the master has no unanswered calls left, or that the mirror has answered them. Returns whether
+    /// anything waits for that.
     pub fn settled(&mut self) -> bool {
         self.in_flight = InFlight::default();
         std::mem::take(&mut self.awaited)
@@ -164,22 +164,20 @@ impl Order {
         let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
         self.repeats.drop_all_but(subject, &ports);
         for (answer, port) in about {
-            // Not for an answer in the same batch: that call ran later, or is itself the reason for the
-            // notification.
+            // An answer in the same batch does not count: its call ran later, or has itself caused the notification.
             if !self.in_flight.answers.contains(&answer) {
                 self.repeats.add(until, port, subject.clone());
             }
         }
     }
 
-    /// Notes that the master which has notified nodes is gone and sends nothing any more.
+    /// Notes that the master is gone and sends no more notifications.
     pub fn master_is_gone(&mut self) {
         self.told = Told::default();
     }
 
-    /// Queues `call`, which a master would send now, for the node at `port`. If a master that is away may
-    /// already have run the write, `call` may be older than what that master has sent. Then the node is told
-    /// the state instead.
+    /// Queues `call`, which a master would send now, for the node at `port`. If an absent master may have run the write
+    /// already, `call` may be older than what that master has sent. Then the node is told the state instead.
     pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
         let is_news = !self.in_flight.tells.has(&subject);
         let content = is_news.then_some(Content::Call(call));
@@ -187,22 +185,22 @@ impl Order {
             .add(port, subject, content.unwrap_or(Content::State));
     }
 
-    /// Queues a notification that tells the node at `port` the state of `subject` at the time of sending.
+    /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
     pub fn tell_state(&mut self, port: &str, subject: Subject) {
         self.outbox.add(port, subject, Content::State);
     }
 
-    /// Like [`Self::tell_state`], but not before the time `at`.
+    /// Like [`Self::tell_state`], but not before `at`.
     pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
         self.repeats.add(at, port.to_owned(), subject);
     }
 
-    /// The ports that have notifications waiting and need a sender.
+    /// The ports that have waiting notifications and need a task to send them.
     pub fn take_idle_ports(&mut self) -> Vec<String> {
         self.outbox.take_idle_ports()
     }
 
-    /// The next thing to do for the node at `port`.
+    /// What to do next for the node at `port`.
     pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> Next {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
@@ -226,7 +224,7 @@ impl Order {
             let Some(notification) = self.outbox.pop(port) else {
                 continue;
             };
-            // The slower of two senders may tell something older, so the state is told last.
+            // The slower of two senders may send something older, so the node is told the state last.
             if is_being_told || told.is_some() && notification.is_state() {
                 let again = told.unwrap_or(now + REPEAT_AFTER);
                 self.repeats.add(again, port.to_owned(), subject);
@@ -253,32 +251,32 @@ impl Order {
         Next::Idle
     }
 
-    /// Notes that the node has taken the notification with this number, and so will read later ones after it,
-    /// or that it could not be delivered. Returns whether anything waits for that.
+    /// Notes that the node has taken the notification with this number, so that it reads later ones after it; or that
+    /// it could not be delivered. Returns whether anything waits for that.
     pub fn taken(&mut self, number: u64) -> bool {
         self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
     }
 
-    /// Drops all notifications that wait for the node at `port`.
+    /// Drops all waiting notifications for the node at `port`.
     pub fn drop_port(&mut self, port: &str) {
         self.outbox.remove(port);
     }
 
-    /// Drops all notifications that wait, because another computer notifies nodes from now on.
+    /// Drops all waiting notifications. From now on another computer notifies nodes.
     pub fn forget_notifications(&mut self) {
         self.outbox.clear();
         (self.told, self.repeats) = Default::default();
     }
 
-    /// Queues the notifications that are to be repeated by now.
+    /// Queues the repeats that are due.
     pub fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
             self.outbox.add(&port, subject, Content::StateAgain);
         }
     }
 
-    /// Whether [`Self::next_repeat`] has become earlier since this was last asked.
+    /// Whether [`Self::next_repeat`] has become earlier since the last call of this method.
     pub fn has_new_repeat(&mut self) -> bool {
         std::mem::take(&mut self.repeats.is_new)
     }
@@ -288,7 +286,7 @@ impl Order {
         self.repeats.at.next()
     }
 
-    /// Whether an answer to the node at `port` about `subject` is under way, and until when it delays others.
+    /// Whether an answer to the node at `port` about `subject` is on its way, and until when it delays others.
     pub fn is_under_way(&mut self, now: Instant, port: &str, subject: &Subject) -> Option<Held> {
         match self.under_way.answer_to(now, port, subject)? {
             under_way::Answer::UnderWay { limit } => {
@@ -300,7 +298,7 @@ impl Order {
     }
 }
 
-/// The subjects of which the master may still be notifying nodes.
+/// The subjects about which the master may still be notifying nodes.
 #[derive(Debug, Default)]
 struct Told {
     /// When the master will have sent everything about each subject.
@@ -338,8 +336,8 @@ impl Told {
     }
 }
 
-/// Which nodes, by port, are told the state of a subject once more, and when: after the last time at which
-/// they may have read notifications in the wrong order.
+/// The repeats: which nodes, by port, to tell the state of a subject again, and when. That is after the last moment at
+/// which they may have read notifications in the wrong order.
 #[derive(Debug, Default)]
 struct Repeats {
     at: Schedule<(Subject, String)>,
@@ -366,7 +364,7 @@ impl Repeats {
     }
 }
 
-/// The times at which several things are due.
+/// Times at which things are due.
 #[derive(Debug)]
 struct Schedule<T> {
     at: BTreeMap<T, Instant>,

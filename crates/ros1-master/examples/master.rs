@@ -1,4 +1,5 @@
-//! A complete ROS 1 master: `cargo run --example master 11311`. Nodes find it by `ROS_MASTER_URI`, as usual.
+//! A complete ROS 1 master. Run it with `cargo run --example master 11311`. Nodes find it by `ROS_MASTER_URI`, as
+//! usual.
 
 #![allow(clippy::disallowed_methods, clippy::disallowed_types)]
 
@@ -10,7 +11,7 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::{Mutex, PoisonError, mpsc};
 use std::{env, process, thread};
 
-/// The state, and a queue for each node: a node hears of changes in their order, and delays no other node.
+/// The state, and a queue for each node. Each node is notified of changes in order, and delays no other node.
 type State = Mutex<(Master, HashMap<String, mpsc::SyncSender<Vec<u8>>>)>;
 
 fn main() -> io::Result<()> {
@@ -38,7 +39,7 @@ fn serve(mut client: TcpStream, state: &State) -> io::Result<()> {
     }
 }
 
-/// The answer to a call. What nodes must hear of it goes into their queues.
+/// Answers a call, and queues the notifications that it causes.
 fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
     let (master, queues) = &mut *state.lock().unwrap_or_else(PoisonError::into_inner);
     let applied = master.apply(request);
@@ -54,7 +55,7 @@ fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
     applied.reply
 }
 
-/// Calls a node, such as `http://robot:40123/`. One that is gone is none of the master's business.
+/// Calls a node, such as `http://robot:40123/`. Errors are ignored: the node may be gone.
 fn notify(node: &str, call: Vec<u8>) -> io::Result<()> {
     let at = node.trim_start_matches("http://").trim_end_matches('/');
     let length = call.len();

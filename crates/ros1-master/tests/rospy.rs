@@ -1,4 +1,4 @@
-//! The example is a master for real rospy nodes. Needs rospy, std_msgs and std_srvs for `/usr/bin/python3`.
+//! Runs the example as a master for real rospy nodes. Needs rospy, std_msgs and std_srvs for `/usr/bin/python3`.
 
 #![allow(
     clippy::disallowed_methods,
@@ -14,7 +14,7 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-/// Says that it is ready, then what it has heard, what a parameter became, and what a service answered.
+/// Reports that it is ready, then what it has received, the new value of a parameter, and a service's answer.
 const LISTENER: &str = "
 import rospy, std_msgs.msg, std_srvs.srv, threading
 heard = threading.Event()
@@ -28,7 +28,7 @@ print('reset', rospy.ServiceProxy('/reset', std_srvs.srv.Trigger)().message, flu
 print('gain', rospy.get_param('/gain'), flush=True)
 ";
 
-/// Starts after the listener, which learns of it by a notification alone.
+/// Starts after the listener, which finds it only through a notification.
 const TALKER: &str = "
 import rospy, std_msgs.msg, std_srvs.srv
 rospy.init_node('talker')
@@ -38,7 +38,7 @@ rospy.Publisher('/chatter', std_msgs.msg.String, latch=True, queue_size=1).publi
 rospy.spin()
 ";
 
-/// Killed at the end of the test.
+/// A process that is killed at the end of the test.
 struct Process(Child);
 
 impl Drop for Process {
@@ -61,7 +61,7 @@ fn node(script: &str, port: u16, home: &str) -> Process {
 
 #[test]
 fn the_example_is_a_master_for_rospy() {
-    // Beside the test's own program is the folder of the examples.
+    // The folder of the examples is next to the test program's folder.
     let own = env::current_exe().unwrap();
     let example = own.ancestors().nth(2).unwrap().join("examples/master");
     let port = TcpListener::bind("127.0.0.1:0")

@@ -1,4 +1,4 @@
-//! Asks etcd about `--cluster`. Judges nothing.
+//! Asks etcd for the facts about `--cluster`.
 
 use serde::Deserialize;
 
@@ -14,24 +14,24 @@ use crate::{
     ros_env::MasterUri,
 };
 
-/// What the options of several computers lead to.
+/// What etcd says about the robot and this computer.
 #[derive(Debug)]
 pub(in crate::commands::check) struct Cluster {
     pub(super) robot: String,
     /// This computer's name and address.
     pub(super) name: String,
     pub(super) uri: String,
-    /// Each endpoint.
+    /// How each endpoint answered.
     pub(super) tried: Vec<Tried>,
-    /// Who leads the robot or led it last; none if etcd does not know the robot.
+    /// The present or last leader. `None` if etcd does not know the robot.
     pub(super) leader: Option<String>,
-    /// Other robots in etcd, if this one is not.
+    /// The robots in etcd, if this one is not among them.
     pub(super) others: Vec<String>,
-    /// Where another computer with this one's name is.
+    /// Address of another computer with the same name.
     pub(super) namesake: Option<String>,
 }
 
-/// Why they lead nowhere.
+/// Why the cluster options cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub(in crate::commands::check) enum Unusable {
     #[error(transparent)]
@@ -40,14 +40,14 @@ pub(in crate::commands::check) enum Unusable {
     Etcd(#[from] EtcdError),
 }
 
-/// What is needed of an entry among the members.
+/// The part of a computer's entry in etcd that the check needs.
 #[derive(Deserialize)]
 struct Entry {
     uri: String,
 }
 
 impl Cluster {
-    /// None without `--cluster`. `usual`: where others reach this computer.
+    /// Gathers the facts. `None` without `--cluster`. `usual` is where other computers reach this one.
     pub(super) async fn look(
         args: &ClusterArgs,
         usual: &MasterUri,
@@ -94,7 +94,7 @@ impl Cluster {
     }
 }
 
-/// The address that the entry of `name` among the members has, if it is another computer's.
+/// The address of another computer that is registered under `name`.
 async fn namesake_of(client: &Etcd, keys: &Keys, name: &str, own: &MasterUri) -> Option<String> {
     let key = keys.member(name);
     let found = client

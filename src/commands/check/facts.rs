@@ -1,4 +1,4 @@
-//! Gathers facts about this computer, and judges nothing.
+//! Gathers facts about this computer.
 
 use std::{
     collections::BTreeSet,
@@ -35,11 +35,11 @@ use crate::{
     server::listener::{self, ListenError},
 };
 
-/// How long a look-up of a name may take. A name server that does not answer takes longer.
+/// Longest time for one name lookup. A dead name server takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
 /// Most addresses in launch files that are looked up.
 const LOOKUPS_MOST: usize = 4;
-/// Programs that set the clock.
+/// Names of services that set the clock.
 const CLOCKS: [&str; 6] = [
     "systemd-timesyn",
     "chronyd",
@@ -49,56 +49,56 @@ const CLOCKS: [&str; 6] = [
     "phc2sys",
 ];
 
-/// All that is looked at.
+/// All facts that `rosrescue check` judges.
 #[derive(Clone, Debug)]
 pub(super) struct Facts {
     pub(super) version: &'static str,
-    /// The master of `proxy`, and what answers there; none for `core`.
+    /// The master of `proxy` and what answers at its address. `None` for `core`.
     pub(super) proxied: Option<(MasterUri, ros::Server)>,
-    /// What the master of `proxy` speaks, if it answers.
+    /// HTTP version of the master of `proxy`, if it answers.
     pub(super) proxied_speaks: Option<String>,
-    /// The release of the kernel.
+    /// The kernel's release.
     pub(super) kernel: String,
     pub(super) env: Environment,
-    /// The port that nodes use, or what is wrong with `ROS_MASTER_URI`.
+    /// The port that nodes use, or the error in `ROS_MASTER_URI`.
     pub(super) port: Result<Port, UriError>,
-    /// The name that this computer's nodes register.
+    /// The name that nodes on this computer register.
     pub(super) own: Host,
     /// The host of `ROS_MASTER_URI`.
     pub(super) master_host: Option<Host>,
     /// What answers at `ROS_MASTER_URI`, if that is another computer.
     pub(super) elsewhere: Option<ros::Server>,
-    /// The host that the rosrescue there gives as its own.
+    /// The host that a rosrescue at `ROS_MASTER_URI` calls itself.
     pub(super) elsewhere_host: Option<Host>,
-    /// Hosts of registered nodes, and some of the nodes, when rosrescue runs.
+    /// Hosts of registered nodes, each with some of its nodes, if rosrescue runs.
     pub(super) node_hosts: Vec<(Host, Vec<String>)>,
     pub(super) disk: Disk,
-    /// Most open files that this process may ask for.
+    /// The limit of open files that this process may ask for.
     pub(super) files: u64,
     pub(super) clock: Clock,
-    /// How to run rosmaster; none for `proxy`.
+    /// How to run rosmaster. `None` for `proxy`.
     pub(super) rosmaster: Option<Result<Program, String>>,
     pub(super) has_rosout: bool,
-    /// The python3 on the PATH, if it lacks ROS.
+    /// The first python3 on the PATH, if it cannot import ROS.
     pub(super) strange_python: Option<PathBuf>,
     pub(super) units: Vec<Unit>,
-    /// The launch files, with those settings that lead to another master.
+    /// The launch files, with their settings that lead to another master.
     pub(super) launches: Launches,
     /// Free memory, in bytes.
     pub(super) memory: Option<u64>,
-    /// Processes that listen and were started with another `ROS_MASTER_URI` than this one.
+    /// Listening processes that were started with another `ROS_MASTER_URI`.
     pub(super) strays: Vec<(Process, String)>,
-    /// What may change the address in `ROS_IP`.
+    /// Why the address in `ROS_IP` may change.
     pub(super) lease: Option<Lease>,
-    /// The master behind rosrescue, and what goes past it.
+    /// The master behind rosrescue, and the clients that bypass rosrescue.
     pub(super) behind: Option<Behind>,
     /// Masters that run beside rosrescue.
     pub(super) masters: Vec<Process>,
-    /// What `--cluster` leads to; none without it.
+    /// What etcd says about `--cluster`. `None` without it.
     pub(super) cluster: Option<Arc<Result<Cluster, Unusable>>>,
 }
 
-/// ROS's variables.
+/// ROS's environment variables.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Environment {
     pub(super) master_uri: Option<String>,
@@ -106,12 +106,12 @@ pub(super) struct Environment {
     pub(super) hostname: Option<String>,
 }
 
-/// A name, or an address, and where it leads.
+/// A name or an address, with the addresses that it resolves to.
 #[derive(Clone, Debug)]
 pub(super) struct Host {
     pub(super) name: String,
     pub(super) addresses: Result<Vec<IpAddr>, String>,
-    /// Whether one of the addresses is of this computer.
+    /// Whether one of the addresses belongs to this computer.
     pub(super) is_here: bool,
     pub(super) took: Duration,
 }
@@ -145,9 +145,9 @@ impl Host {
 #[derive(Clone, Debug)]
 pub(super) struct Port {
     pub(super) number: u16,
-    /// Why nobody can listen there, if somebody does not already.
+    /// Why this process cannot listen at the port, if the port is not taken.
     pub(super) error: Option<String>,
-    /// Who answers there.
+    /// What answers at the port, if it is taken.
     pub(super) taken: Option<Taken>,
 }
 
@@ -160,7 +160,7 @@ pub(super) struct Taken {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Process {
     pub(super) pid: u32,
-    /// The name of its program.
+    /// The program's name.
     pub(super) name: String,
     pub(super) ports: Vec<u16>,
 }
@@ -176,21 +176,21 @@ impl Process {
     }
 }
 
-/// Where the checkpoint goes.
+/// The file system of the checkpoint.
 #[derive(Clone, Debug)]
 pub(super) struct Disk {
     pub(super) checkpoint: PathBuf,
-    /// The folder, or the nearest above it that exists.
+    /// The checkpoint's folder, or its nearest parent that exists.
     pub(super) folder: PathBuf,
-    /// Free bytes, and whether it is mounted read-only; or why that is not known.
+    /// Free bytes, and whether it is mounted read-only; or why that is unknown.
     pub(super) space: Result<(u64, bool), String>,
-    /// Files that can still be created; none if the file system has no such limit.
+    /// How many more files can be created. `None` if the file system has no limit.
     pub(super) inodes: Option<u64>,
-    /// Why nothing can be written there.
+    /// Why writing there fails.
     pub(super) refused: Option<String>,
-    /// Type and source of the file system, as `ext4` and `/dev/sda1`.
+    /// Type and source of the file system, such as `ext4` and `/dev/sda1`.
     pub(super) mount: Option<(String, String)>,
-    /// Another rosrescue uses the file, with this process id if it is known.
+    /// Set if another rosrescue uses the file, with its process id if known.
     pub(super) holder: Option<Option<u32>>,
     /// Whether the path is a folder.
     pub(super) is_folder: bool,
@@ -198,11 +198,11 @@ pub(super) struct Disk {
 
 #[derive(Clone, Debug)]
 pub(super) struct Clock {
-    /// Seconds since 1970.
+    /// The clock's time, in seconds since 1970.
     pub(super) now: f64,
-    /// When the newest file that we know was changed.
+    /// When the newest known file was changed, in seconds since 1970.
     pub(super) newest: f64,
-    /// Who sets the clock.
+    /// The service that sets the clock.
     pub(super) service: Option<String>,
 }
 
@@ -387,14 +387,14 @@ impl Port {
 #[derive(Clone, Debug)]
 pub(super) struct Behind {
     pub(super) uri: MasterUri,
-    /// What talks to it directly.
+    /// Programs that talk to it directly.
     pub(super) bypassing: Vec<String>,
-    /// Whether it is on this computer and takes connections from others.
+    /// Whether it runs on this computer and accepts connections from other computers.
     pub(super) is_open: bool,
 }
 
 impl Behind {
-    /// `known` is what the running rosrescue has seen.
+    /// Looks for clients that bypass rosrescue. `known` are those that the running rosrescue has seen.
     async fn look(uri: MasterUri, known: Vec<String>) -> Self {
         let place = timeout(LOOKUP_LIMIT, Place::of(&uri)).await.ok().flatten();
         let mut bypass = Bypass::default();
@@ -442,7 +442,7 @@ impl Disk {
     }
 }
 
-/// Type and source of the file system that holds `folder`, from the table of mounts.
+/// Type and source of the file system that holds `folder`, read from the mount table.
 fn mount_of(folder: &Path) -> Option<(String, String)> {
     let table = fs::read_to_string("/proc/self/mountinfo").ok()?;
     let mounts = table.lines().filter_map(|line| {
@@ -452,7 +452,7 @@ fn mount_of(folder: &Path) -> Option<(String, String)> {
         let found = (after.next()?.to_owned(), after.next()?.to_owned());
         folder.starts_with(&point).then_some((point.len(), found))
     });
-    // Of two at the same place the later one hides the other.
+    // A later mount hides an earlier one at the same place.
     mounts
         .max_by_key(|(length, _)| *length)
         .map(|(_, found)| found)
@@ -491,7 +491,7 @@ impl Process {
     }
 }
 
-/// Masters in our network namespace that no rosrescue has started.
+/// Masters in this network namespace that were not started by rosrescue.
 fn masters() -> Vec<Process> {
     process::all()
         .filter(|pid| ["rosmaster", "roscore"].contains(&&*Process::of_name(*pid)))
@@ -500,8 +500,8 @@ fn masters() -> Vec<Process> {
         .collect()
 }
 
-/// Processes in our network namespace that listen and were started with another `ROS_MASTER_URI` than `own`. Those of
-/// other users are seen by root only.
+/// Listening processes in this network namespace that were started with another `ROS_MASTER_URI` than `own`. Only root
+/// sees those of other users.
 fn strays(own: &str) -> Vec<(Process, String)> {
     const NAME: &[u8] = b"ROS_MASTER_URI=";
     let strays = process::all().filter_map(|pid| {
@@ -514,13 +514,13 @@ fn strays(own: &str) -> Vec<(Process, String)> {
             return None;
         }
         let process = Process::of(pid);
-        // Shells have the variable, too.
+        // Shells have the variable too, but do not listen.
         (!process.ports.is_empty() && process.name != "rosrescue").then_some((process, uri))
     });
     strays.collect()
 }
 
-/// Whether `uri` is another way to write the address of the master: `far`, or `port` of this computer.
+/// Whether `uri` leads to the master at `far`, or to `port` of this computer.
 async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bool {
     let Ok(uri) = MasterUri::parse(uri) else {
         return false;
@@ -534,17 +534,17 @@ async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bo
     }
 }
 
-/// Why an address may be another one tomorrow.
+/// How this computer got its address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Lease {
     pub(super) interface: String,
-    /// It was given by DHCP, and not for ever.
+    /// Whether DHCP gave the address, and for a limited time.
     pub(super) is_leased: bool,
     pub(super) is_wireless: bool,
 }
 
 impl Lease {
-    /// By what `ip` of iproute2 says; none where there is no such program.
+    /// Asks `ip` of iproute2. `None` if there is no such program.
     async fn find(address: &str) -> Option<Self> {
         let mut ip = tokio::process::Command::new("ip");
         let ip = ip.args(["-o", "addr", "show"]).kill_on_drop(true).output();
@@ -563,7 +563,7 @@ impl Lease {
     }
 }
 
-/// The interface with `address` in the output of `ip -o addr show`, and whether the address is leased.
+/// Finds the interface with `address` in the output of `ip -o addr show`, and whether DHCP gave the address.
 fn interface_of(output: &str, address: &str) -> Option<(String, bool)> {
     output.lines().find_map(|line| {
         let words: Vec<_> = line.split_whitespace().collect();

@@ -1,4 +1,4 @@
-//! What the facts mean for a robot, and what to do. Looks at nothing.
+//! Judges the facts: what they mean for the robot, and what to do.
 
 mod computers;
 mod network;
@@ -12,13 +12,13 @@ use super::{
     ros::Server,
 };
 
-/// Judges everything.
+/// Turns the facts into findings.
 pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
     if let (Some(Server::Rosrescue { .. } | Server::Master(_)), Some(uri)) =
         (&facts.elsewhere, &facts.env.master_uri)
     {
-        // Only nodes run here: what serves the robot is checked where it runs.
+        // Only nodes run on this computer. What serves the robot is checked on the other one.
         found.elsewhere(facts, uri);
         found.address(facts);
         found.own_name(facts);

@@ -1,4 +1,4 @@
-//! Launch files that send nodes to a master by name. Judges nothing.
+//! Finds launch files that send nodes to a master by its address.
 
 use std::{
     collections::BTreeSet,
@@ -17,13 +17,13 @@ const FILES_MOST: usize = 4000;
 /// How long the search may take.
 const TIME_MOST: Duration = Duration::from_secs(1);
 
-/// What the launch files of all packages say.
+/// What the launch files of all packages contain.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Launches {
-    /// How many were read.
+    /// Number of files that were read.
     pub(super) files: usize,
     pub(super) settings: Vec<Setting>,
-    /// Whether the search ended at its limits.
+    /// Whether the search stopped at its limits.
     pub(super) is_cut: bool,
 }
 
@@ -31,13 +31,13 @@ pub(super) struct Launches {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Setting {
     pub(super) file: PathBuf,
-    /// The first one is 1.
+    /// Line number, counted from 1.
     pub(super) line: usize,
-    /// As written, with substitutions such as `$(arg robot)`.
+    /// The value as written, with substitutions such as `$(arg robot)`.
     pub(super) uri: String,
 }
 
-/// Reads all files `*.launch` below the folders of `package_path`, the value of `ROS_PACKAGE_PATH`. Follows symbolic
+/// Reads all `*.launch` files below the folders of `package_path`, the value of `ROS_PACKAGE_PATH`. Follows symbolic
 /// links, as rospack does.
 pub(super) fn find(package_path: &str) -> Launches {
     let start = Instant::now();
@@ -78,8 +78,8 @@ pub(super) fn find(package_path: &str) -> Launches {
     found
 }
 
-/// Line and value of each `<env>` that sets `ROS_MASTER_URI` in a launch file, up to the first fault in its XML. One that
-/// passes on the variable itself is left out.
+/// Finds line and value of each `<env>` that sets `ROS_MASTER_URI`, up to the first XML error. Leaves out those that
+/// only pass the variable on.
 fn master_uris(launch: &str) -> Vec<(usize, String)> {
     let mut found = Vec::new();
     if !launch.contains(VARIABLE) {
@@ -155,7 +155,7 @@ mod tests {
         ] {
             fs::write(root.join(file), text).unwrap();
         }
-        // A ring.
+        // A link that leads back to its parent.
         std::os::unix::fs::symlink(&root, launch.join("up")).unwrap();
         let path = format!("{0}/src:{0}/none::{0}", root.display());
         let found = find(&path);

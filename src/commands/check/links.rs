@@ -1,5 +1,4 @@
-//! `rosrescue check --live`: whether each subscriber is connected to each publisher of its topics, as the nodes
-//! themselves say.
+//! `rosrescue check --live`: asks the nodes whether each subscriber is connected to each publisher of its topics.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -21,11 +20,11 @@ use crate::{
 };
 
 const SUBJECT: &str = "links";
-/// How long a node may take to answer.
+/// Longest time for a node to answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(3);
-/// Nodes asked at the same time.
+/// Number of nodes that are asked at the same time.
 const AT_ONCE: usize = 64;
-/// A link that is missing is looked for once more after this time: a node that has just started makes it meanwhile.
+/// Pause before a second look at missing connections: a node that has just started may connect meanwhile.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
 /// Asks the nodes of the running robot.
@@ -61,11 +60,11 @@ async fn ask(live: &mut Live) -> Result<Found, Failure> {
     Ok(compare(&state, &answers))
 }
 
-/// What a node says about its connections.
+/// A node's answer about its connections.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Answer {
     Connections(Vec<Connection>),
-    /// It answers, but not this question.
+    /// An answer that contains no connections.
     Other,
     Silent,
 }
@@ -73,7 +72,7 @@ enum Answer {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Connection {
     topic: String,
-    /// The publisher's address for an incoming one, else the subscriber's name.
+    /// For an incoming connection the publisher's address, else the subscriber's name.
     peer: String,
     is_incoming: bool,
 }
@@ -93,7 +92,7 @@ impl Answer {
 }
 
 impl Connection {
-    /// An entry of getBusInfo, of rospy and roscpp: id, peer, direction, transport, topic, and more.
+    /// Reads an entry of `getBusInfo`. rospy and roscpp send id, peer, direction, transport, topic, and more.
     fn read(entry: &Value) -> Option<Self> {
         let [_, peer, direction, _, topic, ..] = entry.as_array()? else {
             return None;
@@ -110,7 +109,7 @@ fn trimmed(api: &str) -> &str {
     api.trim_end_matches('/')
 }
 
-/// A subscriber should be connected to a publisher of the topic.
+/// A connection that should exist between a subscriber and a publisher of one topic.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Link {
     subscriber: String,
@@ -120,16 +119,16 @@ struct Link {
 
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Found {
-    /// Links that the subscriber says it has.
+    /// Number of connections that the subscriber confirms.
     seen: usize,
     missing: BTreeSet<Link>,
-    /// Links about which the answers say nothing, or contradict each other.
+    /// Connections that the answers do not mention, or contradict each other about.
     unknown: BTreeSet<Link>,
-    /// Nodes that do not answer.
+    /// Nodes that did not answer.
     silent: BTreeSet<String>,
 }
 
-/// Compares the registrations with what the nodes say. Links from nodes that do not answer are not expected.
+/// Compares the registrations with the nodes' answers. Leaves out connections of nodes that did not answer.
 fn compare(state: &Master, answers: &BTreeMap<String, Answer>) -> Found {
     let mut found = Found::default();
     let mut publishers = BTreeMap::<_, Vec<_>>::new();
@@ -164,7 +163,7 @@ fn compare(state: &Master, answers: &BTreeMap<String, Answer>) -> Found {
                     }),
                     _ => false,
                 };
-                // Some libraries answer with an empty list, whatever they have.
+                // Some libraries always answer with an empty list.
                 let is_empty = *answer == Answer::Connections(Vec::new());
                 if has(answer, *api, true) {
                     found.seen += 1;
@@ -262,7 +261,7 @@ mod tests {
         Answer::read((Sign::Alive, Some(list)))
     }
 
-    /// Counts of seen, missing, unknown and silent.
+    /// Numbers of seen, missing and unknown connections and of silent nodes.
     fn found(talker: Answer, other: Answer, listener: Answer) -> [usize; 4] {
         let names = ["/talker", "/other", "/listener"].map(str::to_owned);
         let answers = names.into_iter().zip([talker, other, listener]).collect();
@@ -286,7 +285,7 @@ mod tests {
         assert_eq!(found(none(), none(), both), [2, 0, 0, 0]);
         let one = || says(&[("http://robot:1/", "i")]);
         assert_eq!(found(none(), none(), one()), [1, 1, 0, 0]);
-        // A publisher may take a connection for open that its subscriber has closed.
+        // A publisher may still list a connection that its subscriber has closed.
         let claims = || says(&[("/listener", "o")]);
         assert_eq!(found(claims(), claims(), one()), [1, 1, 0, 0]);
         assert_eq!(found(claims(), none(), none()), [0, 1, 1, 0]);

@@ -1,11 +1,11 @@
-//! Whether other users may plant files beside the checkpoint.
+//! Checks whether other users can place files beside the checkpoint.
 
 use std::path::Path;
 
 use super::{Finding, Severity};
 use crate::checkpoint::folder;
 
-/// The finding for the checkpoint at `path`; none if its folders are safe.
+/// The finding for the checkpoint at `path`. `None` if its folders are safe.
 pub(super) fn look(path: &Path) -> Option<Finding> {
     let (folder, why) = folder::open_to_others(path)?;
     Some(Finding {

@@ -1,4 +1,4 @@
-//! Asks what answers at a port, and how this computer's ROS runs. Judges nothing.
+//! Finds out what answers at a port, and how ROS runs on this computer.
 
 use std::{
     collections::BTreeMap,
@@ -22,13 +22,13 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// How long a server may take to answer.
+/// Longest time for a server to answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(3);
-/// How long Python may take to import a module.
+/// Longest time for Python to import a module.
 const IMPORT_LIMIT: Duration = Duration::from_secs(20);
 /// Largest answer to getPid, in bytes.
 const MAX_REPLY: usize = 64 << 10;
-/// Some names of nodes stand for all at a host.
+/// Most nodes that are named for each host.
 const SOME: usize = 3;
 
 /// What answers at an address.
@@ -38,22 +38,22 @@ pub(super) enum Server {
         version: String,
         uri: String,
         unprotected: Option<String>,
-        /// The master behind it; none for `core`.
+        /// The master behind that rosrescue. `None` for `core`.
         proxied: Option<MasterUri>,
-        /// What goes past it.
+        /// Clients that bypass rosrescue.
         bypassing: Vec<String>,
     },
-    /// A master, with the process id that it says.
+    /// A master, with the process id that it reports.
     Master(Option<i32>),
-    /// Something listens there that does not speak XML-RPC.
+    /// A program that does not speak XML-RPC.
     Other,
-    /// Nothing listens there.
+    /// No program listens there.
     Nobody,
-    /// No answer in time.
+    /// There was no answer in time.
     Silent,
 }
 
-/// What is needed of `/status.json`, of any version.
+/// The fields of `/status.json` that the check needs, in any version.
 #[derive(Deserialize)]
 struct Page {
     version: String,
@@ -94,7 +94,7 @@ impl Server {
     }
 }
 
-/// What the master at `address` speaks, if it answers.
+/// The HTTP version of the master at `address`, if it answers.
 pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
     let ask = async {
         let addresses = resolver::addresses(&address.host, address.port).await;
@@ -111,7 +111,7 @@ pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
     tokio::time::timeout(ANSWER_LIMIT, ask).await.ok()?
 }
 
-/// The hosts of the nodes that the master at `uri` knows, with some of the nodes.
+/// Hosts of the nodes registered at `uri`, each with some of its nodes.
 pub(super) async fn hosts_of_nodes(uri: &str) -> BTreeMap<String, Vec<String>> {
     let ask = async |method: &str, params: Vec<Value>| {
         let params = std::iter::once("/rosrescue_check".into()).chain(params);
@@ -144,20 +144,20 @@ pub(super) async fn hosts_of_nodes(uri: &str) -> BTreeMap<String, Vec<String>> {
     hosts
 }
 
-/// A rosmaster that is there.
+/// An installed rosmaster.
 #[derive(Clone, Debug)]
 pub(super) struct Program {
     pub(super) path: PathBuf,
-    /// The version in its package.
+    /// The version from its package.
     pub(super) version: Option<String>,
-    /// Its first line.
+    /// The first line of the script.
     pub(super) interpreter: String,
-    /// Why Python does not run it; none if it does, or is not Python.
+    /// Python's error when it runs the program. `None` if there is none or the program is not Python.
     pub(super) broken: Option<String>,
 }
 
 impl Program {
-    /// The given one, or the one that `core` would find.
+    /// Finds the given program, or the one that `core` would run.
     pub(super) async fn find(given: Option<&Path>) -> Result<Self, String> {
         let path = process::find_rosmaster(given).map_err(|error| error.to_string())?;
         let interpreter = process::interpreter(&path).unwrap_or_default();
@@ -175,8 +175,8 @@ impl Program {
     }
 }
 
-/// The version in the `package.xml` that belongs to `program`. Ubuntu 16.04 leaves it out; rosgraph, without which no
-/// rosmaster runs, is released with it under the same number.
+/// The version in the `package.xml` of `program`. Ubuntu 16.04 does not install that file for rosmaster, so the version
+/// of rosgraph is used: both are released together, with one number.
 fn version(program: &Path) -> Option<String> {
     let real = program.canonicalize().ok()?;
     let prefix = real.parent()?.parent()?;
@@ -188,7 +188,7 @@ fn version(program: &Path) -> Option<String> {
     Some(rest.split_once('<')?.0.trim().to_owned())
 }
 
-/// Imports `module` as the ROS of `program` would. What Python says if it cannot.
+/// Imports `module` with the ROS of `program`. The error is Python's message.
 async fn import(
     python: &str,
     arguments: &[String],
@@ -210,7 +210,7 @@ async fn import(
     }
 }
 
-/// The python3 that nodes with `#!/usr/bin/env python3` get, if it comes before the system's and lacks ROS.
+/// The python3 that nodes with `#!/usr/bin/env python3` run with, if it is not the system's and lacks ROS.
 pub(super) async fn strange_python() -> Option<PathBuf> {
     let python = process::find_program("python3", &[])?;
     if ["/usr/bin/python3", "/bin/python3"]
@@ -228,7 +228,7 @@ pub(super) async fn strange_python() -> Option<PathBuf> {
 mod tests {
     use super::*;
 
-    /// As in Ubuntu 16.04 the first time.
+    /// The first layout is that of Ubuntu 16.04.
     #[test]
     fn the_version_is_that_of_rosmaster_or_else_of_rosgraph() {
         let folder = tempfile::tempdir().unwrap();

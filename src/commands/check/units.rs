@@ -1,11 +1,11 @@
-//! Systemd units that start a master or roslaunch.
+//! Finds systemd units that start a master or roslaunch.
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
 
-/// The folders of the computer's units. The first ones override the others.
+/// Folders of the system's units. Earlier ones override later ones.
 const FOLDERS: [&str; 4] = [
     "/etc/systemd/system",
     "/run/systemd/system",
@@ -15,32 +15,31 @@ const FOLDERS: [&str; 4] = [
 /// Largest unit or script that is read, in bytes.
 const MOST: u64 = 1 << 20;
 
-/// A unit that has to do with ROS.
+/// A unit that starts a part of ROS.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(in crate::commands) struct Unit {
     pub(in crate::commands) name: String,
     pub(in crate::commands) kind: Kind,
-    /// Whether it starts at boot.
     pub(in crate::commands) is_enabled: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::commands) enum Kind {
     Rosrescue,
-    /// It runs a roscore or a rosmaster at port 11311.
+    /// The unit runs a roscore, or a rosmaster at port 11311.
     Roscore,
-    /// It runs roslaunch, which starts a master where it finds none.
+    /// The unit runs roslaunch, which starts a master if it finds none.
     Roslaunch,
 }
 
-/// All units that have to do with ROS, by name.
+/// All units that start a part of ROS, by name.
 pub(super) fn find() -> Vec<Unit> {
     let home = std::env::var_os("HOME");
     let users = home.map(|home| Path::new(&home).join(".config/systemd/user"));
     in_folders(users.as_slice(), true)
 }
 
-/// The units in `folders`, and those of the computer if asked for.
+/// The units in `folders`, and those of the system if `of_computer` is true.
 pub(in crate::commands) fn in_folders(folders: &[PathBuf], of_computer: bool) -> Vec<Unit> {
     let computers = FOLDERS.iter().filter(|_| of_computer).map(PathBuf::from);
     let folders: Vec<_> = folders.iter().cloned().chain(computers).collect();
@@ -77,7 +76,7 @@ pub(super) fn read(path: &Path) -> String {
     }
 }
 
-/// By what a unit starts, or by the script that it starts, as those of robot_upstart.
+/// Classifies a unit by the command that it starts, or by the script that it starts, as those of robot_upstart.
 fn kind_of(unit: &str) -> Option<Kind> {
     let mut found = None;
     for line in unit.lines() {
@@ -91,7 +90,7 @@ fn kind_of(unit: &str) -> Option<Kind> {
         let script = command.split_whitespace().next().unwrap_or_default();
         let script = script.trim_start_matches(['-', '@', '+', '!', ':']);
         let of_script = || {
-            // What ROS's own program does is known by its arguments.
+            // roslaunch itself is not read: its arguments show what it does.
             let text = match script.ends_with("roslaunch") {
                 true => String::new(),
                 false => read(Path::new(script)),
@@ -103,7 +102,7 @@ fn kind_of(unit: &str) -> Option<Kind> {
     found
 }
 
-/// What these words run.
+/// Classifies a command line.
 fn words(text: &str) -> Option<Kind> {
     let lines = text
         .lines()
@@ -120,7 +119,7 @@ fn words(text: &str) -> Option<Kind> {
     match () {
         () if has("rosrescue") => Some(Kind::Rosrescue),
         () if has("roscore") || has("rosmaster") => (!is_elsewhere).then_some(Kind::Roscore),
-        // With --wait it starts no master.
+        // With --wait, roslaunch starts no master.
         () if has("roslaunch") && !has("--wait") => Some(Kind::Roslaunch),
         () => None,
     }

@@ -1,4 +1,4 @@
-//! Calls of the Master API, made all the time as nodes make them, and how long they took.
+//! Calls the Master API continuously, as nodes do, and measures how long each call takes.
 
 use std::{
     sync::Arc,
@@ -15,11 +15,11 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// A call that takes longer has failed. rosrescue promises to answer everything sooner.
+/// A call that takes longer has failed. rosrescue answers all calls sooner.
 const LIMIT: Duration = Duration::from_secs(10);
 /// Pause between two calls of a loop.
 const PAUSE: Duration = Duration::from_millis(5);
-/// Most failures that are told.
+/// Most failures that are reported.
 const MOST: usize = 5;
 
 /// The Master API at an address, called by one node.
@@ -29,11 +29,11 @@ pub(super) struct Api {
     pub(super) caller: String,
 }
 
-/// An answer, and what it took.
+/// An answer, with how long it took.
 struct Answer {
     value: Result<Value, String>,
     took: Duration,
-    /// The connection broke, and the call was repeated, as rospy and roscpp do.
+    /// Whether the connection broke and the call was repeated, as rospy and roscpp do.
     again: bool,
 }
 
@@ -72,15 +72,15 @@ impl Api {
     }
 }
 
-/// How calls of one kind went.
+/// Results of all calls of one kind.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Waits {
     pub(super) calls: u64,
     pub(super) longest_ms: f64,
-    /// Made twice, because the connection had been broken.
+    /// Number of calls that were repeated because the connection had broken.
     pub(super) again: u64,
     pub(super) failed: u64,
-    /// Some of the failures.
+    /// The first failures.
     pub(super) failures: Vec<String>,
 }
 
@@ -114,25 +114,25 @@ impl Waits {
     }
 }
 
-/// How all calls went.
+/// Results of all calls.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Calls {
     pub(super) reads: Waits,
     pub(super) writes: Waits,
-    /// From a write to the notification of its subscriber.
+    /// Times from a write to the notification of its subscriber.
     pub(super) notifications: Waits,
 }
 
-/// What the callers use, all of it the drill's own.
+/// What the callers need. All of it belongs to the drill.
 #[derive(Clone, Debug)]
 pub(super) struct Callers {
     pub(super) api: Api,
-    /// The drill's node.
+    /// Address of the drill's node.
     pub(super) node_api: String,
     pub(super) heard: Arc<Heard>,
-    /// A parameter that nobody else uses.
+    /// A parameter that no other node uses.
     pub(super) key: String,
-    /// A topic that nobody else uses.
+    /// A topic that no other node uses.
     pub(super) topic: String,
 }
 
@@ -148,7 +148,7 @@ impl Callers {
         }
     }
 
-    /// One caller only reads: a node that looks for another one.
+    /// Reads in a loop, like a node that looks up another one.
     async fn read(&self, stop: &CancellationToken) -> Waits {
         let mut waits = Waits::default();
         let name = [self.api.caller.as_str().into()];
@@ -164,12 +164,12 @@ impl Callers {
         waits
     }
 
-    /// One caller sets a parameter, waits for the notification, and reads it.
+    /// Sets a parameter, waits for the notification, and reads the parameter back, in a loop.
     async fn write(&self, stop: &CancellationToken) -> (Waits, Waits, Waits) {
         let (mut written, mut read, mut told) = <(Waits, Waits, Waits)>::default();
         let mut seen = self.heard.param.subscribe();
         let mut number = 0;
-        // The master does not notify a node of what it has set itself.
+        // The master does not notify a node of its own writes, so a second node writes.
         let another = Api {
             caller: format!("{}_writer", self.api.caller),
             ..self.api.clone()
@@ -203,13 +203,14 @@ impl Callers {
         (written, read, told)
     }
 
-    /// One caller registers and unregisters all the time. A subscriber of any type leaves no type behind.
+    /// Registers and unregisters a subscriber in a loop. With the type `*` it leaves no topic type behind.
     async fn register(&self, stop: &CancellationToken) -> Waits {
         let mut waits = Waits::default();
         let (topic, api) = (self.topic.as_str(), self.node_api.as_str());
         while !stop.is_cancelled() {
             let register = [topic.into(), "*".into(), api.into()];
-            // Said before it is so, as by nodes: the health check would take back what the node does not know of.
+            // The node claims the subscription before it registers, as real nodes do. Else the health check would
+            // remove it.
             self.heard.subscribes(topic, true);
             let answer = self.api.ask("registerSubscriber", &register).await;
             waits.add(answer);
@@ -217,7 +218,7 @@ impl Callers {
             self.heard.subscribes(topic, false);
             let unregister = [topic.into(), api.into()];
             let answer = self.api.ask("unregisterSubscriber", &unregister).await;
-            // The first call may have been run, and its answer lost with the connection.
+            // The first call may have run although its answer was lost with the connection.
             let again = answer.again;
             if waits.add(answer) == Some(Value::Int(0)) && !again {
                 waits.fail(format!(

@@ -1,4 +1,4 @@
-//! Kills, and waits for what comes after.
+//! Kills processes, and waits for the recovery.
 
 use std::time::{Duration, Instant};
 
@@ -12,17 +12,17 @@ use super::{
 };
 use crate::{cli::Victim, commands::Failure, process};
 
-/// How long it is watched after each recovery: notifications that were missed come then.
+/// How long the drill watches after each recovery. Late notifications arrive in that time.
 const AFTER: Duration = Duration::from_millis(1500);
-/// How often the recovery is looked for.
+/// Pause between two checks for the recovery.
 const LOOK: Duration = Duration::from_millis(20);
-/// How long a master is made to hang. It counts as hung after some 1.6 s.
+/// How long a master is stopped with `--hang`. It counts as hung after some 1.6 s.
 const HANG: Duration = Duration::from_secs(4);
-/// So many deaths within that time are not a crash loop yet.
+/// Most deaths within a minute that are not a crash loop.
 const DEATHS: usize = 5;
 const DEATHS_WITHIN: Duration = Duration::from_secs(61);
 impl Drill<'_> {
-    /// Kills as often as is asked for, and waits for each recovery.
+    /// Kills as often as `--times` asks, and waits for each recovery.
     pub(super) async fn kill(&self) -> Result<Vec<Kill>, Failure> {
         let kill = if self.args.hang {
             Victim::Master
@@ -40,7 +40,7 @@ impl Drill<'_> {
                 );
                 sleep(pause).await;
             }
-            // Looked for each time: they are others after each kill.
+            // Each kill replaces the processes, so they are looked up again.
             let victims = self.target.victims(kill).await?;
             let signal = if self.args.hang { "SIGSTOP" } else { "SIGKILL" };
             eprintln!(
@@ -78,8 +78,8 @@ impl Drill<'_> {
         Ok(kills)
     }
 
-    /// Waits until calls pass to a living master again, and each killed process has a successor. A master that
-    /// hangs may go on as well.
+    /// Waits until calls pass to a living master again, and each killed process has a successor. A stopped master may
+    /// also continue.
     async fn recovered(&self, victims: &[(&'static str, u32)], mut stopped: Option<Stopped>) {
         let start = Instant::now();
         loop {

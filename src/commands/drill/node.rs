@@ -1,4 +1,4 @@
-//! The drill's own node: what the master calls, and what it was told.
+//! The drill's own node: answers the master's calls, and keeps what it was told.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -29,18 +29,18 @@ use crate::{
 /// Largest call that is read, in bytes.
 const MAX_CALL: usize = 16 << 20;
 
-/// What the node was told, and what it says of itself.
+/// The notifications that the node got, and its subscriptions.
 #[derive(Debug, Default)]
 pub(super) struct Heard {
     /// The number in the last `paramUpdate` of a drill's parameter.
     pub(super) param: watch::Sender<i32>,
-    /// Other parameters, or namespaces, that somebody has changed.
+    /// Other parameters or namespaces that changed.
     changed: Mutex<BTreeSet<String>>,
-    /// Each `publisherUpdate`: topic and publishers.
+    /// Topic and publishers of each `publisherUpdate`.
     updates: Mutex<Vec<(String, Vec<String>)>>,
-    /// Why somebody told it to shut down.
+    /// The reason in a `shutdown` that the node got.
     shutdown: Mutex<Option<String>>,
-    /// Types of the topics that it subscribes.
+    /// The topics that the node subscribes to, with their types.
     subscriptions: Mutex<BTreeMap<String, String>>,
 }
 
@@ -53,7 +53,7 @@ impl Heard {
         lock(&self.updates).clone()
     }
 
-    /// The parameters and namespaces that somebody has changed.
+    /// Parameters and namespaces that others have changed.
     pub(super) fn changed(&self) -> BTreeSet<String> {
         lock(&self.changed).clone()
     }
@@ -62,7 +62,7 @@ impl Heard {
         lock(&self.shutdown).clone()
     }
 
-    /// The node subscribes `topic` from now on, or no longer: the health check asks for that.
+    /// Adds or removes a subscription to `topic`. The health check asks the node for its subscriptions.
     pub(super) fn subscribes(&self, topic: &str, yes: bool) {
         let mut subscriptions = lock(&self.subscriptions);
         match yes {
@@ -71,7 +71,7 @@ impl Heard {
         };
     }
 
-    /// What the node answers: status, message and value, or none for a method that it lacks.
+    /// The node's answer (status, message and value). `None` for a method that it lacks.
     fn answer(&self, call: Call) -> Option<[Value; 3]> {
         let mut params = call.params.into_iter().skip(1);
         let value = match call.method.as_str() {
@@ -89,7 +89,7 @@ impl Heard {
                     Some(Value::Int(number)) if key.starts_with(PREFIX) => {
                         self.param.send_replace(number);
                     }
-                    // Told once more after an outage: all that is below the subscribed namespace.
+                    // After an outage the node is told everything below the namespace again.
                     Some(Value::Struct(all)) if key == "/" => {
                         let ours = all
                             .iter()
@@ -99,7 +99,7 @@ impl Heard {
                         }
                     }
                     _ => {
-                        // The master ends keys with a slash, for comparing.
+                        // The master appends a slash to keys when it compares them.
                         let key = key.trim_end_matches('/').to_owned();
                         lock(&self.changed).insert(key);
                     }
@@ -127,18 +127,18 @@ impl Heard {
     }
 }
 
-/// The node, which answers as long as it is not dropped.
+/// A node that answers until it is dropped.
 #[derive(Debug)]
 pub(super) struct Node {
     pub(super) name: String,
-    /// Its address for others.
+    /// The address that it registers.
     pub(super) api: String,
     pub(super) heard: Arc<Heard>,
     server: tokio::task::JoinHandle<()>,
 }
 
 impl Node {
-    /// A node at the address that this computer's nodes have, as rospy and roscpp choose it.
+    /// Starts a node at this computer's address, chosen as rospy and roscpp do.
     pub(super) async fn start(name: String) -> io::Result<Self> {
         let env = |name: &str| std::env::var(name).ok();
         let any = ros_env::bind_addresses(&env).first().copied();
@@ -175,7 +175,7 @@ async fn serve(listener: TcpListener, heard: Arc<Heard>) {
         };
         let heard = heard.clone();
         let service = service_fn(move |request| answer(heard.clone(), request));
-        // A caller that goes away is no concern of ours.
+        // It does not matter if a caller closes the connection.
         tokio::spawn(http1::Builder::new().serve_connection(TokioIo::new(stream), service));
     }
 }

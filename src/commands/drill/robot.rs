@@ -1,4 +1,4 @@
-//! What the master says of the robot, and which processes its nodes are, before and after.
+//! The state of the robot before and after a drill: what the master says, and the process of each node.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -14,27 +14,27 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// How long a node may take to say its process id.
+/// Longest time for a node to report its process id.
 const NODE_LIMIT: Duration = Duration::from_secs(5);
 
-/// Facts of parameters begin so.
+/// Names of facts about parameters begin with this.
 const PARAMETER: &str = "the parameter ";
 
-/// The robot at one moment, without what belongs to drills.
+/// The robot's state at one moment, without what belongs to drills.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Robot {
-    /// Registrations, types and parameters, each by a name for people.
+    /// Registrations, types and parameters, each under a name for people.
     facts: BTreeMap<String, Value>,
-    /// Each node's process id, if it answered.
+    /// Each node's process id. `None` if it did not answer.
     nodes: BTreeMap<String, Option<i32>>,
 }
 
-/// What differs between two moments.
+/// The difference between two moments.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Difference {
-    /// Gone or changed.
+    /// Facts that are gone or changed.
     pub(super) lost: Vec<String>,
-    /// New, or changed by somebody else.
+    /// Facts that are new, or changed by other programs.
     pub(super) new: Vec<String>,
 }
 
@@ -42,7 +42,7 @@ impl Robot {
     pub(super) async fn read(api: &Api) -> Result<Self, String> {
         let state = api.call("getSystemState", &[]).await?;
         let types = api.call("getTopicTypes", &[]).await?;
-        // A master may hold a parameter that it can never return.
+        // A master may hold a parameter that it can never return, so this call may fail.
         let params = api.call("getParam", &["/".into()]).await;
         let params = params.unwrap_or(Value::Nil);
         let (facts, names) = facts(&state, &types, &params);
@@ -68,8 +68,8 @@ impl Robot {
         (answering, self.facts.len())
     }
 
-    /// What `later` lacks of this or has otherwise, but for what is otherwise in `meanwhile`, when nothing
-    /// had been killed yet. `changed`: parameters and namespaces that somebody else was seen to change.
+    /// What `later` has lost or changed, leaving out what already differed in `meanwhile`, before the first kill.
+    /// `changed` are the parameters and namespaces that other programs were seen to change.
     pub(super) fn compare(
         &self,
         meanwhile: &Self,
@@ -105,7 +105,7 @@ impl Robot {
                 "is gone"
             };
             match is_below(what, changed) {
-                true => by_others.push(format!("{what} {how}: somebody did so")),
+                true => by_others.push(format!("{what} {how}: another program did that")),
                 false => difference.lost.push(format!("{what} {how}")),
             }
         }
@@ -117,7 +117,7 @@ impl Robot {
     }
 }
 
-/// The facts in what the master says, and the names of all nodes.
+/// The facts in the master's answers, and the names of all nodes.
 fn facts(
     state: &Value,
     types: &Value,
@@ -146,7 +146,7 @@ fn facts(
     (facts, names)
 }
 
-/// Adds the parameters below `key`, each by its whole key.
+/// Adds the parameters below `key`, each under its full key.
 fn flatten(key: &str, value: &Value, facts: &mut BTreeMap<String, Value>) {
     match value {
         _ if key.starts_with(PREFIX) => {}
@@ -162,7 +162,7 @@ fn flatten(key: &str, value: &Value, facts: &mut BTreeMap<String, Value>) {
     }
 }
 
-/// Whether this fact is a parameter among `changed`, or in a namespace of them.
+/// Whether this fact is one of the parameters `changed`, or is in one of their namespaces.
 fn is_below(fact: &str, changed: &BTreeSet<String>) -> bool {
     let Some(key) = fact.strip_prefix(PARAMETER) else {
         return false;
@@ -219,7 +219,7 @@ mod tests {
             ]
         );
         assert_eq!(difference.new, ["/other as publisher of /chatter is new"]);
-        // Somebody else changes it.
+        // Another program changes the parameter.
         for (changed, is_its) in [("/robot", true), ("/robot/wheels", true), ("/rob", false)] {
             let changed = [changed.to_owned()].into();
             let difference = before.compare(&before, &after, &changed);
@@ -227,7 +227,7 @@ mod tests {
             let is_noted = difference.new.iter().any(|what| what.contains("wheels"));
             assert_eq!((is_lost, is_noted), (!is_its, is_its), "{changed:?}");
         }
-        // It changes by itself.
+        // The parameter also changes without a kill.
         let meanwhile = robot("/talker", 3, Some(1));
         let difference = before.compare(&meanwhile, &after, &nothing);
         assert!(difference.lost.iter().all(|what| !what.contains("wheels")));
@@ -244,7 +244,7 @@ mod tests {
         };
         assert!(lost(Some(2))[0].contains("it was process 1 and is 2"));
         assert!(lost(None)[0].contains("does not answer"));
-        // One that never answered proves nothing.
+        // A node that never answered proves nothing.
         let silent = robot("/talker", 4, None);
         assert!(silent.compare(&silent, &before, &nothing).lost.is_empty());
     }

@@ -1,4 +1,4 @@
-//! The processes that a drill kills: finds them, and makes sure that they are what they seem.
+//! Finds the processes that a drill kills, and verifies them.
 
 use std::path::Path;
 
@@ -24,7 +24,7 @@ pub(super) struct Target {
 }
 
 impl Target {
-    /// The processes to kill, by what they are: the master first.
+    /// The processes to kill, each with its role; the master comes first.
     pub(super) async fn victims(&self, kill: Victim) -> Result<Vec<(&'static str, u32)>, Failure> {
         let status = &self.running.status().await?;
         let mut victims = Vec::new();
@@ -37,7 +37,7 @@ impl Target {
         Ok(victims)
     }
 
-    /// The master's process. It says its id itself, and it must listen where rosrescue calls it.
+    /// The master's process id. `getPid` reports it, and that process must listen at the address that rosrescue calls.
     async fn master(&self, status: &Status) -> Result<u32, Failure> {
         if status.elsewhere {
             return Err(Failure::Usage(
@@ -61,7 +61,7 @@ impl Target {
             return Ok(pid);
         }
         Err(Failure::Usage(format!(
-            "process {pid} is said to be the master at {}, but what can be seen of it does not say \
+            "process {pid} calls itself the master at {}, but this computer's processes do not show \
              so: run the drill as the user of rosrescue, and not in another container",
             status.master
         )))
@@ -73,7 +73,7 @@ impl Target {
         pid.ok_or_else(|| "getPid gave no process id".to_owned())
     }
 
-    /// rosrescue's worker. It says its id itself, and it must listen at the port.
+    /// The process id of rosrescue's worker. The status reports it, and that process must listen at the port.
     fn worker(&self, status: &Status) -> Result<u32, Failure> {
         if !status.guarded {
             return Err(Failure::Usage(
@@ -85,14 +85,14 @@ impl Target {
         match process::is_rosrescue(status.pid) && listeners::listens(status.pid, port) {
             true => Ok(status.pid),
             false => Err(Failure::Usage(format!(
-                "process {} is said to be rosrescue's worker, but it cannot be seen to listen at port \
+                "process {} calls itself rosrescue's worker, but it does not seem to listen at port \
                  {port}: run the drill as the user of rosrescue, and not in another container",
                 status.pid
             ))),
         }
     }
 
-    /// Refuses a rosrescue of another computer.
+    /// Refuses a rosrescue on another computer.
     pub(super) async fn refuse_others(&self) -> Result<(), Failure> {
         let address = &self.running.address;
         if is_here(address).await {
@@ -105,7 +105,7 @@ impl Target {
     }
 }
 
-/// A process that hangs until this is dropped.
+/// A process that is stopped until this value is dropped.
 #[derive(Debug)]
 pub(super) struct Stopped(u32);
 

@@ -1,4 +1,4 @@
-//! TCPROS, as far as a subscriber needs it that does not look into messages.
+//! The part of TCPROS that a subscriber needs if it does not decode messages.
 
 use std::io;
 
@@ -10,11 +10,11 @@ use tokio::{
 /// Largest header that is read, in bytes.
 const MAX_HEADER: u32 = 1 << 20;
 
-/// A link to a publisher.
+/// A connection to a publisher.
 #[derive(Debug)]
 pub(super) struct Link {
     stream: TcpStream,
-    /// Whether each message begins with a `std_msgs/Header`, whose first field is its number.
+    /// Whether messages begin with a `std_msgs/Header`, whose first field is a sequence number.
     is_numbered: bool,
 }
 
@@ -48,7 +48,7 @@ impl Link {
         }
     }
 
-    /// Waits for the next message; its number, if it has one.
+    /// Waits for the next message, and returns its sequence number if it has one.
     pub(super) async fn next(&mut self) -> io::Result<Option<u32>> {
         let mut length = u64::from(self.stream.read_u32_le().await?);
         let mut number = None;
@@ -65,7 +65,7 @@ impl Link {
     }
 }
 
-/// A subscriber's header, as that of `rostopic hz`: of any type.
+/// The header of a subscriber to any type, as `rostopic hz` sends it.
 fn header(caller: &str, topic: &str) -> Vec<u8> {
     let mut header = Vec::new();
     for (name, value) in [
@@ -87,7 +87,7 @@ fn length(of: usize) -> [u8; 4] {
     u32::try_from(of).unwrap_or(u32::MAX).to_le_bytes()
 }
 
-/// Names and values of a header without its length. What is malformed ends it.
+/// Names and values in a header without its length. Stops at the first malformed field.
 fn fields(mut header: &[u8]) -> impl Iterator<Item = (String, String)> {
     std::iter::from_fn(move || {
         let (length, rest) = header.split_first_chunk()?;

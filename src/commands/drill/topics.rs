@@ -1,4 +1,4 @@
-//! Topics that the drill watches as a subscriber.
+//! Watches topics as a subscriber.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -11,28 +11,28 @@ use tokio::{task::JoinHandle, time::timeout};
 use super::{calls::Api, node::Node, tcpros::Link};
 use crate::xmlrpc::Value;
 
-/// How long a publisher may take to accept a subscriber.
+/// Longest time for a publisher to accept a subscriber.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
-/// With fewer messages before the first kill nobody knows what pause is normal.
+/// Least number of messages before the first kill to tell a topic's normal pauses.
 const FEWEST: u64 = 10;
-/// No shorter pause is held against a stream: computers have other things to do.
+/// Shorter pauses never count as failures: any computer may be busy for that long.
 const SHORTEST_GAP: Duration = Duration::from_secs(1);
 /// How much longer than normal a pause must be to count as a failure.
 const LONGER: u32 = 10;
-/// Topics that are tried when none is named.
+/// Most topics that are tried when none is named.
 const CANDIDATES: usize = 12;
 
-/// What came over one link.
+/// What arrived over one connection.
 #[derive(Debug, Default)]
 struct Seen {
     messages: u64,
-    /// Whether numbers tell what is lost. Not those of a throttled topic, which skip some from the beginning.
+    /// Whether sequence numbers reveal lost messages. They do not for a throttled topic, which always skips some.
     is_numbered: bool,
     number: Option<u32>,
     lost: u64,
     last: Option<Instant>,
     longest: Duration,
-    /// The longest pause before the first kill, if it is known.
+    /// The longest pause before the first kill. `None` if too few messages came.
     normal: Option<Duration>,
     ended: Option<String>,
 }
@@ -44,7 +44,7 @@ impl Seen {
         self.last = Some(now);
         self.is_numbered |= number.is_some() && self.number.is_none();
         if let (Some(before), Some(number)) = (self.number, number) {
-            // A publisher that restarts has lost its link, which is reported separately.
+            // A publisher that restarts starts its numbers again. The lost connection is reported separately.
             let missing = number.wrapping_sub(before).wrapping_sub(1);
             self.lost += u64::from(missing).min(1 << 20) * u64::from(missing < 1 << 31);
         }
@@ -57,7 +57,7 @@ impl Seen {
         }
     }
 
-    /// From now on something is killed.
+    /// Starts the part with kills.
     fn begin(&mut self) {
         self.normal = (self.messages >= FEWEST).then_some(self.longest);
         self.longest = Duration::ZERO;
@@ -72,7 +72,7 @@ impl Seen {
             && self.longest > SHORTEST_GAP.max(normal * LONGER)
         {
             failures.push(format!(
-                "no message of {publisher} came for {} ms, before it was {} ms at most",
+                "no message of {publisher} came for {} ms; before the kill the longest pause was {} ms",
                 self.longest.as_millis(),
                 normal.as_millis()
             ));
@@ -88,10 +88,9 @@ fn lock(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
     seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A link that is read until it is dropped.
+/// A connection that is read until it is dropped.
 #[derive(Debug)]
 struct Watched {
-    /// The publisher's address.
     publisher: String,
     seen: Arc<Mutex<Seen>>,
     task: JoinHandle<()>,
@@ -103,23 +102,23 @@ impl Drop for Watched {
     }
 }
 
-/// A subscription, with a link to each publisher.
+/// A subscription, with a connection to each publisher.
 #[derive(Debug)]
 pub(super) struct Topic {
     pub(super) name: String,
     links: Vec<Watched>,
 }
 
-/// How it went with one topic.
+/// The results for one topic.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Report {
     pub(super) topic: String,
     pub(super) publishers: usize,
     pub(super) messages: u64,
-    /// None if the messages have no number.
+    /// `None` if the messages have no sequence number.
     pub(super) lost: Option<u64>,
     pub(super) longest_gap_ms: f64,
-    /// Before the first kill; none if too few messages came to tell.
+    /// The longest pause before the first kill. `None` if too few messages came.
     pub(super) normal_gap_ms: Option<f64>,
     pub(super) failures: Vec<String>,
 }
@@ -169,14 +168,14 @@ impl Topic {
             .sum()
     }
 
-    /// From now on something is killed.
+    /// Starts the part with kills.
     pub(super) fn begin(&self) {
         for link in &self.links {
             lock(&link.seen).begin();
         }
     }
 
-    /// How it went until `now`. `updates`: what the node was told of publishers.
+    /// The results until `now`. `updates` are the `publisherUpdate`s that the node got.
     pub(super) fn report(&self, now: Instant, updates: &[(String, Vec<String>)]) -> Report {
         let mut report = Report {
             topic: self.name.clone(),
@@ -204,7 +203,7 @@ impl Topic {
             if left_out {
                 let publisher = &link.publisher;
                 report.failures.push(format!(
-                    "subscribers were told that {publisher} publishes no more"
+                    "subscribers were told that {publisher} no longer publishes"
                 ));
             }
         }
@@ -212,7 +211,7 @@ impl Topic {
     }
 }
 
-/// Takes the registration as a subscriber of `topic` away.
+/// Unregisters the subscriber of `topic`.
 pub(super) async fn unregister(api: &Api, node: &Node, topic: &str) -> Result<(), String> {
     node.heard.subscribes(topic, false);
     let params = [topic.into(), node.api.as_str().into()];
@@ -247,7 +246,7 @@ async fn read(mut link: Link, seen: Arc<Mutex<Seen>>) {
     }
 }
 
-/// Topics that somebody publishes and that are cheap to watch.
+/// Published topics that are cheap to watch.
 pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
     let published = api.call("getPublishedTopics", &["".into()]).await?;
     let mut topics: Vec<_> = published
@@ -266,7 +265,7 @@ pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
     Ok(topics)
 }
 
-/// Whether one subscriber more would cost the robot something.
+/// Whether another subscriber to this type would load the robot.
 fn is_heavy(message_type: &str) -> bool {
     [
         "Image",
@@ -279,7 +278,7 @@ fn is_heavy(message_type: &str) -> bool {
     .any(|word| message_type.contains(word))
 }
 
-/// Sorts the best to watch first: with numbers, and with many messages.
+/// Sorts the best topics first: those with sequence numbers, then those with many messages.
 pub(super) fn sort(topics: &mut Vec<Topic>) {
     topics.retain(|topic| topic.messages() > 0);
     let is_numbered = |topic: &Topic| topic.links.iter().any(|link| lock(&link.seen).is_numbered);

@@ -1,4 +1,4 @@
-//! The verdict of a drill, with its numbers.
+//! The verdict of a drill.
 
 use std::fmt;
 
@@ -11,21 +11,21 @@ use super::{
 };
 use crate::commands::counted;
 
-/// Most sentences of a kind.
+/// Most sentences of one kind.
 const MOST: usize = 12;
 
 /// One kill.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Kill {
-    /// Names and process ids.
+    /// Roles and process ids.
     pub(super) killed: Vec<(&'static str, u32)>,
-    /// `SIGKILL`, or `SIGSTOP` for one that was made to hang.
+    /// `SIGKILL`, or `SIGSTOP` for a process that was made to hang.
     pub(super) signal: &'static str,
-    /// Until calls passed to a living master again; none if that took too long.
+    /// Time until calls passed to a living master again. `None` if that took too long.
     pub(super) recovered_ms: Option<f64>,
 }
 
-/// What a drill found.
+/// The result of a drill.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Verdict {
     pub(super) passed: bool,
@@ -35,17 +35,17 @@ pub(super) struct Verdict {
     pub(super) kills: Vec<Kill>,
     pub(super) calls: Calls,
     pub(super) topics: Vec<topics::Report>,
-    /// Nodes that answered before, and what the master said of the robot.
+    /// Number of nodes that answered before the drill.
     pub(super) nodes: usize,
     pub(super) registrations_and_parameters: usize,
-    /// Why it has not passed.
+    /// Why the drill failed.
     pub(super) failures: Vec<String>,
-    /// What else a person should know.
+    /// Other observations.
     pub(super) notes: Vec<String>,
 }
 
 impl Verdict {
-    /// Adds up the failures.
+    /// Collects the failures.
     pub(super) fn judge(&mut self, difference: Difference, shutdown: Option<String>, limit: u32) {
         let mut failures = Vec::new();
         for kill in self.kills.iter().filter(|kill| kill.recovered_ms.is_none()) {
@@ -91,7 +91,7 @@ impl Verdict {
     }
 }
 
-/// The first of `all`, and how many more there are.
+/// Keeps the first sentences, and says how many more there are.
 fn some(mut all: Vec<String>) -> Vec<String> {
     let more = all.len().saturating_sub(MOST);
     all.truncate(MOST);
@@ -258,7 +258,7 @@ mod tests {
         let mut passed = verdict();
         passed.judge(Difference::default(), None, 30);
         assert!(passed.passed && passed.to_string().starts_with("PASSED: "));
-        // And says what it could not see.
+        // The verdict also says what the drill could not see.
         assert!(passed.notes[0].contains("no topic carried messages"));
     }
 

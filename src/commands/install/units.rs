@@ -1,4 +1,4 @@
-//! The texts of the systemd units and of the drop-ins that fit them to a robot. Pure.
+//! Texts of the systemd units, and of the drop-ins with a robot's own settings.
 
 use std::{collections::BTreeMap, net::SocketAddr, path::Path};
 
@@ -6,10 +6,10 @@ const SERVICE: &str = include_str!("../../../packaging/systemd/rosrescue.service
 const SOCKET: &str = include_str!("../../../packaging/systemd/rosrescue.socket");
 /// The first line of every file that `rosrescue install` writes.
 pub(super) const MARK: &str = "# Written by `rosrescue install`.";
-/// Begins a line that names a unit that `rosrescue install` has disabled.
+/// Start of a drop-in line that names a unit disabled by `rosrescue install`.
 const DISABLED: &str = "# Disabled: ";
 
-/// Texts of the two units. A user's systemd can apply neither the account nor the hardening of the computer's.
+/// Texts of the two units. A user's systemd cannot apply the account and hardening settings.
 pub(super) fn units(user: bool) -> [String; 2] {
     let mut service = SERVICE.to_owned();
     if user {
@@ -25,20 +25,20 @@ pub(super) fn units(user: bool) -> [String; 2] {
     [service, SOCKET.to_owned()].map(|text| format!("{MARK}\n{text}"))
 }
 
-/// What differs from robot to robot.
+/// The settings of one robot.
 #[derive(Clone, Debug)]
 pub(super) struct Robot<'a> {
     pub(super) program: &'a Path,
     /// `core` or `proxy`, with options.
     pub(super) command: &'a [String],
-    /// The user that runs the service; none for a user's own systemd.
+    /// The user that runs the service. `None` for a user's own systemd.
     pub(super) run_as: Option<&'a str>,
     /// Environment variables of ROS.
     pub(super) settings: &'a BTreeMap<String, String>,
     pub(super) listen: &'a [SocketAddr],
     /// Units that need a master when they start.
     pub(super) before: &'a [String],
-    /// Units that rosrescue replaces.
+    /// Units that rosrescue has replaced.
     pub(super) disabled: &'a [String],
 }
 
@@ -60,7 +60,7 @@ impl Robot<'_> {
         if let Some(user) = self.run_as {
             lines.extend(["DynamicUser=no".to_owned(), "StateDirectory=".to_owned()]);
             lines.push(format!("User={user}"));
-            // ROS_HOME is the user's own again, and the unit's other variables stay.
+            // Restores the user's own ROS_HOME. The unit's other variables stay.
             lines.push("Environment=".to_owned());
             let [unit, _] = units(false);
             let variables = unit.lines().filter(|line| {
@@ -104,7 +104,7 @@ pub(super) fn disabled(dropin: &str) -> Vec<String> {
     units.map(str::to_owned).collect()
 }
 
-/// One word of a unit's line. `$` is special in commands only.
+/// Quotes one word for a unit file. `$` is special only if it is part of a command.
 fn quoted(word: &str, command: bool) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "_-+./:=,@".contains(c);
     if !word.is_empty() && word.chars().all(plain) {

@@ -31,7 +31,7 @@ fn a_process_id_is_sure_until_the_node_registers_again() {
         &Request::multicall([publish("/a", "/u")]),
     );
     assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
-    // An answer to a question that was asked before is too old.
+    // An answer to a question from before the registration is too old.
     activity.remember_pid("/a", "http://n:1/", registered, 8);
     assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
 }
@@ -66,7 +66,7 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
         master.apply_telling(&publish, &mut noticed);
         activity.applied(now, &publish, noticed, |_| true)
     };
-    // The first time a node is new, too.
+    // A node that registers for the first time is new, too.
     assert!(apply(&mut activity, false));
     assert!(!apply(&mut activity, false));
     activity.set_notifying(true);
@@ -75,7 +75,7 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
     assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
     assert_eq!(activity.take_owed(now).topics, ["/t"]);
     assert_eq!(activity.take_owed(now).topics, Vec::<String>::new());
-    // While no master is there, the notifications are ours, in a master's words.
+    // Without a master, rosrescue sends the notifications, with the master's words.
     let mut noticed = Noticed::new(true);
     master.apply_telling(&publish, &mut noticed);
     let calls = noticed.take_calls().unwrap();
@@ -132,7 +132,7 @@ fn who_was_displaced_by_the_journal_is_told_unless_the_name_is_its_own_again() {
         at("/gone", "http://n:3/"),
     ];
     activity.restore_displaced(displaced.to_vec());
-    // Not before the master was examined.
+    // Nodes are not told before the master was examined.
     assert_eq!(activity.take_owed(now).displaced, []);
     activity.notice_all(&master, now);
     assert_eq!(activity.take_owed(now).displaced, [taken]);

@@ -16,7 +16,7 @@ impl Disk {
         Self { folder, durable }
     }
 
-    /// A journal that records.
+    /// A journal that records everything.
     fn journal(&self, sync: SyncPolicy) -> Journal {
         let path = self.folder.path().join("c");
         let mut store = Store::open(&path).unwrap().0;
@@ -28,7 +28,7 @@ impl Disk {
         *self.durable.borrow()
     }
 
-    /// The state that the next start finds.
+    /// The state that the next start would read.
     fn found(&self, journal: Journal) -> Snapshot {
         drop(journal);
         let path = self.folder.path().join("c");
@@ -49,7 +49,7 @@ fn entry(value: i32) -> Vec<Entry> {
     vec![Entry::call(set(value).into())]
 }
 
-/// The whole state after these values were set, as of the last record.
+/// The complete state after these values were set.
 fn whole(journal: &Journal, values: std::ops::Range<i32>) -> Checkpoint {
     let mut state = Master::default();
     for value in values {
@@ -62,7 +62,7 @@ fn whole(journal: &Journal, values: std::ops::Range<i32>) -> Checkpoint {
     }
 }
 
-/// Has the whole state written.
+/// Writes a complete checkpoint.
 fn rewrite(journal: &mut Journal, values: std::ops::Range<i32>) {
     let checkpoint = whole(journal, values);
     let done = journal.run_whole(checkpoint, |store, checkpoint| store.begin(&checkpoint));
@@ -154,7 +154,7 @@ fn a_disk_that_is_given_too_much_is_given_up() {
     assert_eq!(disk.found(journal), state);
 }
 
-/// One thread runs all jobs; another one that arrives meanwhile does not wait for the disk.
+/// One thread runs all jobs. Another thread that arrives meanwhile does not wait for the disk.
 #[test]
 fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
     let disk = Disk::new();

@@ -1,5 +1,5 @@
-//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now,
-//! they may be in the journal, where they must not count as changes by others.
+//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now, they may be in the
+//! journal. There they must not count as changes by other computers.
 
 use std::{
     collections::BTreeMap,
@@ -10,11 +10,11 @@ use crate::{cluster::merge::weight, master::Request};
 
 /// Most calls that are remembered.
 const MOST: usize = 1000;
-/// Most bytes of one call, approximately. A call that is not remembered is reported as lost
-/// although it is there.
+/// Most bytes of one call, approximately. A call that is too large to remember is later reported as lost, although it
+/// is in the journal.
 const BYTES_MOST: usize = 1 << 20;
 
-/// The calls that were sent; see the [module](self).
+/// The calls that were sent to a leader.
 #[derive(Debug, Default)]
 pub(crate) struct Forwarded(Mutex<Calls>);
 
@@ -29,7 +29,7 @@ impl Forwarded {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Remembers `call` until the result is dropped, when it is answered or nobody waits for it.
+    /// Remembers `call` until the result is dropped, because it was answered or is no longer waited for.
     pub(super) fn begin(self: &Arc<Self>, call: &Request) -> Option<Sent> {
         let bytes: usize = call.calls().into_iter().map(weight).sum();
         let mut calls = self.lock();
@@ -43,7 +43,7 @@ impl Forwarded {
         Some(Sent { of, number })
     }
 
-    /// The writes among the calls that were sent.
+    /// The writes among these calls.
     pub(crate) fn writes(&self) -> Vec<Request> {
         let calls = self.lock();
         let calls = calls.calls.values().flat_map(Request::calls);
@@ -52,7 +52,7 @@ impl Forwarded {
     }
 }
 
-/// A call that was sent.
+/// A call that was sent to a leader.
 pub(super) struct Sent {
     of: Arc<Forwarded>,
     number: u64,

@@ -23,7 +23,7 @@ use crate::{
 const OWN: &str = "http://127.0.0.1:11311/";
 const TERM: u64 = 7;
 
-/// A computer that follows, and what the test controls of it.
+/// A following computer, and what the test controls.
 struct Computer {
     calls: Calls,
     way: watch::Sender<Way>,
@@ -46,7 +46,7 @@ fn handover() -> Request {
 }
 
 impl Computer {
-    /// Its mirror holds one parameter.
+    /// Creates a computer whose mirror holds one parameter.
     fn new(way: Way) -> Self {
         let (gate_tx, gate) = gate::gate();
         gate_tx.set(gate::State::Elsewhere);
@@ -130,7 +130,7 @@ fn made_by(call: &Request) -> Reply {
     model.apply(call).reply
 }
 
-/// A leader that answers 421 to each call, or nothing at all.
+/// A leader that answers each call with this status, or never answers.
 async fn leader(says: Option<StatusCode>) -> Way {
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -170,7 +170,7 @@ async fn while_nobody_leads_reads_are_the_mirrors_and_a_write_waits_for_the_next
     let answer = computer.ask("/RPC2", &get()).await.unwrap();
     assert_eq!(reply(answer).await, made_by(&get()));
     assert!(computer.ask("/RPC2", &set(2)).await.is_err());
-    // Before the state is known there is nothing to answer with.
+    // While the state is unknown, the mirror cannot answer.
     computer.way.send_replace(Way::Nobody { known: false });
     assert!(computer.ask("/RPC2", &get()).await.is_err());
 }
@@ -181,7 +181,7 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
         let computer = Computer::new(leader(says).await);
         let answer = computer.ask("/RPC2", &get()).await.unwrap();
         assert_eq!(reply(answer).await, made_by(&get()), "{says:?}");
-        // A write waits for the decision about the leader.
+        // A write waits until it is known which computer leads.
         let write = set(2);
         let waits = computer.ask("/RPC2", &write);
         assert!(
@@ -266,7 +266,7 @@ async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
     assert_eq!(answer[1], "the leader does not answer".into());
 }
 
-/// Reports when it is dropped.
+/// Sends a report when it is dropped.
 struct Told(mpsc::Sender<u64>, u64);
 
 impl Drop for Told {
@@ -348,8 +348,8 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
     String::from_utf8(body).ok()
 }
 
-/// A caller on one computer keeps seeing what it has been told: a mirror that is behind does not
-/// answer, however long that takes.
+/// A caller on one computer never sees an older state than before. A mirror that is behind does not answer, however
+/// long it takes.
 #[tokio::test(start_paused = true)]
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
     let computer = Computer::new(Way::Nobody { known: true });
@@ -359,7 +359,7 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     let later = others.hold / 2;
     let get = get();
     told(TERM, 7);
-    // The last one belongs to another leader: what the first leader announced and did not commit is
+    // The last position is of another leader. The first leader announced records that it did not commit, so they are
     // gone.
     for (term, seq) in [(TERM, 7), (TERM + 1, 8)] {
         let start = Instant::now();

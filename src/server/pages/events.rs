@@ -1,5 +1,5 @@
-//! `/events`: what changes, as server-sent events, to a few listeners. There is work only while somebody
-//! listens, and it is done once for all of them.
+//! `/events`: sends changes as server-sent events to a few listeners. Changes are looked for only while there are
+//! listeners, once for all of them.
 
 use std::{
     collections::VecDeque,
@@ -29,55 +29,55 @@ use crate::{
     },
 };
 
-/// Most listeners. Each holds a connection; more pages ask for the status now and then.
+/// Most listeners, because each holds a connection. Further pages poll the status.
 const LISTENERS: usize = 16;
-/// After this time a listener gives its place to one that has none. The kernel takes many events for a peer that never
-/// reads, so a write does not show whether a listener reads. A browser that is ended comes again.
+/// Time after which a listener must make room for a new one. The kernel accepts many events for a peer that never
+/// reads, so a write does not show whether the listener reads. A browser reconnects.
 const TURN: Duration = Duration::from_secs(15);
-/// Pause between two looks.
+/// Pause between two checks for changes.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Shortest pause, when the gate moves.
+/// Pause between two checks after the gate has changed.
 const SHORT_PAUSE: Duration = Duration::from_millis(50);
-/// Without news for so long, the old ones are sent: both sides see that the other one is there.
+/// Time without changes after which the last events are sent again, so that both sides know that the other is alive.
 const SILENCE: Duration = Duration::from_secs(15);
-/// A browser that has lost its connection comes again after so many milliseconds.
+/// Tells a browser to reconnect this many milliseconds after losing its connection.
 const BEGIN: &[u8] = b"retry: 1000\n\n";
 
-/// Members of the status that change all the time, and are sent apart from the rest.
+/// Fields of the status that change all the time. They are sent as a separate event.
 const LIVELY: [&str; 4] = ["counters", "pending_writes", "journal", "cluster"];
-/// Members of the status that are left out: there may be many.
+/// Fields of the status that are left out, because they may be long.
 const LEFT_OUT: [&str; 4] = ["clients", "slowest_callers", "calls_per_second", "uptime"];
 
-/// The latest of each kind of event.
+/// The latest event of each kind.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Latest {
     status: Bytes,
     now: Bytes,
 }
 
-/// Members of `now` beside those of [`LIVELY`].
+/// Fields of the `now` event, in addition to [`LIVELY`].
 #[derive(Debug, Serialize)]
 struct Now {
-    /// Where calls go: `open`, `standing_in`, `injecting`, `elsewhere` or `unknown`.
+    /// The gate's state: `open`, `standing_in`, `injecting`, `elsewhere` or `unknown`.
     gate: &'static str,
-    /// Grows with every change of the state, parameters included.
+    /// Grows with every change of the state, including parameters.
     version: u64,
-    /// Another number means that nodes, topics or services have changed.
+    /// Changes whenever nodes, topics or services change.
     registrations: u64,
     #[serde(flatten)]
     lively: Map<String, Value>,
 }
 
-/// Listeners are told of a disk's free bytes in such steps.
+/// Free bytes on the disk are rounded to multiples of this, so that not every byte is an event.
 const DISK_STEP: u64 = 100_000_000;
 
-/// Listeners and what they are told.
+/// The listeners and the latest events.
 #[derive(Debug)]
 pub(crate) struct Feed {
     latest: watch::Sender<Latest>,
-    /// The listeners and their beginnings, the oldest first.
+    /// The listeners with the time of their start, oldest first.
     listeners: Mutex<VecDeque<(Instant, AbortHandle)>>,
-    /// Somebody looks for news.
+    /// Whether a task is looking for changes.
     running: AtomicBool,
 }
 
@@ -91,7 +91,7 @@ impl Default for Feed {
     }
 }
 
-/// The reply to somebody who wants to listen.
+/// Adds a listener, and returns the stream of events as the reply.
 pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     let feed = &server.pages.desk.feed;
     let listeners = feed.listeners.lock();
@@ -126,7 +126,7 @@ pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     Response::new(Content::Events(body))
 }
 
-/// Sends what is new. A listener that reads slowly misses what is outdated.
+/// Sends new events. A listener that reads slowly misses outdated events.
 async fn tell(mut latest: watch::Receiver<Latest>, events: &mpsc::Sender<Bytes>) {
     let mut sent = Latest::default();
     let mut next = Bytes::from_static(BEGIN);
@@ -153,7 +153,7 @@ async fn tell(mut latest: watch::Receiver<Latest>, events: &mpsc::Sender<Bytes>)
     }
 }
 
-/// Looks for news as long as somebody listens.
+/// Looks for changes while there are listeners.
 async fn look(server: Arc<Server>) {
     let pages = &server.pages;
     let mut gate = pages.gate.clone();
@@ -166,7 +166,7 @@ async fn look(server: Arc<Server>) {
             (known, latest)
         };
         let Ok((same, latest)) = tokio::task::spawn_blocking(look).await else {
-            // It panicked. The next listener starts another one.
+            // The task panicked. The next listener starts another one.
             pages.desk.feed.running.store(false, Ordering::Release);
             break;
         };
@@ -186,7 +186,7 @@ async fn look(server: Arc<Server>) {
         shut = gate.look();
         if pages.desk.feed.latest.receiver_count() == 0 {
             pages.desk.feed.running.store(false, Ordering::Release);
-            // Somebody may have come just before that.
+            // A listener may have been added just before.
             let is_needed = pages.desk.feed.latest.receiver_count() > 0;
             if !is_needed || pages.desk.feed.running.swap(true, Ordering::AcqRel) {
                 break;
@@ -195,7 +195,7 @@ async fn look(server: Arc<Server>) {
     }
 }
 
-/// What the last look has found.
+/// The result of the last check.
 #[derive(Default)]
 struct Known {
     version: Option<u64>,
@@ -253,7 +253,8 @@ impl Known {
     }
 }
 
-/// Times of day, which are counted back from now, differ a little each time, and so does a disk's room.
+/// Rounds values that would differ each time without a real change: times of day, which are computed from the present
+/// time, and free bytes.
 fn settle(value: &mut Value) {
     match value {
         Value::Number(number) if number.is_f64() => {
@@ -272,7 +273,7 @@ fn settle(value: &mut Value) {
     }
 }
 
-/// One event. JSON has no newline in it.
+/// Formats one event. JSON contains no newline.
 fn event(name: &str, data: &impl Serialize) -> Bytes {
     let data = serde_json::to_string(data).unwrap_or_default();
     format!("event: {name}\ndata: {data}\n\n").into()

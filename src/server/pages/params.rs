@@ -1,5 +1,5 @@
-//! Parameters as the page shows them: a part of the tree at a time, so that a hundred thousand are no burden,
-//! with the values hidden that the operator wants hidden.
+//! Parameters as the page shows them. Hides the values that the operator wants hidden, and lists a part of the tree at
+//! a time, so that even 100,000 parameters are no problem.
 
 use serde::Serialize;
 
@@ -8,47 +8,47 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Entries that are sent at once. What is left out says so, and can be asked for.
+/// Most entries in one answer. The answer says what it leaves out, and a page can ask for that.
 const ENTRIES: usize = 1000;
-/// Kept length of a value, in characters. A robot's description may have a million.
+/// Most characters of a value. A robot description may have a million.
 const TEXT: usize = 2000;
-/// Results of a search.
+/// Most results of a search.
 const FOUND: usize = 200;
 
 /// A parameter or a namespace.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Entry {
-    /// The last part of its name; of what was searched, the whole name.
+    /// The last part of the name. In search results, the whole name.
     name: String,
-    /// `namespace`, or what rosparam calls the value.
+    /// `namespace`, or the type of the value as rosparam calls it.
     #[serde(rename = "type")]
     kind: &'static str,
-    /// A value as text; none if it is hidden.
+    /// The value as text. `None` if it is hidden.
     #[serde(skip_serializing_if = "Option::is_none")]
     value: Option<String>,
-    /// The value is longer.
+    /// Whether the value is shortened.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     cut: bool,
-    /// The value is not shown.
+    /// Whether the value is hidden.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     hidden: bool,
-    /// What is in a namespace; none if it must be asked for.
+    /// The members of a namespace. `None` if they were left out and must be asked for.
     #[serde(flatten)]
     members: Option<Members>,
-    /// Parameters in a namespace and below.
+    /// Number of parameters in a namespace and below it.
     #[serde(skip_serializing_if = "Option::is_none")]
     count: Option<usize>,
 }
 
-/// What is in a namespace, sorted by name.
+/// The members of a namespace, sorted by name.
 #[derive(Debug, Default, PartialEq, Eq, Serialize)]
 pub(super) struct Members {
     members: Vec<Entry>,
-    /// Further members that are left out.
+    /// Number of members that are left out.
     more: usize,
 }
 
-/// What is in the namespace of that name; none if it is not one.
+/// The members of the namespace `name`. `None` if there is no such namespace.
 pub(super) fn members(tree: &Struct, name: &str, hide: &Hide) -> Option<Members> {
     let mut namespace = tree;
     for part in name.split('/').filter(|part| !part.is_empty()) {
@@ -62,7 +62,7 @@ pub(super) fn members(tree: &Struct, name: &str, hide: &Hide) -> Option<Members>
     Some(list(namespace, name, hide, &mut room))
 }
 
-/// Takes from `room` what it lists.
+/// Lists members of a namespace, and reduces `room` by their number.
 fn list(namespace: &Struct, name: &str, hide: &Hide, room: &mut usize) -> Members {
     let mut sorted: Vec<_> = namespace.iter().collect();
     sorted.sort_by_key(|(name, _)| *name);
@@ -89,7 +89,7 @@ fn list(namespace: &Struct, name: &str, hide: &Hide, room: &mut usize) -> Member
     }
 }
 
-/// The parameters below `namespace`, and with the namespaces.
+/// The number of parameters below `namespace`, without and with namespaces.
 fn size(namespace: &Struct) -> (usize, usize) {
     let sizes = namespace.values().map(|value| match value {
         Value::Struct(inner) if !inner.is_empty() => {
@@ -101,8 +101,8 @@ fn size(namespace: &Struct) -> (usize, usize) {
     sizes.fold((0, 0), |(a, b), (c, d)| (a + c, b + d))
 }
 
-/// The parameters in whose full names `text` occurs, whatever its case. Values are not searched: one could
-/// find out hidden ones.
+/// Finds the parameters with `text` in their full names, in upper or lower case. Values are not searched, because that
+/// would reveal hidden ones.
 pub(super) fn search(tree: &Struct, text: &str, hide: &Hide) -> Members {
     let mut found = Members::default();
     collect(tree, "", &text.to_lowercase(), hide, &mut found);
@@ -137,7 +137,7 @@ impl Entry {
         }
     }
 
-    /// A value, called `name` here and `full` in the tree.
+    /// Makes an entry of a value. It is shown as `name`, and is `full` in the tree.
     fn of(name: String, full: &str, value: &Value, hide: &Hide) -> Self {
         let kind = match value {
             Value::Nil => "none",
@@ -158,7 +158,7 @@ impl Entry {
         }
         let mut text = String::new();
         match value {
-            // Members of structs in a list have names of their own.
+            // Structs in a list have names of their own, which may be hidden.
             Value::Array(_) => write(&hide.mask(full, value), &mut text),
             Value::String(words) => text.extend(words.chars().take(TEXT + 1)),
             value => write(value, &mut text),
@@ -175,7 +175,7 @@ impl Entry {
     }
 }
 
-/// Writes a value in one line; not much more than can be shown.
+/// Writes a value in one line, and stops soon after the length that can be shown.
 fn write(value: &Value, to: &mut String) {
     if to.len() > 4 * TEXT {
         return;

@@ -1,4 +1,4 @@
-//! Who is registered, as the page shows it.
+//! Nodes, topics and services as the page shows them.
 
 use std::{
     collections::BTreeMap,
@@ -13,11 +13,11 @@ use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Node
 pub(super) struct Node {
     pub(super) name: String,
     pub(super) health: Health,
-    /// When there was evidence of that last: seconds since 1970.
+    /// When that was last known, in seconds since 1970.
     pub(super) checked_at: Option<u64>,
-    /// Its own XML-RPC address.
+    /// The node's XML-RPC address.
     pub(super) api: String,
-    /// Its process on its computer, if it has been asked.
+    /// The node's process id, if it was asked for it.
     pub(super) pid: Option<i32>,
     pub(super) publishes: Vec<String>,
     pub(super) subscribes: Vec<String>,
@@ -42,7 +42,7 @@ pub(super) struct Service {
     pub(super) api: String,
 }
 
-/// Sorted by name.
+/// Nodes, topics and services, each sorted by name.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash, Serialize)]
 pub(super) struct Robot {
     pub(super) nodes: Vec<Node>,
@@ -51,7 +51,7 @@ pub(super) struct Robot {
 }
 
 impl Robot {
-    /// What the mirror holds now.
+    /// Reads the mirror's present content.
     pub(super) fn read(ledger: &Ledger, nodes: &Nodes) -> Self {
         let lives = nodes.lives();
         let (snapshot, pids) = ledger.with_activity(|mirror, activity| {
@@ -86,7 +86,7 @@ impl Robot {
         robot
     }
 
-    /// What a snapshot holds, without rosrescue's own token.
+    /// The content of a snapshot, without rosrescue's own token.
     pub(super) fn of(snapshot: Snapshot) -> Self {
         let mut nodes: BTreeMap<String, Node> = BTreeMap::new();
         for (name, node) in snapshot.nodes {
@@ -147,11 +147,11 @@ impl Robot {
         }
     }
 
-    /// Changes with every change. A number that JavaScript can hold.
+    /// A hash of the content, short enough for a JavaScript number.
     pub(super) fn digest(&self) -> u64 {
         let mut hasher = DefaultHasher::new();
         for node in &self.nodes {
-            // Seconds that are read from a clock may differ by one.
+            // Times that are computed from the clock may differ by a second.
             (&node.name, node.health, &node.api, node.pid).hash(&mut hasher);
         }
         (&self.topics, &self.services).hash(&mut hasher);

@@ -1,4 +1,4 @@
-//! The status of this moment.
+//! Builds the present status.
 
 use std::{
     sync::{Mutex, PoisonError},
@@ -20,12 +20,12 @@ use crate::{
     },
 };
 
-/// Shortest time over which calls a second are counted.
+/// Shortest time, in seconds, over which the calls per second are counted.
 const SAMPLE: f64 = 1.0;
-/// Callers listed as the slowest.
+/// Number of callers listed as the slowest.
 const SLOWEST: usize = 20;
 
-/// Calls a second, counted from one time that somebody asks to the next: at rest it costs nothing.
+/// Calls per second, counted between two requests for the status. Without requests it costs nothing.
 #[derive(Debug)]
 pub(crate) struct Rate(Mutex<Sample>);
 
@@ -45,7 +45,7 @@ impl Rate {
         }))
     }
 
-    /// The rate at `now`, after so many `calls` in all.
+    /// The rate at `now`, when `calls` is the total number of calls.
     fn at(&self, now: Instant, calls: u64) -> f64 {
         let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let seconds = now.saturating_duration_since(last.at).as_secs_f64();

@@ -9,8 +9,8 @@ use crate::{
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts},
 };
 
-/// Time after which a missing leader is worth a look. A new leader normally takes over within
-/// etcd's time to live plus 300 ms, and a starting computer finds the leader within a second.
+/// Time after which a missing leader is worth attention. A new leader normally takes over within `--cluster-ttl` plus
+/// 300 ms, and a starting computer finds the leader within a second.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// A condition caused by the other computers.
@@ -21,8 +21,7 @@ pub(super) struct Notice {
     pub(super) action: Option<String>,
 }
 
-/// The condition caused by the other computers; none on the leader, whose condition is that of a
-/// single computer.
+/// The condition caused by the other computers. `None` on the leader, whose condition is that of a single computer.
 pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
     let leader = of.leader.as_ref();
     let notice = match (of.role, leader, of.leaderless) {
@@ -108,7 +107,7 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
         text: format!("{notice}. This computer is cut off from the others{why}."),
         action: Some(
             match (&of.etcd, &of.leader) {
-                // Nothing has come from etcd since this process started.
+                // etcd has not answered since this process started.
                 (Some(_), None) => {
                     "make sure that a majority of etcd runs, and that --cluster has its addresses and client port. \
                      `rosrescue check --cluster URLS` tries each."
@@ -122,7 +121,7 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
     }
 }
 
-/// The leader's extra sentences about the other computers, and what to do.
+/// Additional sentences of the leader about the other computers, and what to do.
 pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     let others = of.members.iter().filter(|member| member.name != of.name);
     let (away, here): (Vec<_>, Vec<_>) = others.partition(|member| member.is_away());
@@ -150,7 +149,7 @@ pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     (text, action)
 }
 
-/// Why etcd does not answer, in parentheses for the end of a sentence; empty if it answers.
+/// Why etcd does not answer, in parentheses for the end of a sentence. Empty if it answers.
 fn etcd(of: &ClusterFacts) -> String {
     let why = of.etcd.as_ref().map(|(_, why)| format!(" ({why})"));
     why.unwrap_or_default()

@@ -16,7 +16,7 @@ pub(super) enum Library {
     Roscpp,
 }
 
-/// What a thread of a node has read.
+/// Data that a thread of a node has read.
 #[derive(Debug)]
 pub(super) enum Thread {
     /// The thread that made a call reads the answer.
@@ -31,12 +31,12 @@ pub(super) struct Node {
     name: String,
     api: String,
     library: Library,
-    /// The publishers of subscribed topics, as last heard.
+    /// The publishers of each subscribed topic, as the node last heard.
     topics: BTreeMap<String, Vec<String>>,
     /// Cached parameters.
     params: BTreeMap<String, Value>,
     published: BTreeSet<String>,
-    /// Parameters that it subscribes to, and those that it has set.
+    /// Parameters that the node subscribes to, and those that it has set.
     subscribed: BTreeSet<String>,
     set: BTreeSet<String>,
     /// A call of roscpp that holds the mutex which a publisherUpdate needs.
@@ -105,7 +105,7 @@ impl Node {
         }
     }
 
-    /// A notification arrives, in this order. `values` tells when each parameter had each value.
+    /// A notification arrives. `values` tells when each parameter had each value.
     pub(super) fn arrives(&mut self, call: &Call, values: &HashMap<(String, Option<i32>), u64>) {
         let [_, subject, value] = call.params.as_slice() else {
             return;
@@ -120,7 +120,7 @@ impl Node {
         }
     }
 
-    /// One of its threads reads something. Returns the call that follows at once, if there is one.
+    /// One of the node's threads reads something. Returns the call that follows at once, if any.
     pub(super) fn hears(&mut self, thread: Thread) -> Option<Request> {
         match thread {
             Thread::Server(call) => {

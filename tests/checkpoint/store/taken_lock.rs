@@ -20,7 +20,7 @@ fn assert_refused(path: &Path) {
     assert!(matches!(error, OpenError::Locked { .. }), "{error}");
 }
 
-/// Checks that the files are in their places and hold everything.
+/// Checks that the files are in their places and complete.
 fn assert_whole(path: &Path, mut store: Store) {
     let reason = store.unprotected().unwrap().to_owned();
     assert!(reason.contains("c.yaml"), "{reason}");
@@ -36,7 +36,7 @@ fn assert_whole(path: &Path, mut store: Store) {
     assert_eq!(store.seq(), seq);
 }
 
-/// As from another container, which does not see the socket.
+/// The other process is like one in another container, which does not see the socket.
 #[test]
 fn recording_resumes_when_another_process_gives_the_lock_back() {
     let (folder, path) = place();

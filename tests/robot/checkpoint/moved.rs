@@ -11,13 +11,14 @@ use std::time::{Duration, Instant};
 use crate::support::{Rescue, Scratch, Setup, SmallDisk, eventually, free_port, signal, status};
 use rustix::process::Signal;
 
-/// How soon it must be reported: within a second, or later on a busy computer, but long before the next sync.
+/// Time in which the change must be reported: about a second, or longer on a busy computer, but long before the next
+/// sync.
 const SAID: Duration = Duration::from_secs(10);
 
 fn robot(scratch: &Scratch) -> Rescue {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();
-    // It checks the file however seldom it syncs.
+    // rosrescue checks the file often, even if it rarely syncs.
     Setup::core(scratch, free_port())
         .args(["--sync-interval", "30000"])
         .at_checkpoint(folder.join("chkpt.yaml"))
@@ -43,8 +44,8 @@ fn second(scratch: &Scratch, checkpoint: PathBuf) -> Setup {
     Setup::core(scratch, free_port()).at_checkpoint(checkpoint)
 }
 
-/// Does `deed` while no calls come, tries to start a second rosrescue at once and again when all is well, and
-/// then kills everything.
+/// Does `deed` while no calls come. Tries to start a second rosrescue at once and again when all is well. Then kills
+/// everything.
 fn assert_survives(rescue: &mut Rescue, deed: impl FnOnce(&Path), second: impl Fn() -> Setup) {
     rescue.client().set_param("/before", 1);
     deed(&rescue.checkpoint());

@@ -9,8 +9,8 @@ use crate::support::{Rescue, Scratch, Setup, eventually, free_port, signal, stat
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::process::Signal;
 
-/// A rosrescue that has died with its master, with the parameter `/kept` in both generations of its
-/// checkpoint; also the checkpoint's folder.
+/// A rosrescue that has died with its master. Both generations of its checkpoint contain the parameter `/kept`. Also
+/// returns the checkpoint's folder.
 fn dead(scratch: &Scratch) -> (Rescue, PathBuf) {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();

@@ -1,5 +1,5 @@
-//! Where `core` is reached: at every address of its computer, over IPv4 and IPv6, and from other
-//! computers; its rosmaster at loopback only.
+//! The addresses of `core`: every address of its computer, over IPv4 and IPv6, also from other computers. Its rosmaster
+//! is only at loopback.
 
 use std::io::ErrorKind;
 use std::net::TcpStream;
@@ -7,7 +7,7 @@ use std::process::Command;
 
 use crate::support::{Client, Netns, Scratch, Setup, free_port};
 
-/// Sets a parameter as another computer does.
+/// A program that sets a parameter from another computer.
 const FROM_AFAR: &str = "
 import sys, xmlrpc.client
 master = xmlrpc.client.ServerProxy(sys.argv[1])
@@ -19,7 +19,7 @@ fn core_is_reached_at_every_address_and_its_master_at_loopback_only() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let master_port = free_port();
-    // Nothing says that loopback is enough. (rosout would look for our name.)
+    // No variable limits `core` to loopback. (rosout would look up this computer's name.)
     let rescue = Setup::core(&scratch, master_port)
         .arg("--no-rosout")
         .env("ROS_IP", "")
@@ -48,7 +48,7 @@ fn core_is_reached_at_every_address_and_its_master_at_loopback_only() {
     }
 }
 
-/// What ROS says of this computer's own address holds for `core` too.
+/// `core` interprets ROS's variables for the computer's own address as ROS does.
 #[test]
 fn core_is_reached_at_loopback_only_where_ros_says_so() {
     let net = Netns::new();

@@ -1,4 +1,4 @@
-//! `core` does what roscore does, as far as it can be seen in the master.
+//! `core` does everything that roscore does, as far as the master shows it.
 
 use std::process::Command;
 
@@ -7,7 +7,7 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// The state of a whole core: with rosout, and all parameters.
+/// The state of a complete core, with rosout and all parameters.
 fn complete(client: &Client) -> State {
     eventually_some("the core is complete", || {
         let state = State::try_read(client).ok()?;

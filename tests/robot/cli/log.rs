@@ -1,4 +1,4 @@
-//! The log: priorities for journald, a limit on what could come by the thousand, and reports as files.
+//! The log: priorities for journald, rate limits, and reports as files.
 
 use std::fs::{self, File};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -7,7 +7,7 @@ use crate::support::{
     Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, in_both_modes, request,
 };
 
-/// Standard error is a file, as it may be a socket of journald: it is known by device and inode.
+/// Standard error is a file here. Like a socket of journald, it is recognised by device and inode.
 #[test]
 fn journald_is_told_the_priority_of_each_line_and_nobody_else_is() {
     let scratch = Scratch::new();
@@ -73,7 +73,7 @@ in_both_modes!(after_many_deaths_the_last_lines_say_that_the_master_is_back);
 
 fn after_many_deaths_the_last_lines_say_that_the_master_is_back(mode: Mode) {
     let mut robot = Robot::start(mode);
-    // A core pauses for 10 s after each further one.
+    // In a crash loop a core waits 10 s before each further start.
     let deaths = if mode == Mode::Core { 12 } else { 15 };
     for _ in 0..deaths {
         robot.crash_master();

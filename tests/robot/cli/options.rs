@@ -1,4 +1,4 @@
-//! Options that show in what rosrescue writes, by environment variables, as a service unit sets them.
+//! Options that affect rosrescue's output, set by environment variables as in a service unit.
 
 use std::process::Command;
 
@@ -23,7 +23,7 @@ fn the_log_as_json() {
     assert!(lines.iter().all(|line| line["level"].is_string()));
 }
 
-/// The same command on a terminal.
+/// The same command, run in a terminal.
 fn on_terminal(own: &Command) -> Command {
     let words = std::iter::once(own.get_program()).chain(own.get_args());
     let words: Vec<_> = words

@@ -1,4 +1,4 @@
-//! What the log and the status page are silent about: the values of parameters, which may be passwords.
+//! Values of parameters, which may be passwords, never appear in the log or on the status page.
 
 use std::fs;
 
@@ -9,7 +9,7 @@ use rosrescue::xmlrpc::{Call, Value};
 
 const SECRET: &str = "hunter2";
 
-/// With every call logged, in every way that a value can take, and through an outage.
+/// Logs every call, with values at every place where they can be, and through an outage.
 #[test]
 fn values_are_never_logged() {
     let mut robot = Robot::start_with(Mode::Core, &["-v"]);
@@ -25,7 +25,7 @@ fn values_are_never_logged() {
         .call("system.multicall", Call::multicall(several).params)
         .unwrap();
     assert_eq!(client.param("/alone"), Some(SECRET.into()));
-    // What cannot be decoded, or what the master refuses.
+    // Calls that cannot be decoded, or that the master refuses.
     let call = String::from_utf8(encode_call("setParam", params!["/c", "/odd", SECRET])).unwrap();
     let typed = call.replace(SECRET, &format!("<int>{SECRET}</int>"));
     let document = &call[call.find("<methodCall").unwrap()..];
@@ -37,13 +37,13 @@ fn values_are_never_logged() {
         let bytes = request("POST / HTTP/1.1", &[header], call.as_bytes());
         client.exchange(&bytes).unwrap();
     }
-    // What the mirror does not know: a divergence.
+    // A change that the mirror does not know: a divergence.
     robot.bare().set_param("/past", SECRET);
     let api = "http://127.0.0.1:1/";
     let answer = client.ok("subscribeParam", params!["/c", api, "/past"]);
     assert_eq!(answer, SECRET.into());
     eventually("it has been noticed", || robot.counter("divergences") > 0);
-    // What cannot be restored, and what waits for the new master.
+    // Values that cannot be restored, and values that wait for the new master.
     client.set_param(
         "/large",
         tree! { "password" => SECRET, "number" => Value::BigInt("9".repeat(30)) },

@@ -1,5 +1,5 @@
-//! How rosrescue starts and refuses to start: its arguments, files and ports. Each mistake gets one clear
-//! sentence; nothing is left behind and nothing of a person's is lost.
+//! How rosrescue starts and refuses to start, depending on its arguments, files and ports. Each mistake gets one clear
+//! sentence. No process or file is left behind, and no user's file is lost.
 
 use std::fs;
 use std::net::{TcpListener, TcpStream};
@@ -14,8 +14,8 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// Runs rosrescue to its end, which must come by itself, with `code`, one clear sentence on standard
-/// error, and nothing left behind. Gives the sentence.
+/// Runs rosrescue until it ends by itself. It must end with `code` and one clear sentence on standard error, and leave
+/// nothing behind. Returns the sentence.
 #[track_caller]
 fn refused(scratch: &Scratch, setup: Setup, code: i32) -> String {
     let before = scratch.survivors();
@@ -24,13 +24,12 @@ fn refused(scratch: &Scratch, setup: Setup, code: i32) -> String {
     let said = rescue.stderr().join("\n");
     assert_eq!(status.code(), Some(code), "{said}");
     rescue.assert_no_panic();
-    // A usage error comes with a hint how to get help; anything else is one sentence, perhaps
-    // after lines of the log.
+    // A usage error also tells how to get help. Other errors are one sentence, perhaps after log lines.
     let sentence = said.lines().last().unwrap().to_owned();
     for noise in ["Os {", "Err(", "Some(", "stack backtrace", "kind:"] {
         assert!(!said.contains(noise), "`{noise}` is not for people: {said}");
     }
-    // What it has killed at its end may take a moment to be gone.
+    // Processes that it killed at its end may take a moment to be gone.
     eventually("no process is left behind", || {
         scratch.survivors() == before
     });
@@ -101,7 +100,7 @@ fn variables_of_core_are_no_matter_of_proxy() {
             .env("ROSRESCUE_PORT", "bad")
     };
     setup().start();
-    // Its own still are.
+    // Its own variables are still checked.
     let said = refused(&scratch, setup().env("ROSRESCUE_HOLD", "bad"), 2);
     assert!(said.contains("--hold"), "{said}");
     for arguments in [&[][..], &["core"], &["--no-rosout"]] {
@@ -120,7 +119,7 @@ fn a_new_session_is_said_to_be_one() {
     assert!(!said.contains("whole state was restored"), "{said}");
 }
 
-/// The gate stays open although rosmaster closes what is idle for four seconds.
+/// The gate stays open although rosmaster closes connections that were idle for four seconds.
 #[test]
 fn probes_keep_the_sentinel_from_being_idle() {
     let scratch = Scratch::new();
@@ -184,14 +183,14 @@ fn an_address_that_cannot_be_served_is_named() {
     }
 }
 
-/// The sockets of a rosrescue that was killed are closed a moment after its end.
+/// The kernel closes the sockets of a killed rosrescue a moment after its end.
 #[test]
 fn a_port_that_becomes_free_soon_is_waited_for() {
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
     let taken = TcpListener::bind(("0.0.0.0", setup.port)).unwrap();
     let mut rescue = setup.spawn();
-    // It ends at once otherwise.
+    // Otherwise it would end at once.
     holds(Duration::from_millis(300), || rescue.exited().is_none());
     drop(taken);
     rescue.wait_serving();
@@ -229,7 +228,7 @@ fn a_master_that_is_none_or_rosrescue_itself_is_refused() {
     }
 }
 
-/// `own` where nothing lies in /opt but, if one is given, a ROS with this rosmaster.
+/// The command `own` with nothing in /opt but a ROS with this rosmaster, if one is given.
 fn with_opt(own: &Command, rosmaster: &Path) -> Command {
     const MOUNT: &str = r#"
         own_path=$PATH
@@ -261,7 +260,7 @@ fn no_rosmaster_installed() {
     let said = refused(&scratch, setup, 1);
     assert!(said.contains("/nonexistent/rosmaster"), "{said}");
 
-    // With an empty PATH, on a computer without a ROS in /opt.
+    // With an empty PATH, on a computer without ROS in /opt.
     let empty = scratch.path("empty");
     fs::create_dir(&empty).unwrap();
     let bare = |more: &[&str]| {
@@ -289,7 +288,7 @@ fn no_rosmaster_installed() {
     rescue.client().set_param("/x", 1);
     assert_eq!(rescue.terminate().code(), Some(0));
 
-    // One that ends at once is no master either, and is reported as such.
+    // A rosmaster that ends at once is reported.
     let mut setup = Setup::bare(&scratch, ["core", "-p", &port, "--rosmaster", "/bin/false"]);
     setup.port = port.parse().unwrap();
     let mut rescue = setup.spawn();
@@ -303,14 +302,14 @@ fn no_rosmaster_installed() {
     }
 }
 
-/// rosout is a client as any: it must find the master by what is said.
+/// rosout is an ordinary client: it must find the master at the announced address.
 #[test]
 fn an_address_to_serve_is_the_one_that_is_said() {
     let scratch = Scratch::new();
     let port = free_port();
     let said = format!("http://127.0.0.7:{port}/");
     let arguments = ["core", "--listen", "127.0.0.7", "-p", &port.to_string()];
-    // An empty variable is none.
+    // An empty variable counts as unset.
     let mut rescue = Setup::bare(&scratch, arguments).env("ROS_IP", "").spawn();
     rescue.wait_line("that address", |line| {
         line == format!("ROS_MASTER_URI={said}")
@@ -334,7 +333,7 @@ fn an_address_to_serve_is_the_one_that_is_said() {
     });
 }
 
-/// Such as while its package is being upgraded.
+/// A rosmaster may be missing while its package is being upgraded.
 #[test]
 fn a_rosmaster_that_is_gone_for_a_while_is_started_when_it_is_back() {
     let scratch = Scratch::new();
@@ -382,7 +381,7 @@ fn a_master_that_is_not_there_is_waited_for() {
         let client = client.clone();
         move || client.status("setParam", params!["/c", "/early", 1])
     });
-    // Nobody knows yet what there is in it.
+    // The state of that master is not known yet.
     assert!(holds(Duration::from_secs(1), || !early.is_finished()));
     let master = Rosmaster::start_at(&scratch, port);
     rescue.wait_serving();

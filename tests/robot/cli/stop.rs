@@ -1,5 +1,5 @@
-//! How rosrescue stops, and what it keeps alive until then: signals end it in good order whatever hangs,
-//! with nothing left behind and nothing answered falsely.
+//! How rosrescue stops, and what it keeps running until then. Signals stop it cleanly whatever hangs. Nothing is left
+//! behind, and no call gets a false answer.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -44,7 +44,7 @@ fn an_orderly_stop_in_an_outage_keeps_what_was_answered_and_answers_nothing_fals
     for number in 0..5 {
         client.ok("setParam", params!["/c", "/answered", number]);
     }
-    // Only a master understands these.
+    // Calls that only a master understands.
     let waiting: Vec<_> = (0..5)
         .map(|number| {
             let client = client.clone();
@@ -62,7 +62,7 @@ fn an_orderly_stop_in_an_outage_keeps_what_was_answered_and_answers_nothing_fals
         start.elapsed()
     );
     for call in waiting {
-        // Nothing did it, so nothing may say that it was done.
+        // No master ran the calls, so they must not succeed.
         assert!(call.join().unwrap().is_err());
     }
     let checkpoint = fs::read_to_string(robot.rescue.checkpoint()).unwrap();
@@ -83,13 +83,13 @@ fn a_core_stops_even_if_its_master_hangs() {
 #[test]
 fn a_second_signal_ends_at_once() {
     for (second, code) in [(Signal::INT, 130), (Signal::TERM, 143), (Signal::HUP, 129)] {
-        // A rosout that takes long to end must not give the hung master time to be replaced.
+        // A rosout that stops slowly must not give rosrescue time to replace the hung master.
         let mut robot = Robot::start_with(Mode::Core, &["--probe-count", "1000"]);
         let master = robot.master_pid();
-        // An orderly stop has to wait for this one.
+        // A clean stop has to wait for this one.
         crate::support::stop(master);
         robot.rescue.signal(Signal::TERM);
-        // The first one has been taken: two that are under way may become one.
+        // The first signal has been handled. Two pending signals may be merged into one.
         eventually("the stop has begun", || rosout(&robot).is_none());
         let start = Instant::now();
         robot.rescue.signal(second);
@@ -102,7 +102,7 @@ fn a_second_signal_ends_at_once() {
     }
 }
 
-/// Runs its arguments in a terminal of its own, closes that once calls pass, and ends as they do.
+/// Runs its arguments in a terminal of its own, closes the terminal once calls pass, and exits with their status.
 const IN_A_TERMINAL: &str = r#"
 import os, pty, sys
 pid, terminal = pty.fork()
@@ -158,7 +158,7 @@ fn rosout(robot: &Robot) -> Option<u32> {
     rosout.map(|(pid, _)| pid)
 }
 
-/// rosout is kept alive; what it says for itself in the master is there again.
+/// rosout is restarted when it ends, and its registrations are restored.
 #[test]
 fn a_core_keeps_rosout_alive() {
     let robot = Robot::start(Mode::Core);
@@ -176,7 +176,8 @@ fn a_core_keeps_rosout_alive() {
     });
 }
 
-/// One that ends at once, such as without its libraries, is started ever more seldom, and says why.
+/// A rosout that ends at once, for example without its libraries, is started after growing pauses. The log has its last
+/// output.
 #[test]
 fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
     let scratch = Scratch::new();
@@ -202,7 +203,7 @@ fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
     eventually("it is started three times more", || {
         starts(&rescue) >= first + 3
     });
-    // The pauses are of 1, 2 and 4 seconds.
+    // The pauses are 1, 2 and 4 seconds.
     let least = Duration::from_millis(6500);
     assert!(start.elapsed() > least, "{:?}", start.elapsed());
     assert_eq!(rescue.terminate().code(), Some(0));

@@ -1,4 +1,4 @@
-//! `rosrescue check` on this computer, with the traps set.
+//! `rosrescue check` on this computer, with problems built in.
 
 use std::fs;
 use std::process::Command;
@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::support::{Library, Mode, Process, Robot, Rosmaster, Scratch, Setup, behind, free_port};
 
-/// A check of port `port` in an environment that is in order.
+/// A check of port `port` in an environment without problems.
 fn check(scratch: &Scratch, port: u16) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
     scratch.prepare(&mut command);
@@ -17,7 +17,7 @@ fn check(scratch: &Scratch, port: u16) -> Command {
     command
 }
 
-/// What a check found.
+/// The findings of a check.
 struct Found {
     report: Value,
     status: Option<i32>,
@@ -41,7 +41,7 @@ impl Found {
             .collect()
     }
 
-    /// It is a problem, the only one, and says these words.
+    /// Asserts that this is the only problem, with these words.
     #[track_caller]
     fn assert_problem(&self, subject: &str, words: &str) {
         let problems = self.of("problem");
@@ -62,7 +62,7 @@ impl Found {
         assert_eq!(self.status, Some(0));
     }
 
-    /// What is said of `subject`.
+    /// The text of the findings about `subject`.
     #[track_caller]
     fn said(&self, subject: &str) -> String {
         let all = self.report["findings"].as_array().unwrap().iter();
@@ -83,7 +83,7 @@ fn a_computer_in_order_has_no_problem() {
     found.assert_no_problem();
     assert_eq!(found.said("port"), format!("{port} is free"));
     assert!(found.said("rosmaster").contains("1.1"));
-    // Nothing was left behind, not even a folder.
+    // The check has created nothing, not even a folder.
     assert_eq!(fs::read_dir(scratch.log_dir()).unwrap().count(), 0);
     let mut words = Process::start("a check", &mut check(&scratch, port));
     words.wait_output();
@@ -101,7 +101,7 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let found = Found::by(&mut check(&scratch, port));
     let who = format!("rosmaster (process {}, port {port})", master.pid());
     found.assert_problem("port", &who);
-    // In front of it there is no problem, and behind oneself there is.
+    // In front of that master there is no problem. In front of itself there is one.
     let uri = format!("http://127.0.0.1:{port}");
     let free = free_port();
     let found = Found::by(check(&scratch, free).args(["--master", &uri]));
@@ -149,7 +149,7 @@ fn a_launch_file_that_names_another_master_is_found() {
     fs::create_dir_all(launch.parent().unwrap()).unwrap();
     let port = free_port();
     let env = |uri: &str| format!("<env name=\"ROS_MASTER_URI\" value=\"{uri}\"/>\n");
-    // The first one is another way to write the robot's own.
+    // The first one is another form of the robot's own address.
     let own = env(&format!("http://localhost:{port}/"));
     let text = format!(
         "<launch>\n{own}{}</launch>\n",
@@ -172,7 +172,7 @@ fn a_node_of_another_master_is_found() {
     let found = Found::by(&mut check(&robot.scratch, free_port()));
     let said = found.said("ROS_MASTER_URI");
     assert!(said.contains(&stray), "{said}");
-    // At its own master it is at home, however that is written.
+    // At its own master it causes no finding, in whatever form the address is written.
     let mut own = check(&robot.scratch, robot.port());
     own.env(
         "ROS_MASTER_URI",
@@ -188,7 +188,7 @@ fn something_else_at_the_port() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     let closing = std::thread::spawn(move || {
-        // The status page and the Master API are asked for.
+        // The check asks for the status page and for the Master API.
         for _ in 0..2 {
             drop(listener.accept());
         }
@@ -290,7 +290,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
     let port = free_port();
     let found = Found::by(check(&scratch, port).env("PATH", "/nowhere"));
     found.assert_problem("rosmaster", "there is no rosmaster on the PATH");
-    // A python without ROS before the system's.
+    // A python without ROS comes before the system's.
     let tools = scratch.path("tools");
     fs::create_dir(&tools).unwrap();
     std::os::unix::fs::symlink("/bin/false", tools.join("python3")).unwrap();
@@ -302,7 +302,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
     few.args(["-c", r#"ulimit -n 100; exec "$0" "$@""#]);
     let found = Found::by(&mut behind(few, &check(&scratch, port)));
     found.assert_problem("descriptors", "100 open files");
-    // Somebody who may not write there.
+    // A user who may not write there.
     let mut nobody = Command::new("setpriv");
     nobody.args([
         "--reuid",
@@ -311,7 +311,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
         "--inh-caps=-all",
         "--",
     ]);
-    // The program's own folder may be closed to others.
+    // Other users may not be able to read the program's own folder.
     let shared = tempfile::Builder::new().tempdir_in("/tmp").unwrap();
     let program = shared.path().join("rosrescue");
     fs::copy(env!("CARGO_BIN_EXE_rosrescue"), &program).unwrap();
@@ -334,7 +334,7 @@ fn open_to_all(folder: &std::path::Path) {
     fs::set_permissions(folder, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
-/// Debian's trap: the computer's own name is 127.0.1.1. And a roscore that starts with the computer.
+/// On Debian the computer's own name resolves to 127.0.1.1. A roscore also starts at boot.
 #[test]
 fn the_hosts_file_and_the_units_of_this_computer() {
     let scratch = Scratch::new();

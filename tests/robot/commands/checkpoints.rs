@@ -43,7 +43,7 @@ fn a_checkpoint_is_inspected_beside_the_running_rosrescue() {
         .unwrap();
     assert_eq!(listener["subscribes"][0], "/chatter");
     assert_eq!(listener["services"].as_array().unwrap().len(), 2);
-    // A regular expression of one's own, and none.
+    // A regular expression given by the user, and an empty one.
     let text = run(&["inspect", "--hide-values", "WHEELS"]).ended(0);
     assert!(text.contains("/robot/wheels: \"(hidden)\"") && text.contains("geheim"));
     assert!(
@@ -53,7 +53,7 @@ fn a_checkpoint_is_inspected_beside_the_running_rosrescue() {
     );
 
     assert!(run(&["verify", "present"]).ended(0).contains("is whole"));
-    // The mirror is what the master holds.
+    // The mirror equals the master.
     let same = run(&["diff", "present", "--live"]).ended(0);
     assert!(same.contains("do not differ"), "{same}");
 }
@@ -121,7 +121,7 @@ fn what_differs_is_said_in_words() {
     nobody.ended(3);
 }
 
-/// A checkpoint with a parameter in its snapshot and two in its journal, and where the journal's lines start.
+/// A checkpoint with one parameter in its snapshot and two in its journal. Returns where the journal's lines start.
 fn file(at: &Path) -> [usize; 3] {
     let checkpoint = Checkpoint {
         seq: 1,
@@ -203,7 +203,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
             assert_eq!(ended.ended(2), "", "{command:?}");
         }
     }
-    // Nothing is at the usual place.
+    // There is no file at the default path.
     assert!(run(&["inspect"]).stderr.contains("there is no file"));
     run(&["history"]).ended(1);
     run(&["history", "--checkpoint", whole]).ended(0);
@@ -221,7 +221,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
     let used = run(&["params", &damaged, "--damaged"]).ended(0);
     assert_eq!(used, "\"one\": 1\n\"three\": 2");
 
-    // An append that was cut short is normal.
+    // An incomplete append is normal.
     let torn = make("torn.yaml", &bytes[..end - 3]);
     let text = run(&["verify", &torn]).ended(0);
     assert!(
@@ -242,7 +242,7 @@ fn no_name_commands_the_terminal() {
     });
     let text = Tool::rosrescue(&robot.scratch, robot.port(), &["inspect"]).ended(0);
     assert!(text.contains("31m") && !text.contains('\u{9b}'));
-    // In JSON the name stays what it is.
+    // In JSON the name is unchanged.
     let api = "http://127.0.0.1:9/";
     let call = params!["/node\u{9b}\u{202e}", "/topic", "std_msgs/String", api];
     robot.client().ok("registerPublisher", call);

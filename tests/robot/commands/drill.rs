@@ -26,7 +26,7 @@ fn drill(scratch: &Scratch, port: u16, options: &[&str]) -> Process {
     Process::start(format!("a drill {options:?}"), &mut command)
 }
 
-/// The verdict, and the exit status that goes with it.
+/// The verdict of a drill, with its exit status checked.
 #[track_caller]
 fn verdict(mut drill: Process) -> Value {
     let status = drill.wait_output().code();
@@ -47,7 +47,7 @@ fn assert_passed(verdict: &Value) {
     }
 }
 
-/// It has failed, and says so.
+/// Asserts that the drill failed, with these words.
 #[track_caller]
 fn assert_failed(verdict: &Value, words: &str) {
     assert_eq!(verdict["passed"], false, "{verdict:#}");
@@ -68,7 +68,7 @@ fn talkers(robot: &Robot) -> Vec<Node> {
 fn a_master_is_killed_and_nobody_notices() {
     let robot = Robot::start(Mode::Core);
     let nodes = talkers(&robot);
-    // Messages with numbers.
+    // Messages with sequence numbers.
     let mut log = ros_command(&robot.scratch, find_program("rostopic"), robot.port());
     log.args(["pub", "-r", "50", "/log", "rosgraph_msgs/Log", "{msg: hi}"]);
     let log = Process::start("a log", &mut log);
@@ -105,7 +105,7 @@ fn a_master_is_killed_and_nobody_notices() {
         assert!(topic["messages"].as_u64().unwrap() > 100, "{found:#}");
     }
     assert_eq!(found["nodes"], 4, "the talkers, the log and rosout");
-    // It has left nothing behind, not even in the state that the rescue keeps for `restore`.
+    // The drill has left nothing behind, not even in the state that the rescue keeps for `restore`.
     robot.await_state(&before, "after the drill");
     let mut kept = robot.rescue.checkpoint().to_owned().into_os_string();
     kept.push(".rescue-1");
@@ -199,7 +199,7 @@ fn it_fails_when_nobody_starts_the_master_again() {
     let found = verdict(drill(&robot.scratch, robot.port(), &options));
     assert_failed(&found, "2 s after the SIGKILL of the master");
     assert_eq!(found["kills"][0]["recovered_ms"], Value::Null);
-    // The mirror answered all the time, and nothing is left in it.
+    // The mirror answered all the time and has nothing left of the drill.
     assert_eq!(found["calls"]["reads"]["failed"], 0);
     assert_eq!(
         robot.client().ok("getSystemState", vec!["/test".into()]),
@@ -221,7 +221,7 @@ fn it_fails_when_the_state_is_not_the_same_but_not_for_what_nodes_change() {
     assert_passed(&found);
     let notes = found["notes"].to_string();
     assert!(
-        notes.contains("the parameter /robot/wheels has changed: somebody did so"),
+        notes.contains("the parameter /robot/wheels has changed: another program did that"),
         "{notes}"
     );
     let mut lost = drill(&robot.scratch, robot.port(), &["--yes", "--times", "1"]);
@@ -247,7 +247,7 @@ fn an_interrupted_drill_leaves_nothing_behind() {
         assert!(drill.stderr().join(" ").contains("cleaned up"));
         robot.await_state(&before, "after an interrupted drill");
     }
-    // One that is killed itself: the next takes its parameter away, a health check its registrations.
+    // After a drill that was killed itself, the next drill removes its parameter, and a health check its registrations.
     let mut killed = drill(
         &robot.scratch,
         robot.port(),
@@ -284,7 +284,7 @@ fn nothing_is_killed_without_consent_or_understanding() {
     assert!(nobody.stderr()[0].contains("no rosrescue at"));
 }
 
-/// A person at a terminal is asked.
+/// At a terminal the drill asks first.
 #[test]
 fn a_person_is_asked() {
     let robot = Robot::start(Mode::Core);

@@ -1,4 +1,4 @@
-//! `rosrescue handover`: what it makes of a rosrescue's answers.
+//! `rosrescue handover`: how it reacts to a rosrescue's answers.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -10,18 +10,18 @@ use serde_json::{Value as Json, json};
 
 use crate::support::{Mode, Robot, Tool, free_port, status};
 
-/// What a rosrescue of several computers says: pc-1 leads, until it is asked to hand over.
+/// A simulated rosrescue of several computers. pc-1 leads until it is asked to hand over.
 #[derive(Clone)]
 struct Story {
-    /// The status of a real one.
+    /// The status of a real rosrescue.
     status: Json,
     /// The answer to the request.
     answer: Reply,
-    /// Who leads after so many looks at the status since the request, with its term; nobody until then.
+    /// The leader and its term after so many status requests since the handover request. Until then there is none.
     next: Option<(usize, &'static str, u64)>,
 }
 
-/// Tells `story` at a port of its own, until the end of the test program.
+/// Serves `story` at a port of its own until the end of the test program.
 fn tell(story: Story) -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -35,7 +35,7 @@ fn tell(story: Story) -> u16 {
 }
 
 impl Story {
-    /// `looks`: 0 before the request.
+    /// Answers a request. `looks` counts the status requests, and is 0 before the handover request.
     fn serve(&self, stream: TcpStream, looks: &AtomicUsize) -> std::io::Result<()> {
         let mut stream = BufReader::new(stream);
         let mut first = String::new();
@@ -158,7 +158,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
         "{back}"
     );
     let other = ran(&done, Some((2, "pc-3", 8)), &["--to", "pc-2"]).ended(1);
-    assert!(other.contains("pc-3 leads now, and not pc-2"), "{other}");
+    assert!(other.contains("pc-3 leads now instead of pc-2"), "{other}");
     let nobody = ran(&done, None, &["--timeout", "1.2"]);
     assert!(
         nobody.stdout.contains("no computer leads after"),

@@ -1,4 +1,4 @@
-//! The checkpoints that are kept, and `history`.
+//! The kept checkpoints, and `history`.
 
 use std::fs;
 
@@ -21,7 +21,7 @@ fn names(robot: &Robot) -> Vec<String> {
     names
 }
 
-/// An orderly stop and a start: with `--restore never` it begins another session.
+/// Stops rosrescue cleanly and starts it again. With `--restore never` that begins another session.
 fn start_again(robot: &mut Robot) {
     assert!(robot.rescue.terminate().success());
     robot.rescue.start_again();
@@ -37,7 +37,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     }
     let kept = [3, 4, 5, 6, 7].map(|number| format!("session-{number}"));
     assert_eq!(names(&robot), [&["present".to_owned()][..], &kept].concat());
-    // Somebody with another home, as a service has, asks for the same.
+    // A user with another home folder, as a service has, gets the same answer.
     let elsewhere = Tool::rosrescue(&Scratch::new(), robot.port(), &["history", "--json"]);
     assert_eq!(elsewhere.json(0)["kept"].as_array().unwrap().len(), 6);
     // By name, and by number.
@@ -60,7 +60,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     eventually("the rescue is kept", || {
         names(&robot).contains(&"rescue-1".to_owned())
     });
-    // As the master died: before the dead node was unregistered.
+    // The state at the master's death, before the dead node was unregistered.
     let rescue = run(&robot, &["inspect", "rescue-1"]);
     assert!(rescue.contains("  /dead at http"), "{rescue}");
     eventually("the dead node is unregistered", || {
@@ -85,7 +85,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     let text = run(&robot, &["history"]);
     assert!(text.contains("restored in a rescue"), "{text}");
     assert_eq!(text.lines().count(), 2 * history(&robot).len());
-    // Only its owner may read them.
+    // Only the owner may read them.
     use std::os::unix::fs::PermissionsExt;
     for row in history(&robot) {
         let mode = fs::metadata(row["path"].as_str().unwrap())
@@ -105,11 +105,11 @@ fn a_history_of_no_space_is_the_last_session() {
         robot.crash_master();
         start_again(&mut robot);
     }
-    // Were one kept it would be there before the stop has ended.
+    // A kept checkpoint would exist before the stop has ended.
     assert_eq!(names(&robot), ["present", "session-2"]);
 }
 
-/// A large state is not written beside itself again and again.
+/// A large state must not fill the disk with copies.
 #[test]
 fn a_rescue_that_would_not_fit_is_not_kept() {
     let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--history", "1"]);

@@ -1,4 +1,4 @@
-//! `rosrescue check --live`: a subscriber that is not connected to a publisher of its topic is named.
+//! `rosrescue check --live` names a subscriber that is not connected to a publisher of its topic.
 
 use crate::support::{
     Client, Library, Mode, Robot, Tool, eventually, eventually_some, free_port, params, port_of,
@@ -21,7 +21,7 @@ fn a_link_that_was_broken_is_found_and_named() {
         let words = [&["check", "--live"], more].concat();
         Tool::rosrescue(&robot.scratch, robot.port(), &words)
     };
-    // Four of /chatter, and those of /rosout.
+    // Four connections of /chatter, and those of /rosout.
     eventually("all links are there", || {
         let checked = check(&[]);
         checked.exit() == 0 && checked.stdout.ends_with("No problems found.")
@@ -31,7 +31,7 @@ fn a_link_that_was_broken_is_found_and_named() {
     let count: u32 = seen.split(' ').next().unwrap().parse().unwrap();
     assert!(count >= 8, "{all}");
 
-    // rospy drops no link by itself, roscpp does.
+    // roscpp drops connections by itself, and rospy does not.
     let api = |node: &str| client.ok("lookupNode", params!["/test", node]);
     let node = Client::new(port_of(&client, "/listener_cpp"));
     let tell = |publishers| {
@@ -54,7 +54,7 @@ fn a_link_that_was_broken_is_found_and_named() {
     tell(vec![api("/talker_py"), api("/talker_cpp")]);
     eventually("the link is there again", || check(&[]).exit() == 0);
 
-    // One that does not answer is no missing link.
+    // A node without an answer is not reported as a missing connection.
     stop(nodes[0].pid());
     let checked = check(&[]).ended(0);
     assert!(

@@ -1,4 +1,4 @@
-//! `restore`: the parameters of a checkpoint for a running robot.
+//! `restore`: gives a running robot the parameters of a checkpoint.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -40,7 +40,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
         assert!(text.lines().any(|found| found == line), "{line}\n{text}");
     }
     assert_eq!(client.param("/gains/p"), Some(3.0.into()));
-    // Nobody is there to be asked.
+    // Without a terminal it cannot ask.
     let refused = run(&robot, &["restore", "session-1"]);
     assert!(refused.stderr.contains("--yes"), "{refused:?}");
     refused.ended(2);
@@ -60,7 +60,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
             .iter()
             .any(|update| update[1..] == params!["/gains/i/", 2])
     });
-    // The master behind has it, too.
+    // The real master has the value as well.
     assert_eq!(robot.bare().param("/gains/i"), Some(Value::from(2)));
 
     let json = run(
@@ -79,7 +79,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert!(text.ends_with("nothing to do"), "{text}");
 }
 
-/// The mirror takes it as it takes every write, and the next master is given it.
+/// The mirror answers the writes as usual, and the next master gets them.
 #[test]
 fn a_checkpoint_is_put_back_while_there_is_no_master() {
     let mut robot = Robot::start_for_outages(Mode::Core);

@@ -1,4 +1,4 @@
-//! `rosrescue status`: how the running one is, for a tired person and for a script.
+//! `rosrescue status`: shows the status, for people and for scripts.
 
 use std::io::{Read, Write};
 use std::net::TcpListener;
@@ -19,7 +19,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     assert!(good.stdout.starts_with("protected, since "), "{good:?}");
     assert!(good.stdout.contains("Nodes work as usual"), "{good:?}");
     assert!(good.stdout.lines().count() <= 10, "{good:?}");
-    // The page is the same.
+    // The page has the same text.
     let first = |text: &str| text.lines().nth(1).map(str::to_owned);
     assert_eq!(first(&page(&robot.client(), "/")), first(&good.stdout));
 
@@ -75,7 +75,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     );
 }
 
-/// Callers choose their names, which must not write to the terminal of a person who asks.
+/// Callers choose their names, which must not write control characters to a terminal.
 #[test]
 fn it_prints_no_commands_for_a_terminal() {
     let robot = Robot::start(Mode::Core);
@@ -129,7 +129,7 @@ fn a_newer_rosrescue_is_said_to_be_one() {
     );
 }
 
-/// A master that was never seen: nodes wait, and the status says what for.
+/// There was never a master. Nodes wait, and the status says so.
 #[test]
 fn it_says_that_nodes_wait_for_a_first_master() {
     let scratch = Scratch::new();

@@ -1,4 +1,4 @@
-//! `rosrescue top`: live on a terminal, in blocks elsewhere.
+//! `rosrescue top`: a live picture on a terminal, and plain text elsewhere.
 
 use std::process::Command;
 
@@ -6,8 +6,8 @@ use crate::support::{
     Mode, NODES, Process, Robot, Tool, behind, command, eventually, free_port, params,
 };
 
-/// What `rosrescue top` leaves on a terminal of `size` after `key` (or a signal's number): the last line of the script's
-/// verdict, and the pictures.
+/// The output of `rosrescue top` on a terminal of `size` after `key` or a signal's number: the last line of the
+/// script's verdict, and the pictures.
 fn on_terminal(robot: &Robot, key: &str, size: &str) -> (String, Vec<String>) {
     let mut python = Command::new("/usr/bin/python3");
     python

@@ -1,4 +1,4 @@
-//! `rosrescue wait`: start scripts go on when there is something to go on with.
+//! `rosrescue wait`: start scripts continue once its condition holds.
 
 use std::time::Instant;
 
@@ -61,7 +61,7 @@ fn it_ends_in_time_and_says_what_is_missing() {
     }
 }
 
-/// While the mirror stands in calls are answered, and there is no master.
+/// While the mirror stands in, calls are answered although there is no master.
 #[test]
 fn answers_are_not_a_master() {
     let mut robot = Robot::start(Mode::Proxy);

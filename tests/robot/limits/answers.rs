@@ -12,8 +12,8 @@ use crate::support::{
 const LARGE: usize = 5_000_000;
 /// Number of clients. Their answers take more than three times the memory that is available.
 const CLIENTS: usize = 90;
-/// Maximum memory that they may take, in MB: the 128 MB reserved for answers, plus the answers that are being
-/// made. It once was 240 MB.
+/// Most memory that these clients may use, in MB: the 128 MB reserved for answers, plus the answers that are being
+/// encoded. It once was 240 MB.
 const COST: u64 = (CLIENTS * LARGE / 1_000_000) as u64 * 2 / 3;
 
 in_both_modes!(large_answers_that_are_not_read_take_limited_memory_and_delay_no_other);
@@ -41,8 +41,8 @@ fn large_answers_that_are_not_read_take_limited_memory_and_delay_no_other(mode: 
         let start = Instant::now();
         assert_eq!(client.param("/small"), Some(1.into()));
         let small = start.elapsed();
-        // The call is repeated after a lost connection, as ROS clients do. What counts is that the answer
-        // arrives; how soon depends on how fast this build makes the answers for the others.
+        // Like ROS clients, the test repeats the call after a lost connection. Only the answer counts: how soon it
+        // arrives depends on how fast this build encodes the other answers.
         let answer = eventually_some("a large answer", || client.param("/large"));
         assert_eq!(answer.as_str().map(str::len), Some(LARGE));
         (small, start.elapsed())

@@ -88,7 +88,7 @@ fn a_long_multicall_is_answered_as_by_a_bare_master() {
         panic!("no list")
     };
     assert_eq!(results.len(), calls.len());
-    // Entries whose results depend on each other.
+    // Entries with results that depend on each other.
     let read = of("getParam", params!["/test", "/long"]);
     let unknown = of("no_such_method", params![]);
     let nested = Call::multicall([unknown.clone()]);
@@ -105,7 +105,7 @@ fn a_long_multicall_is_answered_as_by_a_bare_master() {
     assert_eq!(whole(&twins.behind), whole(&twins.bare));
 }
 
-/// What the dead master has answered is kept, and the rest is answered by the mirror.
+/// The parts that the dead master has answered are kept, and the mirror answers the rest.
 #[test]
 fn a_long_multicall_survives_the_death_of_the_master() {
     const COUNT: i32 = 5_000;

@@ -42,7 +42,7 @@ fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
 /// everything that it missed, and it notifies no node of that.
 #[test]
 fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
-    // Three seconds for what happens before the master counts as hung.
+    // Three seconds pass before the master counts as hung.
     let probes = [
         "--stand-in-after",
         "100",
@@ -66,7 +66,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     let injections = robot.counter("masters_restored");
 
     crate::support::stop(pid);
-    // This call is under way in the master, which has not run it.
+    // The master has received this call but not run it.
     let flying = thread::spawn({
         let client = client.clone();
         move || client.set_param("/flying", 1)
@@ -102,13 +102,13 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
             .last()
             .is_some_and(|it| *it == both)
     });
-    // Of what is out of date by then it need not be told.
+    // The node need not be told outdated values.
     eventually("the node is told of the last value", || {
         told(&node, "/standing").last() == Some(&(3, true))
     });
     let heard = told(&node, "/standing");
     assert!(heard.is_sorted(), "{heard:?}");
-    // With the verdict: until then the master may tell it.
+    // When the master counts as hung. Until then the master itself may tell the node.
     eventually("the node is told of what was under way", || {
         told(&node, "/flying").contains(&(1, true))
     });

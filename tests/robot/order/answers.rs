@@ -209,7 +209,7 @@ fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
     });
 }
 
-/// A node has asked and was answered, and the answer does not yet show the other node's change.
+/// A node has asked and was answered. The answer does not show the other node's change yet.
 struct Asked {
     subject: String,
     /// When the answer arrived.
@@ -217,7 +217,7 @@ struct Asked {
     text: String,
 }
 
-/// Two nodes, one that asks and one that changes.
+/// Two nodes: one asks, and one makes changes.
 struct Pair {
     master: Client,
     name: String,

@@ -1,5 +1,5 @@
-//! No value goes back: a node that is notified of a parameter again and again never hears an older value
-//! after a newer one, and finally hears the last one.
+//! A node that is notified of a parameter again and again never gets an older value after a newer one, and finally gets
+//! the last one.
 
 use std::thread;
 use std::time::Duration;

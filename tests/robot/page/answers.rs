@@ -1,4 +1,4 @@
-//! What the pages answer, without a browser.
+//! The answers of the pages, without a browser.
 
 use std::fs;
 use std::path::Path;
@@ -22,7 +22,7 @@ fn json(client: &Client, path: &str) -> Value {
     serde_json::from_slice(&page.body).unwrap()
 }
 
-/// Somebody who listens to `/events`.
+/// Connects a listener to `/events`.
 fn listen(port: u16) -> (Wire, Response) {
     let mut wire = Wire::connect("127.0.0.1", port).unwrap();
     wire.send(&request("GET /events HTTP/1.1", &[], b""))
@@ -72,7 +72,7 @@ fn a_browser_gets_the_page_and_curl_gets_text() {
     let (live, ready) = (get(&client, "/live", &[]), get(&client, "/ready", &[]));
     assert_eq!((live.code, ready.code), (200, 200));
     assert_eq!(get(&client, "/favicon.ico", &[]).code, 404);
-    // A page of another site, which could take the few places of listeners.
+    // A page of another site could take the few places for listeners.
     for path in ["/events", "/state.json"] {
         let refused = get(&client, path, &["Origin: http://evil.example"]);
         assert_eq!(refused.code, 403);
@@ -179,13 +179,13 @@ fn a_few_may_listen_and_hear_of_every_change() {
         "the rescue",
         &[r#""standing_in"#, r#""outcome":"injected""#],
     );
-    // One that leaves makes room.
+    // A listener that disconnects makes room.
     listeners.truncate(15);
     eventually("there is room again", || listen(robot.port()).1.code == 200);
     assert!(robot.rescue.terminate().success(), "nobody is waited for");
 }
 
-/// What is sent lies in the buffers of the kernel, which take hours of it.
+/// Events for them go into the kernel's buffers, which hold hours of them.
 #[test]
 fn listeners_that_never_read_do_not_keep_others_out() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
@@ -195,14 +195,14 @@ fn listeners_that_never_read_do_not_keep_others_out() {
     });
 }
 
-/// A dashboard with a metric that is not there shows nothing, and an alert never comes.
+/// A dashboard with a wrong metric shows nothing, and an alert with a wrong metric never fires.
 #[test]
 fn every_metric_of_the_examples_exists() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut robot = Robot::start(Mode::Core);
     robot.crash_master();
     let metrics = get(&robot.client(), "/metrics", &[]).text();
-    // Those of several computers are in the source only.
+    // The metrics of several computers are only in the source.
     let source = fs::read_to_string(root.join("src/status/metrics.rs")).unwrap();
     let mut seen = 0;
     for file in ["grafana/rosrescue.json", "prometheus/alerts.yaml"] {

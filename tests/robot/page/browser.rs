@@ -1,4 +1,4 @@
-//! The page in a real Chromium.
+//! Tests of the page in a real Chromium.
 
 use crate::support::{
     Browser, Client, FakeNode, Library, Mode, Robot, eventually, free_port, params, tree,
@@ -25,7 +25,7 @@ fn open(browser: &mut Browser, robot: &Robot) {
     );
 }
 
-/// Nothing was asked of another host, and nothing was complained of.
+/// Checks that the page asked no other host and reported no error.
 fn assert_clean(browser: &Browser, robot: &Robot) {
     assert_eq!(browser.complaints(), Vec::<String>::new());
     let own = format!("http://127.0.0.1:{}/", robot.port());
@@ -79,7 +79,7 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
         assert!(page.contains(shown), "{shown} in {page}");
     }
 
-    // As it happens.
+    // The page shows the outage at once.
     robot.take_master_away();
     browser.shows(
         "the mirror stands in",
@@ -146,7 +146,7 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
     assert_clean(&browser, &robot);
 }
 
-/// Registers a robot of `count` nodes that exist on paper only.
+/// Registers a robot of `count` nodes without processes.
 fn paper_robot(client: &Client, count: usize) {
     let parts = ["camera", "lidar", "arm", "base", "planner"];
     let name = |index: usize| format!("/{}/n{index}", parts[index % parts.len()]);
@@ -283,7 +283,7 @@ fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
     let markup = browser.js("document.documentElement.outerHTML");
     assert!(!markup.as_str().unwrap().contains(SECRET));
     assert_eq!(browser.js("window.hacked"), serde_json::Value::Null);
-    // A phone: nothing sticks out.
+    // On a phone nothing is wider than the screen.
     assert_eq!(browser.js("document.documentElement.scrollWidth"), 390);
     assert_clean(&browser, &robot);
 }

@@ -1,4 +1,4 @@
-//! The page's panel of several computers, in a real Chromium.
+//! Tests of the page's panel about several computers, in a real Chromium.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::support::{Browser, Client, Mode, Robot, request, status};
 
-/// The page of a real rosrescue, which is told `events` instead of its own. Until the end of the test program.
+/// Serves the page of a real rosrescue with `events` instead of its own events, until the end of the test program.
 fn page_with(client: Client, events: String) -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -49,7 +49,7 @@ fn relay(stream: TcpStream, client: &Client, events: &str) -> Option<()> {
     };
     stream.get_mut().write_all(answer.as_bytes()).ok()?;
     if first.contains(" /events ") {
-        // Until the browser goes.
+        // Ends when the browser disconnects.
         let _ = stream.read_to_end(&mut Vec::new());
     }
     Some(())
@@ -132,7 +132,7 @@ fn several_computers_are_listed_and_one_that_is_cut_off_is_loud() {
     }
     assert_eq!(browser.complaints(), Vec::<String>::new());
 
-    // One computer has no such panel.
+    // The page of a single computer has no such panel.
     browser.open(&format!("http://127.0.0.1:{}/", robot.port()));
     browser.shows(
         "the page is live",

@@ -98,7 +98,7 @@ fn another_process_at_the_port_counts_as_another_node() {
     assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
 }
 
-/// As with a client library that makes up process ids.
+/// Some client libraries make up process ids.
 #[test]
 fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut robot = Robot::start(Mode::Proxy);

@@ -52,7 +52,7 @@ fn a_node_that_can_be_reached_again_is_told_everything() {
     });
 }
 
-/// As a node of rosnodejs, which answers all other calls.
+/// A node of rosnodejs does so; it answers all other calls.
 #[test]
 fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);

@@ -1,4 +1,4 @@
-//! The death of rosrescue itself does not erase the history of the session.
+//! The session's history survives the death of rosrescue.
 
 use serde_json::Value;
 
@@ -59,7 +59,7 @@ fn rescues_before_a_death_of_rosrescue_are_still_reported(mode: Mode) {
         get.contains("\nrosrescue_worker_restarts_total 2\n"),
         "{get}"
     );
-    // An unregistered dead node is still dead on the page.
+    // A node that was unregistered as dead is still listed as dead on the page.
     let state = crate::support::page(&robot.client(), "/state.json");
     assert!(
         state.contains(r#""name":"/dead","health":"dead""#),

@@ -1,5 +1,5 @@
-//! Restarts of rosrescue itself: it adopts a living master, fills an empty one, restores from the file what
-//! still applies, and takes over a system that ran without it.
+//! Restarts of rosrescue itself. It adopts a living master, fills an empty one, restores from the file what still
+//! applies, and takes over a system that ran without it.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -244,7 +244,7 @@ fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     (rescue, port)
 }
 
-/// Starts a server on the port where our master was. `what` is what it does with each connection.
+/// Starts a server on the port where the master was. `what` says what it does with each connection.
 fn squat(port: u16, what: &'static str) {
     let listener = eventually_some("the port is free", || {
         TcpListener::bind(("127.0.0.1", port)).ok()

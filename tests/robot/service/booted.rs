@@ -259,7 +259,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
             .ends_with(" 7]\n")
     );
 
-    // Other options.
+    // The same with other options.
     let worker = robot.property("MainPID");
     robot.run(
         "sed -i 's/^# Written by/# Mine, not written by/' /etc/systemd/system/rosrescue.service",

@@ -102,7 +102,7 @@ fn install_is_idempotent_and_leaves_files_of_others_alone() {
     said(&rosrescue(&scratch, &other), 0);
     assert!(said(&rosrescue(&scratch, &other), 0).starts_with("nothing to change"));
     assert!(read(dropin).contains("rosrescue core -p 11399\n"));
-    // A file that somebody has taken over stays.
+    // A file that the user has made his own stays.
     fs::write(&service, "# mine\n").unwrap();
     let refused = said(&rosrescue(&scratch, &install), 1);
     assert!(

@@ -1,4 +1,4 @@
-//! The Debian package, in a Debian that debootstrap has just made, and under a systemd.
+//! The Debian package, in a new Debian made by debootstrap, and under a systemd.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};

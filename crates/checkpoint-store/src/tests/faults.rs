@@ -17,7 +17,7 @@ fn a_failing_disk_loses_only_records_that_were_reported_as_unprotected() {
                 let mut model = Model::default();
                 life(&fs, &mut model);
                 let context = format!("{fault:?} at operation {at}");
-                // Simulates a kill now: everything that was acknowledged is there.
+                // Simulates a kill now: everything acknowledged must be there.
                 let loaded = open(&fs.after_kill()).unwrap().1;
                 check(&model, loaded.as_ref(), model.acked, &context);
                 go_on(&fs.after_kill(), &context);
@@ -40,14 +40,14 @@ fn an_unprotected_store_reports_it_and_can_be_rearmed() {
         model.append(&mut store, 3);
         assert_eq!((model.acked, store.seq()), (2, 5));
         assert!(store.unprotected().unwrap().contains("latest-chkpt.yaml"));
-        // The store does not try that file again, and a new file does not work either.
+        // The store does not try that file again, and a new file fails as well.
         model.append(&mut store, 1);
         assert!(store.sync_job().is_none() && !store.wants_compaction());
         assert!(store.rearm(&model.checkpoint(store.seq())).is_err());
         assert!(store.unprotected().is_some());
         fs.disarm();
 
-        // While calls go on, records that come while the new file is written are in it.
+        // Records that come while the new file is written are in it.
         let job = store
             .begin_compaction(model.checkpoint(store.seq()))
             .unwrap();
@@ -66,7 +66,7 @@ fn an_unprotected_store_reports_it_and_can_be_rearmed() {
 
 #[test]
 fn record_numbers_from_an_unprotected_time_are_never_used_again() {
-    // Otherwise the previous generation's whole records of a failed batch would pass for new ones.
+    // Otherwise the undamaged records of a failed batch in the previous generation would count as new.
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -192,7 +192,7 @@ fn a_session_is_set_aside_completely_or_not_at_all() {
     }
 }
 
-/// rosrescue would never read a larger file again.
+/// rosrescue would refuse to read a larger file.
 #[test]
 fn a_file_that_would_become_too_large_is_rewritten() {
     let fs = SimFs::default();
@@ -229,8 +229,8 @@ fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
     assert!(fs.read(&names.path, 1 << 20).is_ok());
 }
 
-/// A loss of power just after a compaction can leave some records only in the previous generation. A start
-/// that is killed must not replace that file before the next generation is there.
+/// A loss of power just after a compaction can leave some records only in the previous generation. A start that is
+/// killed must not replace that file before the next generation is complete.
 #[test]
 fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
     let fs = SimFs::default();

@@ -8,7 +8,7 @@ fn path() -> &'static Path {
     Path::new(PATH)
 }
 
-/// Runs the check that the checkpointer runs in each round.
+/// Runs the check that the checkpointer makes in each round.
 fn check(store: &mut Store<SimFs>) {
     if let Some(job) = store.check_job() {
         let _ = store.checked(job.run());
@@ -26,8 +26,8 @@ fn started() -> (SimFs, Model, Store<SimFs>) {
     (fs, model, store)
 }
 
-/// Runs `check` on every disk that a crash at operation `at` may leave, and checks that the next start does
-/// not touch `kept`.
+/// Runs `check` on every disk that a crash at operation `at` may leave. Also checks that the next start does not touch
+/// `kept`.
 fn at_each_image(fs: &SimFs, at: usize, kept: &[u8], check: impl Fn(&SimFs, &str)) {
     let mut images = fs.after_power_loss(4_096);
     images.push(fs.after_kill());
@@ -40,7 +40,7 @@ fn at_each_image(fs: &SimFs, at: usize, kept: &[u8], check: impl Fn(&SimFs, &str
     }
 }
 
-/// The whole file with one byte changed.
+/// The complete file with one byte changed.
 fn changed(fs: &SimFs) -> Vec<u8> {
     let mut bytes = fs.read(path(), 1 << 20).unwrap();
     bytes[200] ^= 1;
@@ -95,7 +95,7 @@ fn any_change_of_the_file_by_another_process_is_noticed_and_repaired() {
     }
 }
 
-/// A process that looks at any moment finds one of the two.
+/// At any moment a process finds one of the two locks.
 #[test]
 fn a_removed_lock_file_is_replaced_before_the_old_one_is_closed() {
     let (fs, _, mut store) = started();
@@ -135,8 +135,8 @@ fn a_late_check_of_an_earlier_generation_is_ignored() {
     assert_eq!(store.unprotected(), None);
 }
 
-/// A file found at the path is kept, even if the process is killed in between or the power fails, and from
-/// the first new generation on the state is in a file at any moment.
+/// A file found at the path is kept, even if the process is killed meanwhile or the power fails. From the first new
+/// generation on, the state is always in a file.
 #[test]
 fn a_file_found_at_the_path_is_kept_whenever_a_crash_happens() {
     for at in 0.. {
@@ -226,7 +226,7 @@ fn an_unreadable_file_is_kept_and_the_previous_generation_is_restored() {
     }
 }
 
-/// Without a fallback nothing is known about the state, so nothing is changed.
+/// Without a previous generation nothing is known about the state, so nothing is changed.
 #[test]
 fn an_unreadable_file_without_a_previous_generation_is_left_alone() {
     let (fs, mut model, mut store) = started();

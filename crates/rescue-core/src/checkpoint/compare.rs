@@ -1,5 +1,4 @@
-//! Describes how two states of a master differ. The order of lists, which only a master's replies show, is
-//! ignored.
+//! Describes how two states of a master differ, without the order of lists, which only a master's replies show.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +11,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// The kind of thing that differs.
+/// The kind of the difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum What {
@@ -43,7 +42,7 @@ pub struct Difference {
 }
 
 impl Difference {
-    /// Describes the difference. The arguments are what to call A and B.
+    /// Describes the difference. The arguments are names for A and B.
     pub fn text(&self, [a, b]: [&str; 2]) -> String {
         let (name, node) = (&self.name, self.node.as_deref().unwrap_or_default());
         let (side, value) = match (&self.a, &self.b) {
@@ -110,7 +109,7 @@ pub fn compare(a: &Master, b: &Master, hide: &Hide) -> Vec<Difference> {
     found.found
 }
 
-/// Describes everything for which a node is registered, one registration per element.
+/// Describes all registrations of a node, one per element.
 pub fn registrations(master: &Master, node: &str) -> Vec<String> {
     let services = master
         .services_of(node)
@@ -130,7 +129,7 @@ pub fn registrations(master: &Master, node: &str) -> Vec<String> {
         .collect()
 }
 
-/// The name of a parameter, from the key under which it is subscribed.
+/// The parameter's name, from the key of a subscription.
 pub fn plain(key: &str) -> &str {
     match key {
         "/" => key,
@@ -229,7 +228,7 @@ impl Comparison<'_> {
             if entries[0] == entries[1] {
                 continue;
             }
-            // A node that is in only one state has already been listed with its services.
+            // A node that is only in one state has already been listed, with its services.
             let told = match entries {
                 [Some(entry), None] => !self.b.nodes.contains_key(&entry.node),
                 [None, Some(entry)] => !self.a.nodes.contains_key(&entry.node),
@@ -256,7 +255,7 @@ impl Comparison<'_> {
         for topic in topics {
             let [in_a, in_b] =
                 [&self.a, &self.b].map(|state| state.topic_types.get(&topic).cloned());
-            // A topic that is in use in only one state has already been listed with its nodes.
+            // A topic that is used only in one state has already been listed, with its nodes.
             let used = |state: &Snapshot| {
                 state.publishers.contains_key(&topic) || state.subscribers.contains_key(&topic)
             };
@@ -285,7 +284,7 @@ impl Comparison<'_> {
             Some(_) => None,
         };
         match (a, b, members(a), members(b)) {
-            // It is a namespace in at least one state, and is empty or absent in the other.
+            // It is a namespace in one state, and empty or absent in the other.
             (.., Some(a), Some(b)) => self.params(name, &a, &b),
             _ if a.is_some_and(|a| b.is_some_and(|b| same(a, b))) => {}
             _ => {

@@ -28,22 +28,21 @@ pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub use frame::{Framed, push_body, push_record, read_records, scan, seal};
 pub use rosparam::{for_rosparam, shown};
 
-/// Maximum nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512
-/// levels) below a parameter path of half as many names. rosmaster itself cannot return a value deeper than
-/// 492 levels.
+/// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512 levels) below a
+/// parameter path with half as many names. rosmaster itself cannot return a value deeper than 492 levels.
 pub const DEPTH_MAX: usize = 768;
 
-/// Everything that a restart needs to decide whether the session continues.
+/// The facts from which a restart decides whether the session continues.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Session {
-    /// Identifies the session. Used as roslaunch's `run_id`.
+    /// Identifies the session. It is also roslaunch's `run_id`.
     pub id: String,
     /// The boot id of the kernel when the session began.
     pub boot_id: String,
     /// Whether the session ended with a clean stop.
     pub closed: bool,
-    /// The part of the incarnation token that identifies the session: the `id` of the first session at this
-    /// checkpoint. See [`Token`](crate::replay::Token).
+    /// The part of the incarnation token that identifies the session: the `id` of the first session at this checkpoint.
+    /// See [`Token`](crate::replay::Token).
     pub mark: String,
     /// The master's address, if there has been a master.
     pub master_uri: Option<String>,
@@ -51,15 +50,15 @@ pub struct Session {
     pub started: String,
     /// The number of the master's incarnation, as in its token.
     pub incarnation: u64,
-    /// All pending writes up to and including this record have reached the master. The pending writes in a
-    /// snapshot count as having the number of its last record.
+    /// Number of the record up to which all pending writes have reached the master. Pending writes in a snapshot have
+    /// the number of its last record.
     pub delivered: u64,
     /// The port that nodes use. 0 if an earlier version wrote the session.
     pub port: u16,
-    /// The last term in which this computer was the leader of several. 0 if it never was.
+    /// The last term in which this computer led. 0 if it never did.
     pub term: u64,
-    /// The number of the last record in the etcd journal of that term whose effect this file holds. Each call
-    /// that follows has the next number. Lower if it is not known.
+    /// Number of the last record in etcd's journal of that term that this file contains. Each following call has the
+    /// next number. Lower if the number is unknown.
     pub cluster_seq: u64,
 }
 
@@ -84,40 +83,40 @@ impl Entry {
     }
 }
 
-/// One line of the journal.
+/// A line of the journal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// One more than the number of the previous record, across all generations of the file.
+    /// The number of the record. It grows by one with each record, across all generations of the file.
     pub seq: u64,
     pub entry: Entry,
 }
 
-/// A whole state and its place in the journal.
+/// A complete state and its position in the journal.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
-    /// The number of the last record whose effect `snapshot` contains. 0 if there was none.
+    /// Number of the last record in `snapshot`. 0 if there was none.
     pub seq: u64,
     pub session: Session,
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
     pub pending: Vec<Call>,
-    /// Nodes that must shut down and may not have been told yet.
+    /// Nodes that must shut down and may not have been told to.
     pub displaced: Vec<Displaced>,
 }
 
-/// The text of a checkpoint, and the stamp that its records must carry.
+/// The text of a checkpoint, and the stamp for its records.
 #[derive(Debug)]
 pub struct Encoded {
     /// The whole file up to its first record.
     pub bytes: Vec<u8>,
-    /// Ties the records that follow to these bytes.
+    /// Connects the records that follow to these bytes.
     pub stamp: Stamp,
 }
 
 /// Why a state or a record cannot be encoded.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum EncodeError {
-    /// A value is nested too deep to be read back.
+    /// A value is nested too deeply to be read back.
     #[error("a parameter is nested deeper than {limit} levels; it cannot be kept in a checkpoint")]
     TooDeep {
         /// [`DEPTH_MAX`].
@@ -128,10 +127,10 @@ pub enum EncodeError {
 /// Why a file cannot be read.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum DecodeError {
-    /// No part of it belongs to a checkpoint.
+    /// No part of the file belongs to a checkpoint.
     #[error("not a rosrescue checkpoint")]
     NotACheckpoint,
-    /// An intact file that a newer rosrescue wrote.
+    /// A newer rosrescue wrote the file, which is undamaged.
     #[error("written in checkpoint format {version}; this rosrescue knows up to {known}", known = FORMAT_VERSION)]
     NewerVersion {
         /// The format version in its first line.
@@ -152,10 +151,10 @@ pub enum SnapshotError {
         expected: u64,
         found: u64,
     },
-    /// The content differs from what was written.
+    /// The content is not what was written.
     #[error("the snapshot's check sum is {found:08x}, not {expected:08x}")]
     Checksum { expected: u32, found: u32 },
-    /// The bytes are what was written, but not a valid snapshot.
+    /// The content is what was written, but not a valid snapshot.
     #[error("the snapshot is complete but not valid: {why}")]
     Content { why: String },
 }
@@ -173,11 +172,11 @@ pub struct Damage {
 pub struct Decoded {
     /// The generation of the file. 0 if the first line is damaged.
     pub generation: u64,
-    /// The snapshot, if it is whole.
+    /// The snapshot, or why it cannot be used.
     pub checkpoint: Result<Checkpoint, SnapshotError>,
-    /// The whole records, in order.
+    /// The undamaged records, in order.
     pub records: Vec<Record>,
-    /// The bytes of an incomplete append at the end, if any.
+    /// The position of an incomplete append at the end.
     pub torn: Option<Range<usize>>,
     /// All other damage.
     pub damaged: Vec<Damage>,

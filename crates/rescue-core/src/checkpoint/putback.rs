@@ -1,4 +1,4 @@
-//! The changes that give a running master the parameters of a checkpoint.
+//! Computes the changes that give a running master the parameters of a checkpoint.
 
 use crate::{
     master,
@@ -9,21 +9,21 @@ use crate::{
 /// addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 
-/// A parameter of the checkpoint that is left out, and why.
+/// A parameter of the checkpoint that is left out, and the reason.
 pub type LeftOut = (String, String);
 
 /// The parameters to change.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Params {
-    /// Name, present value in the master, if any, and value in the checkpoint.
+    /// Name, present value in the master, and value in the checkpoint.
     pub set: Vec<(String, Option<Value>, Value)>,
-    /// Names of parameters that the checkpoint does not have.
+    /// Names of parameters that the checkpoint lacks.
     pub delete: Vec<String>,
     pub left_out: Vec<LeftOut>,
 }
 
 impl Params {
-    /// The changes that give `live` every parameter of `file`; with `exact` also the deletions that leave it no others.
+    /// The changes that give `live` every parameter of `file`. With `exact` they also delete all others.
     pub fn between(file: &Struct, live: &Struct, exact: bool) -> Self {
         let mut found = Self::default();
         found.below("", file, live, exact);
@@ -75,7 +75,7 @@ impl Params {
     }
 }
 
-/// Whether `key` can be one part of a parameter name.
+/// Whether `key` can be one part of a parameter's name.
 fn is_plain(key: &str) -> bool {
     !key.is_empty() && !key.contains('/')
 }

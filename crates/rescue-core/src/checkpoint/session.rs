@@ -1,6 +1,6 @@
-//! Decides whether the session of a checkpoint continues, or the robot has been switched on again.
+//! Decides whether a checkpoint's session continues, or whether the robot was switched on again.
 //!
-//! A robot that is switched on in the morning must not start with the parameters of yesterday.
+//! A robot that is switched on in the morning must not start with yesterday's parameters.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use crate::{
 /// When to restore a checkpoint at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Restore {
-    /// Restore it if the session continues: same boot and no clean stop, or a registered node is still alive.
+    /// Restore it if the session continues: there was no reboot and no clean stop, or a registered node is still alive.
     Auto,
     /// Always restore it.
     Always,
@@ -31,7 +31,7 @@ pub struct Evidence {
     pub node_alive: bool,
 }
 
-/// Whether to restore a checkpoint, with the reason as text.
+/// Whether to restore a checkpoint, and why.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     Restore(&'static str),
@@ -82,16 +82,16 @@ pub struct Rebuilt {
     pub session: Option<Session>,
     /// Writes that have not reached the master yet, in order.
     pub pending: Vec<Request>,
-    /// Nodes whose names were taken in the records or shortly before the snapshot, in the order of their
-    /// addresses. It is not known which of them were told to shut down.
+    /// Nodes whose names were taken in the records or shortly before the snapshot, ordered by address. It is unknown
+    /// which of them were told to shut down.
     pub displaced: Vec<Displaced>,
-    /// Why the snapshot was left out: no master can be in that state.
+    /// Why the snapshot was not used: its state is impossible for a master.
     pub trouble: Option<String>,
 }
 
 pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
     let mut rebuilt = Rebuilt::default();
-    // Each write with the number of its record, or of the snapshot.
+    // Each write with the number of its record, or of the snapshot's last record.
     let mut pending: Vec<(u64, Request)> = Vec::new();
     let mut displaced = BTreeMap::new();
     if let Some(checkpoint) = checkpoint {
@@ -157,7 +157,7 @@ mod tests {
         Record { seq, entry }
     }
 
-    /// The writes that still wait: those in a snapshot taken at record 5, and those in `records`.
+    /// The pending writes: those in a snapshot taken at record 5, and those in `records`.
     fn waiting(records: &[Record]) -> Vec<String> {
         let Entry::Call { call, .. } = write(4, true).entry else {
             unreachable!()
@@ -177,7 +177,7 @@ mod tests {
     fn pending_writes_wait_until_they_are_delivered() {
         let mut records = vec![write(6, false), write(7, true), write(8, true)];
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
-        // A session record that was written for another reason changes nothing.
+        // A session record written for another reason changes nothing.
         records.push(delivered(9, 3));
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
         // The pending writes in the snapshot have the number of its last record.
@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(waiting(&records), ["/p14"]);
     }
 
-    /// The number of the last call in the etcd journal, for a file with `records` after a snapshot of call 7.
+    /// Number of the last call in etcd's journal, for a file with `records` after a snapshot of call 7.
     fn cluster_seq(records: Vec<Record>) -> u64 {
         let mut checkpoint = Checkpoint::default();
         checkpoint.session.cluster_seq = 7;
@@ -214,7 +214,7 @@ mod tests {
         assert_eq!(cluster_seq(vec![write(1, false), write(2, true)]), 9);
         let records = vec![write(1, false), session(2, 8), write(3, false)];
         assert_eq!(cluster_seq(records), 9);
-        // Without the session's number the number of the calls after it is unknown.
+        // Without the session's number, the number of the following calls is unknown.
         let records = vec![write(1, false), session(2, 0), write(3, false)];
         assert_eq!(cluster_seq(records), 1);
     }
@@ -236,7 +236,7 @@ mod tests {
         assert_eq!(
             displaced.collect::<Vec<_>>(),
             [
-                // Listed once, with the topics that it had last.
+                // Listed once, with the latest topics.
                 ("http://n:1/", &vec!["/c".to_owned()]),
                 ("http://n:2/", &vec!["/a".to_owned()]),
             ]

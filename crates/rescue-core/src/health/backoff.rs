@@ -10,7 +10,7 @@ pub(super) struct Backoff {
 }
 
 impl Backoff {
-    /// Sets the first attempt to `next`, with a `pause` after it.
+    /// Schedules the first attempt at `next`, with a `pause` after it.
     pub(super) fn new(next: Instant, pause: Duration) -> Self {
         Self { next, pause }
     }

@@ -1,5 +1,4 @@
-//! Tells which registered nodes are alive, from evidence that can be collected without disturbing them. This
-//! is only reported, and decides nothing.
+//! Finds out which registered nodes are alive, without disturbing them. The result is only reported.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -10,23 +9,22 @@ use serde::Serialize;
 
 use super::Sign;
 
-/// Pause before a node is asked again. Shorter if the table of sockets shows that its process has ended.
+/// Pause before a node is asked again. It is shorter if the socket table shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
-/// Evidence older than this says nothing about the present.
+/// Age from which evidence no longer counts.
 const STALE: Duration = Duration::from_secs(120);
 
-/// What is known about whether a node is alive.
+/// Whether a node is alive, as far as known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Health {
     /// A process listens at the node's port, or the node has answered.
     Alive,
-    /// The node has not been asked yet, or not lately.
+    /// The node has not been asked, or not in the last two minutes.
     Unchecked,
-    /// The node does not answer and is not known to be dead. It stays registered.
+    /// The node does not answer, and there is no proof that it is dead. It stays registered.
     Unreachable,
-    /// The node's port refuses connections, or the node was found dead and unregistered and has not come
-    /// back.
+    /// The node's port refuses connections; or the node was unregistered as dead and has not come back.
     Dead,
 }
 
@@ -44,15 +42,15 @@ pub struct Liveness(BTreeMap<String, Port>);
 #[derive(Debug)]
 struct Port {
     seen: Option<Seen>,
-    /// When to ask the port next.
+    /// When to ask at the port next.
     next: Instant,
-    /// Whether the port is being asked right now.
+    /// Whether a question to the port is unanswered.
     asked: bool,
 }
 
 impl Liveness {
-    /// Returns the ports to ask now. `registered` are all ports that have nodes. `listens` tells whether a
-    /// process listens at a port; `None` if that is not known.
+    /// The ports to ask now. `registered` are all ports with nodes. `listens` says whether a process listens at a port;
+    /// `None` if that is unknown.
     pub fn round(
         &mut self,
         registered: &BTreeSet<String>,
@@ -75,8 +73,7 @@ impl Liveness {
             };
             match listens(name) {
                 Some(true) => port.note(Sign::Alive, now),
-                // The process has just ended, or the kernel forwards the port to another place. A connection
-                // shows which.
+                // The process has just ended, or the kernel forwards the port elsewhere. A connection shows which.
                 Some(false) if port.is_alive() => port.next = now,
                 _ => {}
             }
@@ -88,8 +85,7 @@ impl Liveness {
         due
     }
 
-    /// Notes the sign that a port has given when it was asked, if any. Returns whether it has just been found
-    /// dead.
+    /// Notes the answer from a port, if there was one. Returns whether the port has just been found dead.
     pub fn answered(&mut self, port: &str, sign: Option<Sign>, now: Instant) -> bool {
         let Some(port) = self.0.get_mut(port) else {
             return false;
@@ -120,8 +116,8 @@ impl Port {
 }
 
 impl Health {
-    /// The health of a node with this evidence about its port. `unreachable` is whether the node has failed
-    /// to answer the health check or a notification.
+    /// The health of a node with this evidence about its port. `unreachable` says whether the node left a health check
+    /// or a notification unanswered.
     pub fn of(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {
@@ -151,7 +147,7 @@ mod tests {
         let all = ports(&["here"]);
         let health = |liveness: &Liveness, now| Health::of(liveness.seen("here"), false, now);
         assert_eq!(health(&liveness, now), Health::Unchecked);
-        // The table of sockets has not been read yet.
+        // The socket table has not been read yet.
         assert_eq!(liveness.round(&all, |_| None, now), ["here"]);
         assert!(liveness.round(&all, |_| None, now).is_empty(), "once");
         assert!(!liveness.answered("here", Some(Sign::Alive), now));
@@ -193,7 +189,7 @@ mod tests {
         liveness.answered("far", Some(Sign::Alive), now);
         assert_eq!(health("far", &liveness, now), Health::Alive);
         assert_eq!(health("far", &liveness, now + STALE), Health::Unchecked);
-        // The result of the health check counts for more.
+        // The health check's result takes precedence.
         let seen = liveness.seen("far");
         assert_eq!(Health::of(seen, true, now), Health::Unreachable);
         liveness.round(&ports(&[]), |_| None, now);

@@ -6,18 +6,18 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Number of visits that a host may get at once. A recovery asks all nodes of a robot at the same time, and
-/// asks again soon after they have started; all of them may be on one computer.
+/// Number of visits that a host may get at once. A recovery asks all nodes of a robot at the same time, and asks again
+/// soon after they have started. All of them may be on one computer.
 const AT_ONCE: u32 = 400;
 /// Pause between further visits to the same host.
 const PAUSE: Duration = Duration::from_millis(10);
 /// Number of hosts to remember. If there are more, those without recent visits are forgotten.
 const HOSTS: usize = 1024;
 
-/// The visits to each host, limited by a leaky bucket per host (the generic cell rate algorithm).
+/// The visits to each host, limited by a leaky bucket for each host (the generic cell rate algorithm).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rates<K: Ord> {
-    /// When all visits so far would be over if there had been a pause before each.
+    /// When all visits so far would have ended with a pause before each.
     over_at: BTreeMap<K, Instant>,
     forget_at: usize,
 }
@@ -32,7 +32,7 @@ impl<K: Ord> Default for Rates<K> {
 }
 
 impl<K: Ord> Rates<K> {
-    /// Reserves one more visit to `host`. Returns when it may begin.
+    /// Reserves a visit to `host`, and returns when it may begin.
     pub fn reserve(&mut self, host: K, now: Instant) -> Instant {
         if self.over_at.len() >= self.forget_at {
             self.over_at.retain(|_, over_at| *over_at > now);
@@ -64,7 +64,7 @@ mod tests {
         let count = |until| waits.iter().filter(|wait| **wait <= until).count();
         assert_eq!(count(Duration::ZERO), 400);
         assert_eq!(count(Duration::from_secs(2)), 600);
-        // Another host has a limit of its own, and after a while this one may be visited at once again.
+        // Each host has its own limit, and after a while the first one may be visited at once again.
         assert_eq!(pauses(&mut rates, 2, 1, start), [Duration::ZERO]);
         let later = start + Duration::from_secs(20);
         let waits = pauses(&mut rates, 1, 401, later);

@@ -1,10 +1,9 @@
 //! Decides when rosrescue itself notifies nodes because the master's notifications may be late.
 //!
-//! rosmaster makes a list of publishers when something changes, but sends it only when one of its threads is
-//! free. If unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change
-//! itself, but no earlier than an undisturbed master would: if an old list from the master arrives after our
-//! newer one, roscpp nodes drop links until the next notification. Such a list may still come later, so our
-//! notification is repeated.
+//! rosmaster makes a list of publishers when something changes, but sends it only when one of its threads is free. If
+//! unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change as well. It does so no
+//! earlier than an undisturbed master would: if the master's older list arrived after the newer one, roscpp nodes would
+//! drop connections until the next notification. Such a list may still come later, so the notification is repeated.
 
 use std::{
     collections::BTreeMap,
@@ -22,11 +21,11 @@ const LATEST: Duration = Duration::from_millis(600);
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses between repeats double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after the last change it is still repeated: as long as two connection attempts of rosmaster
-/// without an answer take.
+/// How long after the last change its notification is repeated: the time of two connection attempts of rosmaster
+/// without an answer.
 const LIFE: Duration = Duration::from_secs(300);
 
-/// The subjects that have changed, and when the notification of each is due.
+/// The changed subjects, each with the time of its next notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Repeats<K: Ord> {
     of: BTreeMap<K, Wait>,
@@ -34,7 +33,7 @@ pub struct Repeats<K: Ord> {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
-    /// The time of the first change since the last notification, if there was one.
+    /// The first change since the last notification.
     untold: Option<Instant>,
     backoff: Backoff,
     end: Instant,
@@ -64,8 +63,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// The notifications that are due now. `holding_up` is whether there are unreachable nodes; without them
-    /// the master notifies nodes itself.
+    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. Without them the master
+    /// notifies nodes in time.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
@@ -110,7 +109,7 @@ mod tests {
         repeats.changed("/t", start);
         let mut told = Vec::new();
         while let Some(next) = repeats.next() {
-            // This goes on when all nodes answer again, because a thread of the master may still hang.
+            // The repeats continue when all nodes answer again, because a thread of the master may still hang.
             told.extend(repeats.due(next, told.is_empty()).iter().map(|_| next));
         }
         let times: Vec<_> = told.iter().map(|at| (*at - start).as_millis()).collect();

@@ -1,8 +1,8 @@
-//! Finds nodes that are gone because another node now uses their port. A port has one process behind it, so
-//! when a node registers with a port, any other node that is registered there is gone.
+//! Finds nodes that are gone because another node now uses their port. One process listens at a port, so when a node
+//! registers with a port, all other nodes registered there are gone.
 //!
-//! A master does not know that. When the old node starts again at another port, the master sends a `shutdown`
-//! to the old address, where an innocent node listens by then (ros_comm issue 2241).
+//! A master does not know that. When the old node starts again at another port, the master sends a `shutdown` to the
+//! old address, where an innocent node listens by then (ros_comm issue 2241).
 
 use std::collections::HashMap;
 
@@ -24,8 +24,8 @@ impl<'a> Holders<'a> {
         holders
     }
 
-    /// The nodes that lose their ports to `registrants`. If one call registers several names at one port,
-    /// that call itself says that they are one process.
+    /// The nodes that lose their ports to `registrants`. If one call registers several names at one port, they belong
+    /// to one process.
     fn displaced(&self, registrants: &[(&str, &str)]) -> Vec<&'a str> {
         let ports = registrants.iter();
         let holders = ports.flat_map(|(_, port)| self.0.get(port).map_or(&[][..], Vec::as_slice));
@@ -39,7 +39,7 @@ impl<'a> Holders<'a> {
     }
 }
 
-/// The nodes for which `call`, or an entry of it, registers something, and their ports.
+/// The nodes for which `call` or one of its entries registers something, with their ports.
 fn registrants(call: &Request) -> Vec<(&str, &str)> {
     let registrants = call.calls().into_iter().filter_map(Request::registrant);
     registrants
@@ -75,8 +75,8 @@ pub struct Eviction {
 }
 
 impl Eviction {
-    /// What must be unregistered before `call` because it takes ports from nodes of `mirror`. `None` if it
-    /// takes none. A registration that the master would refuse takes no port.
+    /// The eviction that must precede `call`, because it takes ports from nodes of `mirror`. `None` if it takes none. A
+    /// registration that the master would refuse takes no port.
     pub fn before(mirror: &Master, call: &Request) -> Option<Self> {
         first_taking(mirror, std::iter::once(call))?;
         let mut after = mirror.clone();
@@ -152,15 +152,15 @@ mod tests {
         let token_api = mirror.nodes().find(|(node, _)| Token::is_ours(node));
         let (_, token_api) = token_api.unwrap();
         for call in [
-            // The node itself, another port, another host, a refused call, the token, and a call that
-            // registers nothing.
+            // None of these takes a port: the node itself, another port, another host, a refused call, the token, and a
+            // call that registers nothing.
             publish("/old", "/u", "http://h:1/"),
             publish("/new", "/t", "http://h:10/"),
             publish("/new", "/t", "http://i:1/"),
             publish("/new", "", "http://h:1/"),
             publish("/new", "/t", token_api),
             Request::new(Method::GetParam, ["/new", "/t"]),
-            // One process that has two names registers both in one call.
+            // A process with two names registers both in one call.
             Request::multicall([
                 publish("/old", "/t", "http://h:1/"),
                 publish("/new", "/t", "http://h:1/"),
@@ -170,7 +170,7 @@ mod tests {
         }
     }
 
-    /// A node whose service was taken over leaves a reference, which a master never forgets.
+    /// A node whose service was taken over leaves a reference that a master never removes.
     #[test]
     fn the_reference_left_by_a_taken_over_service_is_removed_and_the_provider_keeps_the_service() {
         let mut mirror = master([

@@ -30,8 +30,7 @@ fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
     }
 }
 
-/// The verdicts on `/a` and `/b`, which are registered at one port. `/a` publishes `/ta`, `/b` publishes
-/// `/tb`.
+/// The verdicts on `/a` and `/b`, which are registered at one port. `/a` publishes `/ta`, and `/b` publishes `/tb`.
 fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<Verdict> {
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
@@ -62,11 +61,11 @@ fn a_different_process_id_means_another_node() {
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);
     // One process may have two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
-    // But the process may have been asked before it registered, under the name of the node before it.
+    // But the process may have been asked before it registered, under the name of its predecessor.
     let of_b = claims(&["/tb"], &[]);
     let both = verdicts([Some(2), Some(2)], 2, Some(&of_b));
     assert_eq!(both, [Another, Itself]);
-    // The process id counts for more than the topics: it is that node, whatever it has done since.
+    // The process id takes precedence over topics: it is that node, whatever it has changed since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
 }
@@ -84,7 +83,7 @@ fn matching_topics_count_for_more_than_a_changed_process_id() {
     assert_eq!(judge(std::slice::from_ref(&a), &all), [Verdict::Itself]);
     let some = ["/ta", "/other"];
     assert_eq!(judge(std::slice::from_ref(&a), &some), [Verdict::Another]);
-    // A node that came later to the port publishes the same topics.
+    // A later node at the port publishes the same topics.
     publish(&mut master.clone(), "/b", "/ta", "http://n:1/");
     let verdicts = judge(&[a, name("/b", Some(2), 2)], &all);
     assert_eq!(verdicts, [Verdict::Another, Verdict::Itself]);
@@ -130,7 +129,7 @@ fn different_topics_mean_another_node() {
         verdicts([None, None], 1, Some(&neither)),
         [Another, Another]
     );
-    // Neither topics that all nodes have nor an empty report are evidence.
+    // Common topics and an empty report are no evidence.
     let common = claims(&["/rosout"], &["/clock", "/tf"]);
     assert_eq!(verdicts([None, None], 1, Some(&common)), [Unknown, Unknown]);
     assert_eq!(verdicts([None, None], 1, None), [Unknown, Unknown]);
@@ -165,7 +164,7 @@ fn a_port_has_one_node_behind_it() {
         judge(&master, &names, Some(1), Some(&said))
     };
     assert_eq!(judge(1, 2), [Verdict::Another, Verdict::Itself]);
-    // A process that took a second name, or registrations in an unknown order: both nodes are kept.
+    // A process took a second name, or the order of registrations is unknown: both nodes are kept.
     assert_eq!(judge(2, 1), [Verdict::Unknown, Verdict::Itself]);
     assert_eq!(judge(0, 0), [Verdict::Unknown, Verdict::Itself]);
 }

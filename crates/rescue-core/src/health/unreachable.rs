@@ -1,4 +1,4 @@
-//! Keeps track of nodes that do not answer and are not known to be dead.
+//! Keeps track of nodes that do not answer although there is no proof that they are dead.
 
 use std::{
     collections::BTreeMap,
@@ -21,12 +21,12 @@ pub struct Unreachable {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
     backoff: Backoff,
-    /// Whether the port was due and has not answered yet.
+    /// Whether the question to the port is unanswered.
     asked: bool,
 }
 
 impl Unreachable {
-    /// Notes that a port has not answered. Returns whether it was reachable until now.
+    /// Notes that a port has not answered. Returns whether it was reachable before.
     pub fn add(&mut self, port: &str, now: Instant) -> bool {
         if let Some(wait) = self.of.get_mut(port) {
             if std::mem::take(&mut wait.asked) {
@@ -60,8 +60,8 @@ impl Unreachable {
         self.of.is_empty()
     }
 
-    /// The ports to ask now. A port is not returned again until it has been added again, so it is asked by
-    /// only one visit at a time, however long that visit is delayed. The pauses grow.
+    /// The ports to ask now. A port is returned again only after it was added again, so only one visit asks it at a
+    /// time. The pauses grow.
     pub fn due(&mut self, now: Instant) -> Vec<String> {
         let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
         let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);

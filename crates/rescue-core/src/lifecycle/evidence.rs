@@ -1,37 +1,35 @@
-//! Decides whether a master that does not answer hangs, from what the kernel shows of its process.
+//! Decides from what the kernel shows of a process whether a master that does not answer hangs.
 //!
-//! Silence alone is no evidence. On a busy computer a healthy master may get no processor time, or
-//! rosrescue gets none and its probes are late. A process that hangs has no use for the processor:
-//! it is stopped, or its threads get the processor when they want it, use little of it, and wait
-//! for something else.
+//! Silence alone proves nothing. On a busy computer a healthy master may get no processor time, or rosrescue gets none
+//! and its probes are late. A hung process does not need the processor: it is stopped, or its threads get processor
+//! time when they ask for it, use little of it, and wait for something else.
 
 use std::time::{Duration, Instant};
 
-/// Shortest time a silence must have been watched before it proves anything.
+/// Shortest time that a silent master must have been watched before there can be proof.
 pub const WATCHED_LEAST: Duration = Duration::from_millis(300);
-/// Shortest time a silence must have been watched if the process was not stopped.
+/// Shortest time that a silent master must have been watched if it was not stopped.
 const IDLE_LEAST: Duration = Duration::from_millis(900);
-/// A master that has used this much processor time since its last answer is in an endless loop.
+/// Processor time since the last answer from which on the master is in an endless loop.
 pub const BUSY_LIMIT: Duration = Duration::from_secs(30);
-/// A process that has used more than this fraction (1/n) of the time is busy. The threads of an
-/// idle rosmaster wake a hundred times a second and use 1/200 of the time, or 1/30 on a small
-/// computer.
+/// A process that has used more than this part (1/n) of the time is busy. The threads of an idle rosmaster wake a
+/// hundred times a second and use 1/200 of the time, or 1/30 on a small computer.
 const BUSY_PART: u32 = 10;
-/// A process is starved if its threads wait longer than this each time they want the processor. An
-/// answer takes some ten such turns.
+/// A process is starved if its threads wait longer than this each time they need the processor. An answer takes some
+/// ten such turns.
 const STARVED_WAIT: Duration = Duration::from_millis(10);
-/// A process that wants the processor and had fewer turns than this is starved, too.
+/// A process that needs the processor and got fewer turns than this is starved as well.
 const TURNS_LEAST: u64 = 5;
-/// If rosrescue itself has waited for the processor for more than this fraction (1/n) of the time,
-/// its probes had no fair chance.
+/// If rosrescue itself has waited for the processor for more than this part (1/n) of the time, its probes prove
+/// nothing.
 const UNFAIR_PART: u32 = 2;
 
 /// What the threads of a process and of its children do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
-    /// Whether a thread runs, or waits for the processor.
+    /// Whether a thread runs or waits for the processor.
     pub runnable: bool,
-    /// Whether a thread waits for a disk, and for nothing else.
+    /// Whether a thread waits for a disk, and no thread for anything else.
     pub on_disk: bool,
     /// Whether every thread was stopped, by SIGSTOP or a debugger.
     pub stopped: bool,
@@ -47,10 +45,9 @@ pub struct Effort {
 #[derive(Clone, Copy, Debug)]
 pub struct Sample {
     pub at: Instant,
-    /// What the master's threads do; none if the system does not show it.
+    /// What the master's threads do. `None` if the system does not show it.
     pub master: Option<Effort>,
-    /// How long rosrescue's own threads have waited for the processor, and how late its timers
-    /// were.
+    /// How long rosrescue's own threads have waited for the processor, plus the delay of its timers.
     pub own_wait: Duration,
 }
 
@@ -59,7 +56,7 @@ pub struct Sample {
 pub enum Verdict {
     /// The master hangs, or the system does not show what it does.
     Hung,
-    /// There is no proof that the master hangs, and why.
+    /// There is no proof that the master hangs, for this reason.
     Unproved(&'static str),
     /// The master has not been watched for long enough.
     Unknown,
@@ -70,13 +67,12 @@ pub enum Verdict {
 pub struct Evidence {
     /// The first sample since the last answer.
     silent: Option<Sample>,
-    /// The first sample of those that are judged.
+    /// The first sample that is judged.
     first: Option<Sample>,
     last: Option<Sample>,
-    /// The first of the latest consecutive samples in which the master was stopped and made no
-    /// progress.
+    /// The first of the latest consecutive samples in which the master was stopped and made no progress.
     stopped: Option<Sample>,
-    /// Whether any judged sample shows a thread that wants the processor.
+    /// Whether in any judged sample a thread needs the processor.
     runnable: bool,
     /// Whether any judged sample shows a thread that waits for a disk.
     on_disk: bool,
@@ -108,14 +104,13 @@ impl Evidence {
         self.last.map(|sample| sample.at)
     }
 
-    /// Forgets all samples, because the master has answered.
+    /// Drops all samples, because the master has answered.
     pub fn clear(&mut self) {
         *self = Self::default();
     }
 
-    /// Judges a master that has been silent during all samples. A master that has used the
-    /// processor for `busy_limit` without an answer hangs. After a verdict without proof only the
-    /// last sample and later ones are judged.
+    /// Judges a master that was silent during all samples. A master that has used the processor for `busy_limit`
+    /// without an answer hangs. After a verdict without proof, only the last sample and later ones are judged.
     pub fn judge(&mut self, busy_limit: Duration) -> Verdict {
         let verdict = self.verdict(busy_limit);
         if verdict != Verdict::Unknown
@@ -185,8 +180,7 @@ mod tests {
         Duration::from_millis(ms)
     }
 
-    /// An idle rosmaster after `at` milliseconds: what its threads and rosrescue's have done in
-    /// total.
+    /// An idle rosmaster after `at` milliseconds: the totals of its threads and of rosrescue's.
     fn idle(at: u64) -> (Effort, Duration) {
         let effort = Effort {
             ran: Duration::from_secs(1) + ms(at) / 200,
@@ -198,7 +192,7 @@ mod tests {
         (effort, ms(at) / 500)
     }
 
-    /// The verdict after samples at 0, 500 and 1,000 ms. `seen` changes what an idle master shows.
+    /// The verdict after samples at 0, 500 and 1,000 ms. `seen` changes the samples of an idle master.
     fn verdict(seen: impl Fn(u64, &mut Effort, &mut Duration)) -> Verdict {
         let start = Instant::now();
         let mut evidence = Evidence::default();
@@ -245,7 +239,7 @@ mod tests {
                 effort.turns = 0;
             };
             is_unproved(verdict(waits), "too little CPU time");
-            // Threads that look for work are runnable at times.
+            // Threads of an idle master are runnable from time to time.
             let found = verdict(|at, effort, _| effort.runnable = at == moment);
             assert_eq!(found, Verdict::Hung);
         }
@@ -259,7 +253,7 @@ mod tests {
         is_unproved(verdict(|_, effort, _| effort.on_disk = true), "disk");
         let found = verdict(|at, _, own| *own += ms(at) / 3 * 2);
         is_unproved(found, "rosrescue gets too little");
-        // Stopped and continued in turns: it is stopped in each sample, and runs in between.
+        // The master is stopped in each sample, and runs in between.
         for going_on in [500, 1000, 2000] {
             let found = verdict(|at, effort, _| effort.stopped = at != going_on);
             is_unproved(found, "part of the time");

@@ -1,20 +1,19 @@
-//! How long a write may wait for the master before the mirror answers it.
+//! Decides how long a write waits for the master before the mirror answers it.
 
 use std::{
     collections::VecDeque,
     time::{Duration, Instant},
 };
 
-/// Older false alarms do not count.
+/// How long a false alarm counts.
 const MEMORY: Duration = Duration::from_secs(60);
-/// Number of false alarms within [`MEMORY`] that change nothing. Each further one doubles the
-/// patience.
+/// Number of false alarms within [`MEMORY`] that change nothing. Each further one doubles the patience.
 const FREE: usize = 5;
 /// The longest patience.
 const LONGEST: Duration = Duration::from_secs(10);
 
-/// The patience with a slow master. It grows when the mirror stands in repeatedly for a master that
-/// was only late, and shrinks again when those times are a minute old.
+/// How long writes wait for a slow master. The time grows when the mirror often stands in for a master that was only
+/// late, and shrinks when those times are a minute old.
 #[derive(Clone, Debug)]
 pub struct Patience {
     base: Duration,
@@ -23,7 +22,7 @@ pub struct Patience {
 }
 
 impl Patience {
-    /// Creates a patience of `base` for a master that is mostly in time.
+    /// Creates a patience of `base`, for a master that is mostly in time.
     pub fn new(base: Duration) -> Self {
         Self {
             base,

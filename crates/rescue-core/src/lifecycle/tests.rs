@@ -11,7 +11,7 @@ const PROBING: Probing = Probing {
 };
 const START_LIMIT: Duration = Duration::from_secs(30);
 
-/// Drives the machine along a virtual clock.
+/// Runs the state machine on a virtual clock.
 struct Script {
     machine: Lifecycle,
     start: Instant,
@@ -43,13 +43,13 @@ impl Script {
         self.feed(Input::ConnectionLost, &[shut, Action::Connect])
     }
 
-    /// A master that listens is found to hold the state.
+    /// A master listens, and is found to hold the state.
     fn serve(&mut self, new: bool) -> &mut Self {
         self.feed(Input::Connected, &[Action::Examine])
             .feed(Input::Examined { new }, &[Action::OpenGate])
     }
 
-    /// Jumps to the next deadline, which must lie `pause` ahead.
+    /// Moves the clock to the next deadline, which must be `pause` ahead.
     fn wake(&mut self, pause: Duration, expected: &[Action]) -> &mut Self {
         let deadline = self.machine.deadline().expect("a deadline");
         assert_eq!(deadline - self.now, pause);
@@ -194,7 +194,7 @@ fn a_master_that_was_left_hanging_is_killed() {
         .feed(Input::Exited, &[Action::Spawn]);
 }
 
-/// A stopped process whose backlog of connections is full accepts no more.
+/// A stopped process accepts no more connections once its backlog is full.
 #[test]
 fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     let mut script = Script::new(Supervision::Ours);
@@ -225,7 +225,7 @@ fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     script.feed(Input::Unreachable, &[]);
 }
 
-/// Something else than a master answers at the port of our child.
+/// The server at the child's port is not a master.
 #[test]
 fn a_child_at_whose_port_there_is_no_master_is_replaced() {
     for answer in [Input::NotAMaster, Input::ConnectionLost] {
@@ -247,7 +247,7 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
             .feed(Input::Connected, &[Action::Examine])
             .feed(answer, &[Action::Kill])
             .feed(Input::Exited, &[Action::Spawn]);
-        // External masters are never given up.
+        // External masters are never replaced.
         let mut script = Script::new(Supervision::Theirs);
         script.feed(
             Input::Start {
@@ -347,7 +347,7 @@ fn a_child_whose_port_was_taken_is_replaced_at_once_and_is_no_death() {
     for _ in 0..DEATHS_AT_ONCE {
         take(&mut script, &[Action::Spawn]);
     }
-    // A program that takes each port in turn does not keep the processor busy.
+    // A program that takes each port in turn must not keep the processor busy.
     take(&mut script, &[]);
     script.wake(FIRST_PAUSE, &[Action::Spawn]);
     take(&mut script, &[]);
@@ -385,8 +385,8 @@ fn nothing_happens_after_a_stop() {
     assert_eq!(script.machine.deadline(), None);
 }
 
-/// A dying process accepts connections until its listening socket is closed, which comes last. A
-/// relay in front of a dead master accepts and closes them forever.
+/// A dying process accepts connections until it closes its listening socket, which comes last. A relay in front of a
+/// dead master accepts and closes connections forever.
 #[test]
 fn a_master_that_is_still_dying_dies_once() {
     let mut script = Script::serving(Supervision::Theirs);

@@ -7,20 +7,20 @@ use std::time::Duration;
 pub enum Supervision {
     /// rosrescue starts the masters.
     Ours,
-    /// Another program starts the masters; rosrescue waits for them.
+    /// Another program starts the masters, and rosrescue waits for them.
     Theirs,
 }
 
-/// How a hung master is distinguished from a slow one.
+/// How to tell a hung master from a slow one.
 #[derive(Clone, Copy, Debug)]
 pub struct Probing {
     /// Pause between an answered probe and the next.
     pub interval: Duration,
-    /// Number of probes missed in a row after which the master counts as hung.
+    /// Number of unanswered probes in a row after which the master counts as hung.
     pub count: u32,
     /// How long a write waits for the master before the mirror answers it.
     pub patience: Duration,
-    /// How long a spawned master may take to listen without making progress.
+    /// How long a new master may take to listen without making progress.
     pub start_limit: Duration,
 }
 
@@ -42,7 +42,7 @@ pub enum Input {
     Connected,
     /// Nothing listens at the master's address.
     Refused,
-    /// Another program listens at the port of the master that was spawned.
+    /// Another program listens at the port of the new master.
     PortTaken,
     /// The master's address cannot be reached, or does not answer in time.
     Unreachable,
@@ -57,11 +57,11 @@ pub enum Input {
     /// A write has waited for [`Lifecycle::patience`](super::Lifecycle::patience), and the mirror
     /// can answer it.
     Late,
-    /// The master has answered what was under way when it was [late](Self::Late).
+    /// The master has answered the calls that were outstanding when it was [late](Self::Late).
     LateAnswered,
-    /// The late master has received what the mirror answered meanwhile.
+    /// The late master has got the writes that the mirror answered meanwhile.
     CaughtUp,
-    /// The late master could not be given what it missed.
+    /// The late master could not get the writes that it missed.
     NotCaughtUp,
     /// The master holds the whole state.
     Examined {
@@ -94,7 +94,7 @@ pub enum Input {
 pub enum Cause {
     /// The master's connection ended: it died, or it closed an idle connection.
     ConnectionLost,
-    /// A thread of the master ended: the master is dying, or being stopped in order.
+    /// A thread of the master ended: the master is dying, or is being stopped.
     ThreadEnded,
     /// The master's process ended.
     Exited,
@@ -120,8 +120,8 @@ impl Cause {
     }
 }
 
-/// An action that the shell must carry out, in order. A new `Connect`, `Examine` or `CatchUp`
-/// cancels the step under way; a `Probe` does not.
+/// An action that the shell must carry out, in order. A new `Connect`, `Examine` or `CatchUp` cancels the present step.
+/// A `Probe` does not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or `Unreachable`.
@@ -129,15 +129,13 @@ pub enum Action {
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
-    /// Let no call pass.
+    /// Shut the gate: let no call pass.
     ShutGate(Cause),
-    /// Let the mirror answer until the master has answered what is under way. Result:
-    /// `LateAnswered`.
+    /// Let the mirror answer until the master has answered its outstanding calls. Result: `LateAnswered`.
     StandIn,
-    /// Give the late master what the mirror has answered meanwhile. Results: `CaughtUp` or
-    /// `NotCaughtUp`.
+    /// Send the late master the writes that the mirror has answered meanwhile. Results: `CaughtUp` or `NotCaughtUp`.
     CatchUp,
-    /// Let calls pass.
+    /// Open the gate: let calls pass.
     OpenGate,
     /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
     Probe,
@@ -147,8 +145,7 @@ pub enum Action {
     Kill,
     /// Report why a master that does not answer is not killed.
     Spare(&'static str),
-    /// Stop rosrescue: no master can be started, and there is no state to give to a later one.
-    /// Reporting the error is better than retrying forever.
+    /// Stop rosrescue with an error: no master can be started, and there is no state that a later master would need.
     GiveUp,
     /// Report a crash loop, with the number of deaths within a minute.
     ReportCrashLoop(usize),

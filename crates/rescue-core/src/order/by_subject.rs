@@ -1,4 +1,4 @@
-//! A collection that is looked up by subject.
+//! A collection with lookup by subject.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -7,7 +7,7 @@ use std::{
 
 use super::Subject;
 
-/// Things, filed under their subjects. A parameter is also found by the keys above and below its own key.
+/// Values by subject. A parameter is also found by the keys above and below its own.
 #[derive(Debug)]
 pub struct BySubject<T> {
     exact: HashMap<Subject, Vec<T>>,
@@ -51,7 +51,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         }
     }
 
-    /// The things that `subject` concerns.
+    /// The values under subjects that `subject` concerns.
     pub fn about<'a>(&'a self, subject: &'a Subject) -> impl Iterator<Item = T> + 'a {
         let (exact, key) = match subject {
             Subject::Param(key) => (None, Some(key.as_str())),
@@ -73,7 +73,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         all.flatten().copied()
     }
 
-    /// Whether `subject` concerns anything in this collection.
+    /// Whether `subject` concerns any value.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
     }

@@ -1,4 +1,4 @@
-//! The notifications that rosrescue has yet to send, in order for each node.
+//! The notifications that rosrescue still has to send, in order for each node.
 
 use std::{
     collections::{HashMap, HashSet, VecDeque},
@@ -9,27 +9,27 @@ use std::{
 use super::Subject;
 use crate::{health::port_of, master::Master, xmlrpc::Call};
 
-/// When more notifications than this wait for a node, it is told each subject only once, as it is at the time
-/// of sending.
+/// If more notifications than this wait for a node, it is told each subject only once, with the state at the time of
+/// sending.
 const QUEUE_MAX: usize = 256;
 
-/// The next thing to do for a node.
+/// What to do next for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Next {
     /// Send `call`, then report it by [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
     /// Ask again when something has changed, or at `until` at the latest.
     Wait { until: Option<Instant> },
-    /// Nothing waits. When there is something again, the port is among the [idle
+    /// No notification waits. When there is one again, the port is among the [idle
     /// ports](super::Order::take_idle_ports).
     Idle,
 }
 
-/// The notifications that wait, by port.
+/// The waiting notifications, by port.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     ports: HashMap<String, VecDeque<Notification>>,
-    /// Ports that have notifications waiting and no sender yet.
+    /// Ports with waiting notifications and no task that sends them.
     idle: Vec<String>,
 }
 
@@ -51,7 +51,7 @@ pub(super) struct Notification {
 }
 
 impl Notification {
-    /// Whether the notification tells the state at the time of sending.
+    /// Whether the notification contains the state at the time of sending.
     pub(super) fn is_state(&self) -> bool {
         !matches!(self.content, Content::Call(_))
     }
@@ -90,7 +90,7 @@ impl Outbox {
         self.ports.remove(port);
     }
 
-    /// Drops all notifications, but keeps their senders, which find nothing more to do.
+    /// Drops all notifications. Tasks that send them find nothing left to do.
     pub(super) fn clear(&mut self) {
         self.ports.values_mut().for_each(VecDeque::clear);
     }
@@ -105,7 +105,7 @@ impl Outbox {
         self.ports.get_mut(port)?.pop_front()
     }
 
-    /// The call to make to `port` for `notification`. `None` if it does not concern the node there any more.
+    /// The call to make to `port` for `notification`. `None` if the node there is no longer concerned.
     pub(super) fn call(
         &mut self,
         port: &str,
@@ -116,14 +116,14 @@ impl Outbox {
         if let Content::Call(call) = content {
             return Some(call);
         }
-        // Notifications that wait behind the present state are older than it.
+        // Waiting notifications about the same subject are older than the present state.
         let queue = self.ports.get_mut(port)?;
         renew(queue, |other| other.concerns(&subject));
         queue.retain(|other| other.subject != subject);
         state(mirror, port, &subject)
     }
 
-    /// Replaces the notifications to `port` about `subject` by the state at the time of sending.
+    /// Replaces the notifications to `port` about `subject` by one with the state at the time of sending.
     pub(super) fn renew(&mut self, port: &str, subject: &Subject) {
         if let Some(queue) = self.ports.get_mut(port) {
             renew(queue, |other| other.concerns(subject));
@@ -138,8 +138,7 @@ impl Outbox {
     }
 }
 
-/// Replaces the notifications about each accepted subject by a single one, which tells the state at the time
-/// of sending.
+/// Replaces the notifications about each accepted subject by a single one with the state at the time of sending.
 fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     let is_old = |it: &Notification| !it.is_state() && is_it(&it.subject);
     if !queue.iter().any(is_old) {
@@ -154,7 +153,7 @@ fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     });
 }
 
-/// The call that tells the node at `port` the state of `subject`. `None` if it does not subscribe to it.
+/// The call that tells the node at `port` the state of `subject`. `None` if the node does not subscribe to it.
 fn state(mirror: &Master, port: &str, subject: &Subject) -> Option<Arc<Call>> {
     let at = |api: &str| port_of(api) == port;
     match subject {

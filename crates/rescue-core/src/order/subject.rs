@@ -1,17 +1,16 @@
-//! The subjects about which nodes hear, and those that a call concerns.
+//! The subjects of calls and notifications.
 
 use crate::{
     health::port_of,
     master::{Master, Method, Request, names},
 };
 
-/// A subject about which a node can be told.
+/// A subject about which nodes are notified.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Subject {
     /// The publishers of a topic, given by its resolved name.
     Topic(String),
-    /// A parameter, given by its resolved key, which ends in a slash. It also concerns the keys above and
-    /// below.
+    /// A parameter, by its resolved key, which ends in a slash. News about it also concerns the keys above and below.
     Param(String),
     /// A node's own name. A node is shut down when another node takes its name.
     Name(String),
@@ -29,29 +28,29 @@ impl Subject {
     }
 }
 
-/// A subject about which the node at a port hears by an answer or a notification.
+/// A subject about which the node at a port is told, by an answer or a notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
-    /// Where the node listens; see [`port_of`].
+    /// The node's port; see [`port_of`].
     pub port: String,
     pub subject: Subject,
 }
 
-/// What a write has to do with the subjects about which nodes hear.
+/// The subjects of a write, and what it may tell nodes about them.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
-    /// The subjects of which the write may make a master notify nodes.
+    /// The subjects about which the master may notify nodes because of the write.
     tells: Vec<Subject>,
     /// The subjects about which the answer tells the caller.
     hears: Vec<Heard>,
-    /// Where the registering node listens; see [`port_of`].
+    /// The port of the node that registers; see [`port_of`].
     port: Option<String>,
-    /// Whether it may do anything, because it cannot be decoded.
+    /// Whether the call may change anything, because it cannot be decoded.
     anything: bool,
 }
 
 impl Concern {
-    /// The concern of a call. `None` stands for a call that could not be decoded.
+    /// The subjects of a call. `None` stands for a call that could not be decoded.
     pub fn of(call: Option<&Request>) -> Self {
         let Some(call) = call else {
             return Self {
@@ -100,7 +99,7 @@ impl Concern {
         self.port.get_or_insert_with(|| port.to_owned());
     }
 
-    /// The subjects of which the write may make a master notify nodes.
+    /// The subjects about which the master may notify nodes because of the write.
     pub fn tells(&self) -> &[Subject] {
         &self.tells
     }
@@ -109,7 +108,7 @@ impl Concern {
         self.anything
     }
 
-    /// For a subject that is a name, the port of the caller, because a node does not shut itself down.
+    /// For a subject that is a name, the caller's port: a call never shuts its own node down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),
@@ -122,7 +121,7 @@ impl Concern {
         self.hears.clone()
     }
 
-    /// All subjects that the write is about.
+    /// All subjects of the write.
     pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
         self.tells
             .iter()
@@ -130,7 +129,7 @@ impl Concern {
     }
 }
 
-/// The subjects about which the answer to a read tells the caller: parameters to which it subscribes. roscpp
+/// The subjects about which the answer to a read tells the caller: parameters to which the caller subscribes. roscpp
 /// uses the value that `getParam` returns until it is notified of a newer one.
 pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
     let of = |call: &Request| {

@@ -1,4 +1,4 @@
-//! Single situations. `write_queue/tests` runs nodes, masters and deaths at random.
+//! Tests of single situations. `write_queue/tests` runs random schedules with nodes, masters and deaths.
 
 use super::*;
 use crate::{
@@ -126,7 +126,7 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     let now = start + LEAD;
     let (list, number) = sent(order.next(now, A, &mirror));
     assert_eq!(list, update.params[2]);
-    // While it is under way, writes that would notify the node of something newer wait, but not forever.
+    // While the answer is on its way, writes that would notify the node of something newer wait, but not forever.
     assert!(holds(&mut order, now, &publish("/c", "/t")));
     assert!(!holds(
         &mut order,
@@ -163,7 +163,7 @@ fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
     let (first, number) = sent(order.next(now, A, &mirror));
     assert_eq!(first, lists[0]);
     order.taken(number);
-    // Another part of rosrescue asks for the present state, so the older notifications are left out.
+    // Another part of rosrescue asks for the present state, so older notifications are left out.
     order.tell_state(A, topic("/t"));
     order.begin(
         now,
@@ -222,8 +222,8 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     assert_eq!(list, mirror.publisher_update("/t").params[2]);
     order.taken(number);
     assert_eq!(order.next(later, A, &mirror), Next::Idle);
-    // After the master's death ours is sent at once. It is repeated, because the node may read what the
-    // master had sent later.
+    // After the master's death, rosrescue's notification is sent at once. It is repeated, because the node may read the
+    // master's later.
     order.told_by_master(later, &topic("/t"), 1);
     order.notify(A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
     let (_, number) = sent(order.next(later, A, &mirror));
@@ -236,7 +236,7 @@ fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     let (mut order, now) = (Order::default(), Instant::now());
     let number = begin(&mut order, now, &subscribe("/a", "/t"));
     order.sent([], vec![number]);
-    // In a batch the master only notifies of calls that came before the answered one, so the answer is newer.
+    // In a batch the master only notifies because of calls before the answered one, so the answer is newer.
     order.told_by_master(now, &topic("/t"), 1);
     order.settled();
     assert_eq!(order.next_repeat(), None);
@@ -245,7 +245,7 @@ fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     assert!(order.has_new_repeat());
     let late = now + RECENT;
     order.told_by_master(late, &topic("/t"), 1);
-    // The master's own notification counts as telling the state once more.
+    // The master's own notification takes the place of the repeat.
     assert_eq!(order.next_repeat(), None);
     assert_eq!(port_of("http://a:1/"), A);
 }
@@ -264,8 +264,7 @@ fn a_parameter_that_is_set_again_and_again_takes_no_more_memory() {
     assert_eq!(order.told.until(until, &param("/")), None);
 }
 
-/// Loggers subscribe to the same parameter again and again, also while the master is running a call of the
-/// same node.
+/// Loggers subscribe to the same parameter again and again, even while the master runs a call of the same node.
 #[test]
 fn a_node_does_not_wait_for_its_own_registrations() {
     let mut order = Order::default();

@@ -1,4 +1,4 @@
-//! Answers and notifications that are under way to nodes.
+//! Tracks answers and notifications on their way to nodes.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -7,13 +7,13 @@ use std::{
 
 use super::{BySubject, Heard, RECENT, Subject};
 
-/// The answers and notifications under way, by number, and the answers that were written lately.
+/// The answers and notifications on their way, by number, and the answers written recently.
 #[derive(Debug, Default)]
 pub(super) struct UnderWay {
     last: u64,
     entries: HashMap<u64, Entry>,
     by_subject: BySubject<u64>,
-    /// Answers that were written, the oldest first.
+    /// Written answers, oldest first.
     written: VecDeque<(Instant, u64)>,
 }
 
@@ -38,12 +38,12 @@ impl Entry {
     }
 }
 
-/// The last answer to a node about a subject.
+/// The state of the last answer to a node about a subject.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Answer {
-    /// It is under way and delays others until `limit`, if there is one.
+    /// The answer is on its way and delays others, until `limit` if that is set.
     UnderWay { limit: Option<Instant> },
-    /// It was written at this time, less than [`RECENT`] ago.
+    /// The answer was written at this time, less than [`RECENT`] ago.
     Written { at: Instant },
 }
 
@@ -90,7 +90,7 @@ impl UnderWay {
         }
     }
 
-    /// Forgets the answers that were written [`RECENT`] ago or longer.
+    /// Drops the answers that were written at least [`RECENT`] ago.
     pub(super) fn forget(&mut self, now: Instant) {
         while let Some((at, number)) = self.written.front()
             && now.duration_since(*at) >= RECENT
@@ -101,14 +101,13 @@ impl UnderWay {
         }
     }
 
-    /// Whether anything under way delays others, and until when.
+    /// Whether anything on its way delays others, and until when.
     pub(super) fn any(&self, now: Instant) -> Option<Option<Instant>> {
         let mut entries = self.entries.values();
         entries.find(|entry| entry.holds_up(now)).map(|it| it.limit)
     }
 
-    /// Whether anything about `subject` is under way to a port other than `port`, and until when it delays
-    /// others.
+    /// Whether anything about `subject` is on its way to a port other than `port`, and until when it delays others.
     pub(super) fn before(
         &self,
         now: Instant,
@@ -121,7 +120,7 @@ impl UnderWay {
         })
     }
 
-    /// Numbers and ports of everything about `subject` that is under way, or was written lately.
+    /// Numbers and ports of everything about `subject` that is on its way, or was written recently.
     pub(super) fn about(&mut self, now: Instant, subject: &Subject) -> Vec<(u64, String)> {
         self.forget(now);
         self.concerned(subject)
@@ -129,7 +128,7 @@ impl UnderWay {
             .collect()
     }
 
-    /// The last answer to the node at `port` about `subject`, if it is under way or was written lately.
+    /// The last answer to the node at `port` about `subject`, if it is on its way or was written recently.
     pub(super) fn answer_to(&self, now: Instant, port: &str, subject: &Subject) -> Option<Answer> {
         let to_port = self
             .concerned(subject)

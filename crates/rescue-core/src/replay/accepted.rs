@@ -1,10 +1,10 @@
-//! Which writes of a call a master has executed, and whether the mirror agrees.
+//! Finds out which writes of a call a master has executed, and whether the mirror agrees.
 
 use super::order;
 use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
 use crate::xmlrpc::{Reply, Value};
 
-/// A write that the master has answered. It may be an entry of a multicall.
+/// A write that the master has answered, perhaps as an entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Answered<'a> {
     pub call: &'a Request,
@@ -12,17 +12,17 @@ pub struct Answered<'a> {
     pub reply: Reply,
     /// Whether the write changed the master's state.
     pub executed: bool,
-    /// Whether the master's dictionaries have no order, as on Python 2.
+    /// Whether the master's dictionaries are unordered, as on Python 2.
     pub unordered: bool,
 }
 
 impl Answered<'_> {
-    /// Whether the mirror's answer to the same call means that both are in the same state and return the same
-    /// value. Two refusals agree, whatever their text.
+    /// Whether the mirror's answer to the same call shows that both have the same state and return the same value. Two
+    /// refusals agree, whatever their text.
     ///
-    /// `live`: the same request may have written parameters later. A `subscribeParam` may then return those
-    /// later values, because rosmaster encodes the dictionary itself, after all calls have run. By then a
-    /// value that could not be encoded may have been replaced, too.
+    /// `live` says that the same request may have written parameters later. A `subscribeParam` may then return the
+    /// later values: rosmaster encodes its own dictionary after all calls have run. By then a value that could not be
+    /// encoded may have been replaced as well.
     pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
@@ -42,20 +42,20 @@ impl Answered<'_> {
 /// All writes in a request that the master has answered, including those in nested multicalls.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Accepted<'a> {
-    /// In the order in which the master executed them.
+    /// The writes in the order in which the master executed them.
     pub calls: Vec<Answered<'a>>,
-    /// Whether this is certain. If not, the master's state must be read again.
+    /// Whether this list is certain. If not, the master's state must be read again.
     pub certain: bool,
 }
 
-/// The writes in `call` that the master has answered, according to its `reply`.
+/// The writes in `call` that the master has executed, according to its `reply`.
 ///
-/// A write has been executed if its answer has code 1. In a few cases rosmaster changes its state and answers
-/// an error nevertheless: to a `setParam` whose callbacks cannot be computed, and to a `subscribeParam` of a
-/// value that cannot be returned.
+/// A write has been executed if its answer has code 1. In a few cases rosmaster changes its state and still answers
+/// with an error: to a `setParam` whose callbacks cannot be computed, and to a `subscribeParam` of a value that cannot
+/// be returned.
 ///
-/// A multicall that fails as a whole has run up to the entry that failed. For such a call this returns what
-/// the state before the call, `mirror`, would have accepted, and marks it as not certain.
+/// A multicall that fails as a whole has run up to the entry that failed. For it, this returns what `mirror`, the state
+/// before the call, would have accepted, and marks the result as not certain.
 pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accepted<'a> {
     let mut walk = Walk {
         mirror,
@@ -72,7 +72,7 @@ pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accept
 
 struct Walk<'m, 'a> {
     mirror: &'m Master,
-    /// The mirror after the first `modelled` accepted calls. Made when first needed.
+    /// The mirror after the first `modelled` accepted calls. Created when it is first needed.
     model: Option<Master>,
     modelled: usize,
     accepted: Accepted<'a>,
@@ -137,8 +137,8 @@ impl<'a> Walk<'_, 'a> {
         }
     }
 
-    /// The model's answer to a call, after the calls accepted so far. The model is kept, because there may be
-    /// many multicalls to simulate.
+    /// The model's answer to a call, after the calls accepted so far. The model is kept, because many multicalls may
+    /// have to be simulated.
     fn predict(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
@@ -178,7 +178,7 @@ fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     })
 }
 
-/// Whether a fault is about encoding the reply rather than decoding the call.
+/// Whether a fault concerns the encoding of the reply, instead of the decoding of the call.
 pub(super) fn is_write_error(text: &str) -> bool {
     [
         "TypeError",
@@ -226,7 +226,7 @@ mod tests {
             .remove(0);
         assert!(of.agrees(&answer(1), true));
         assert!(!of.agrees(&answer(1), false));
-        // A value that could not have been encoded has been replaced by then.
+        // A value that could not be encoded has been replaced by then.
         let fault = |class: &str| Reply::Fault {
             code: 1,
             text: format!("<class '{class}'>:cannot marshal it"),
@@ -234,7 +234,7 @@ mod tests {
         assert!(of.agrees(&fault("TypeError"), true));
         assert!(!of.agrees(&fault("TypeError"), false));
         assert!(!of.agrees(&fault("Exception"), true));
-        // A `setParam` that has run and then failed has a message of its own.
+        // A `setParam` that has run and then failed has its own message.
         let failed = |text: &str| answer_with(0, &format!("Internal failure: {text}"));
         let set = set("/a", 1);
         let of = accepted(&Master::default(), &set, &failed("'x'"));
@@ -263,13 +263,13 @@ mod tests {
         master
     }
 
-    /// The calls that have been executed.
+    /// The executed calls.
     fn executed(accepted: Accepted<'_>) -> Vec<Request> {
         let executed = accepted.calls.into_iter().filter(|of| of.executed);
         executed.map(|of| of.call.clone()).collect()
     }
 
-    /// What is accepted of `call`, judging by the model's own answer.
+    /// The accepted writes of `call`, according to the model's own answer.
     fn of<'a>(master: &Master, call: &'a Request) -> Accepted<'a> {
         let reply = master.clone().apply(call).reply;
         accepted(master, call, &reply)
@@ -305,7 +305,7 @@ mod tests {
         assert!(!found.certain);
     }
 
-    /// The model must not be built again for each inner multicall: that would take hours.
+    /// The model must not be built again for each nested multicall: that would take hours.
     #[test]
     fn many_failing_multicalls_inside_a_long_one_are_judged_quickly() {
         let count = 20_000;

@@ -5,11 +5,11 @@ use indexmap::IndexMap;
 use crate::master::Master;
 use crate::xmlrpc::{Struct, Value};
 
-/// Maximum number of sentences.
+/// Most sentences.
 const SENTENCES_MAX: usize = 20;
 
-/// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if
-/// the two are equal. The sentences name keys, nodes and addresses, but never the value of a parameter.
+/// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if the two
+/// are equal. The sentences contain keys, nodes and addresses, but never a parameter's value.
 pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     let mut words = Words(Vec::new());
     let (a, b) = (mirror.registry(), master.registry());

@@ -1,4 +1,4 @@
-//! Reads the state of a master that may hold anything.
+//! Reads the state of a master without knowing anything about it.
 
 use std::collections::HashSet;
 
@@ -31,7 +31,7 @@ pub enum NotAMaster {
     Form { method: Method },
 }
 
-/// The state of a master as far as the first request of an inspection shows it.
+/// The part of a master's state that the first request of an inspection shows.
 #[derive(Clone, Debug)]
 pub struct Inspection {
     pid: i32,
@@ -46,7 +46,7 @@ pub struct Inspection {
 }
 
 impl Inspection {
-    /// The inspection of a rosmaster that has just been started as process `pid`, and so is empty.
+    /// The inspection of a new rosmaster, process `pid`, which is empty.
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
@@ -59,8 +59,7 @@ impl Inspection {
         }
     }
 
-    /// Puts everything that `mirror` has too into the mirror's order, for a master without an order of its
-    /// own.
+    /// Reorders everything that `mirror` also has as in the mirror. For a master with unordered dictionaries.
     pub fn arrange_like(&mut self, mirror: &Master) {
         let registry = mirror.registry();
         order::arrange(&mut self.publishers, &registry.publishers);
@@ -159,12 +158,12 @@ impl Inspection {
         self.pid
     }
 
-    /// The token that the master bears.
+    /// The token that the master has.
     pub fn bears(&self) -> Bears {
         self.bears
     }
 
-    /// Whether the master holds nothing that an inspection can show.
+    /// Whether the master holds nothing that an inspection would show.
     pub fn is_empty(&self) -> bool {
         self.publishers.is_empty()
             && self.subscribers.is_empty()
@@ -186,8 +185,8 @@ impl Inspection {
             .collect()
     }
 
-    /// The second request, for all addresses: `lookupNode` of each node of the inspection or of `previous`,
-    /// and `lookupService` of each service. `None` if there is nothing to ask for.
+    /// The second request, which asks for all addresses: `lookupNode` of each node of the inspection or of `previous`,
+    /// and `lookupService` of each service. `None` if there are neither.
     pub fn second_call(&self, previous: &Master) -> Option<Request> {
         let nodes = self.nodes(previous).into_iter();
         let nodes = nodes.filter_map(|node| lookup(Method::LookupNode, node));
@@ -198,16 +197,15 @@ impl Inspection {
         Some(Request::multicall(calls))
     }
 
-    /// The model of the master's state.
+    /// Builds a model of the master's state.
     ///
-    /// What a master does not show is taken from `previous`, for nodes whose address is unchanged: parameter
-    /// subscriptions, references to nodes whose services were taken over, and the parameters if they cannot
-    /// be read. Anything that vanished between the two requests is left out.
+    /// What a master does not show is taken from `previous`, for nodes whose address is the same: parameter
+    /// subscriptions, references to nodes whose services were taken over, and the parameters if they cannot be read.
+    /// Anything that vanished between the two requests is left out.
     ///
     /// # Errors
     ///
-    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not a master's
-    /// reply.
+    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not a master's reply.
     pub fn into_master(
         self,
         second: Option<&Reply>,
@@ -281,8 +279,8 @@ impl Inspection {
     }
 }
 
-/// For each node without a registration, adds the taken-over services that explain why the master still knows
-/// it. Drops the node if nothing does.
+/// Explains nodes without a registration: adds the taken-over services because of which the master still knows them.
+/// Drops a node without such a service.
 fn keep_references(found: &mut Snapshot, previous: &Master) {
     let shared = [
         &found.publishers,
@@ -307,8 +305,8 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
             };
             let known = previous.taken_over(caller_id, before).filter(lost);
             node.taken_over_services = known.cloned().collect();
-            // The master still knows it without a registration, so another node has taken over one of its
-            // services in the meantime.
+            // The master knows a node without a registration, so another node has taken over one of its services
+            // meanwhile.
             if node.taken_over_services.is_empty() && !held.contains(caller_id) {
                 let lost = before.services.iter().filter(lost);
                 node.taken_over_services = lost.cloned().collect();
@@ -330,7 +328,7 @@ fn only(
     lists.collect()
 }
 
-/// A lookup of `name`, if any call can name it.
+/// A lookup of `name`. `None` if no call can name it.
 pub(super) fn lookup(method: Method, name: &str) -> Option<Request> {
     let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
     Some(Request::new(method, [caller_id, name]))

@@ -1,17 +1,17 @@
-//! Compares masters whose dictionaries have no order, that is on Python 2. Their answers show an order that
-//! no call has determined, and that another master with the same state may not have.
+//! Compares masters with unordered dictionaries, as on Python 2. Their answers show an order that no call has
+//! determined, and that another master with the same state may not have.
 
 use indexmap::IndexMap;
 
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Puts `found` into the order of `known`. Whatever only `found` has comes last, in its own order.
+/// Reorders `found` as in `known`. Whatever only `found` has comes last, in its own order.
 pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<String, B>) {
     let place = |key: &str| known.get_index_of(key).unwrap_or(usize::MAX);
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
-/// Like [`arrange`], including the structs inside.
+/// Like [`arrange`], including nested structs.
 pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;
@@ -24,7 +24,7 @@ pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     }
 }
 
-/// Whether two replies are the same apart from the order of struct members.
+/// Whether two replies are equal apart from the order of struct members.
 pub(super) fn are_alike(a: &Reply, b: &Reply) -> bool {
     match (a, b) {
         (Reply::Value(a), Reply::Value(b)) => sorted(a, false) == sorted(b, false),
@@ -32,7 +32,7 @@ pub(super) fn are_alike(a: &Reply, b: &Reply) -> bool {
     }
 }
 
-/// `value` with the members of its structs sorted. With `lists`, also with lists of `[name, …]` sorted.
+/// `value` with the members of its structs sorted. With `lists`, lists of the form `[name, …]` are sorted as well.
 pub(super) fn sorted(value: &Value, lists: bool) -> Value {
     match value {
         Value::Struct(members) => {
@@ -98,7 +98,7 @@ mod tests {
         let of = |keys: &[&str]| Reply::Value(Value::Struct(tree(keys)));
         assert!(are_alike(&of(&["a", "b"]), &of(&["b", "a"])));
         assert!(!are_alike(&of(&["a", "b"]), &of(&["b", "c"])));
-        // Lists of nodes do have an order.
+        // Lists of nodes are ordered.
         let nodes = |names: [&str; 2]| Value::Array(names.map(Value::from).into());
         assert_ne!(
             sorted(&nodes(["/n", "/m"]), true),

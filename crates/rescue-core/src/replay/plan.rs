@@ -10,7 +10,7 @@ use super::{Token, order};
 use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
-/// Maximum number of mismatches in an error.
+/// Most mismatches in an error.
 const MISMATCHES_MAX: usize = 20;
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
@@ -44,8 +44,6 @@ const MISMATCHES_MAX: usize = 20;
 /// Call and answer are built as text. As values those of a thousand nodes would take ten times as much
 /// memory, and the C library keeps most of the memory of so many small allocations.
 ///
-/// the C library keeps most of the memory of so many small allocations.
-///
 /// # Example
 ///
 /// ```
@@ -65,7 +63,7 @@ const MISMATCHES_MAX: usize = 20;
 #[derive(Clone, Debug)]
 pub struct Plan {
     request: Bytes,
-    /// The body of the answer that a rosmaster is expected to give.
+    /// The answer's body that a rosmaster is expected to send.
     answer: Bytes,
     expected: Master,
     skipped: Vec<Skipped>,
@@ -77,7 +75,7 @@ pub enum Skipped {
     /// The node has another address in the new master.
     Node {
         caller_id: String,
-        /// Its address in the state to restore.
+        /// Its address in the restored state.
         api: String,
         /// Its address in the new master, which stays.
         found_api: String,
@@ -85,16 +83,16 @@ pub enum Skipped {
     /// The service has another provider in the new master.
     Service {
         service: String,
-        /// The provider in the state to restore.
+        /// The provider in the restored state.
         caller_id: String,
         /// The provider in the new master, which stays.
         found: String,
     },
-    /// The reference to a node that exists only because another node took over this service.
+    /// The reference to a node that exists only because another node has taken over this service.
     Reference { caller_id: String, service: String },
-    /// The type `*` of a topic that has no publishers, but has subscribers in the new master.
+    /// The type `*` of a topic that has no publishers, but subscribers in the new master.
     Type { topic: String },
-    /// A parameter that the master would accept but could not return, alone or together with the whole tree.
+    /// A parameter that the master would accept but could not return, alone or with the whole tree.
     Param { key: String },
     /// A registration under a key that no call can name.
     Unnameable { key: String, caller_id: String },
@@ -170,7 +168,7 @@ impl Plan {
         })
     }
 
-    /// With `empties`, everything is removed first.
+    /// Writes the calls. With `empties`, everything is removed first.
     fn write(
         target: &Master,
         found: &Master,
@@ -194,8 +192,8 @@ impl Plan {
         })
     }
 
-    /// Plans the calls that `bring` writes, for a master that holds `found`. `bring` returns the state
-    /// afterwards and what it has left out.
+    /// Plans the calls that `bring` writes, for a master that holds `found`. `bring` returns the resulting state and
+    /// what it has left out.
     fn sequence(
         found: &Master,
         before: Option<&Token>,
@@ -208,7 +206,7 @@ impl Plan {
             request.push(&call.into_entry());
             answer.push(&reply_entry(predicted));
         };
-        // A token is not part of the mirror. It subscribes to a key that is not set.
+        // A token is not part of the mirror: it is a subscription to a key that is not set.
         let aside = |call: Request| {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
@@ -239,7 +237,7 @@ impl Plan {
         &self.request
     }
 
-    /// The body of the answer, if rosmaster answers every entry as the model predicts.
+    /// The answer's body, if rosmaster answers every entry as the model predicts.
     pub fn answer(&self) -> &Bytes {
         &self.answer
     }
@@ -249,22 +247,22 @@ impl Plan {
         &self.expected
     }
 
-    /// The parts of the target that are not restored in the master.
+    /// The parts of the target that the plan leaves out.
     pub fn skipped(&self) -> &[Skipped] {
         &self.skipped
     }
 
-    /// Checks that every entry was answered as the model predicted; texts of refusals may differ. Not needed
-    /// if the reply equals [`Self::answer`] byte for byte.
+    /// Checks that every entry was answered as predicted. The text of a refusal may differ. Not needed if the reply
+    /// equals [`Self::answer`] byte for byte.
     ///
     /// # Errors
     ///
-    /// A sentence for each entry that was answered differently, at most 20. They contain no parameter values.
+    /// A sentence for each entry that was answered differently, at most 20, without parameter values.
     pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
         self.verify_by(reply, true)
     }
 
-    /// Like [`Self::verify`], for a master whose dictionaries have no order.
+    /// Like [`Self::verify`], for a master with unordered dictionaries.
     ///
     /// # Errors
     ///
@@ -311,8 +309,8 @@ impl Plan {
     }
 }
 
-/// Reads that show everything that a master in the target state can show, except for addresses that the same
-/// call has set.
+/// Reads that show everything that a master in the target state can show. Leaves out addresses that the same call has
+/// set.
 fn reads(model: &Master, found: &Master) -> Vec<Request> {
     let own = |method| Request::new(method, [CALLER_ID]);
     let mut calls = vec![own(Method::GetSystemState), own(Method::GetTopicTypes)];

@@ -1,4 +1,4 @@
-//! The state for a master that was unreachable and has come back.
+//! Computes the state for a master that could not be reached and is back.
 
 use super::{Token, restore};
 use crate::master::{Master, Method, Request, names};
@@ -7,17 +7,16 @@ use crate::xmlrpc::Value;
 /// Which side wins where the mirror and a master of the present incarnation differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
-    /// The mirror wins only where it has answered writes since both were equal. All other differences were
-    /// written directly to the master, or are missing in the checkpoint, and so are newer.
+    /// The mirror wins only where it has answered writes since mirror and master were last equal. All other differences
+    /// are newer in the master: they were written to it directly, or the checkpoint lacks them.
     PendingWrites,
-    /// The mirror wins wherever it has an entry, because the master was given the mirror's state and has not
-    /// confirmed it.
+    /// The mirror wins wherever it has an entry, because the master got the mirror's state and has not confirmed it.
     Mirror,
 }
 
-/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending` are the writes
-/// that the mirror has answered and the master may not have run. If the master has run some of them, running
-/// them again leads to the same state.
+/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending` are writes that the
+/// mirror has answered and the master may not have run. Writes that the master has already run may run again: the
+/// result is the same.
 pub fn reconcile(
     mirror: &Master,
     held: &Master,
@@ -38,12 +37,12 @@ pub fn reconcile(
     target
 }
 
-/// The part of a master's state that cannot be read back: the parameter subscriptions in `mirror`, and those
-/// that a pending write removes. The master must be of the present incarnation.
+/// The part of the present incarnation's state that cannot be read back: the parameter subscriptions in `mirror`, and
+/// those that a pending write removes.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        // Not if the node has another address now, because then its subscriptions have ended.
+        // A node with another address by now has no earlier subscriptions left.
         let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
         if *call.method() == Method::UnsubscribeParam
             && known.is_none_or(|known| call.text(1) == Some(known))
@@ -55,8 +54,7 @@ pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     master
 }
 
-/// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another address
-/// adds nothing.
+/// The calls that add to `mirror` what only `master` holds. A node that the mirror has at another address adds nothing.
 fn additions(mirror: &Master, master: &Master) -> Vec<Request> {
     let mut calls = Vec::new();
     let tree = restore::merged(mirror.params(), master.params());
@@ -206,7 +204,7 @@ mod tests {
         assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
     }
 
-    /// A call that is said to change nothing leaves an equal state.
+    /// If a call is said to change nothing, the state is equal afterwards.
     #[test]
     fn calls_that_would_change_nothing_are_recognised() {
         let watch = call("subscribeParam", &["/n", "http://n:1/", "k"]);

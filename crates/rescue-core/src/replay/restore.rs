@@ -1,4 +1,4 @@
-//! The calls of an injection, each tried on a model of the new master.
+//! Generates the calls of an injection, and tries each one on a model of the new master.
 
 use std::collections::HashMap;
 
@@ -19,12 +19,12 @@ pub(super) struct Restore<'a, W> {
     pub(super) skipped: Vec<Skipped>,
     target: &'a Master,
     found: &'a Master,
-    /// Number of the target's topic types that are in place.
+    /// Number of the target's topic types that the new master has so far.
     types_in: usize,
-    /// Whether the new master's topic types are the first ones of the target. If not, the target's order of
+    /// Whether the new master's list of topic types is a prefix of the target's. If not, the order of the target's
     /// types cannot be restored.
     ordered: bool,
-    /// Whether the target's topic types win over those of the new master, which then has no registrations.
+    /// Whether the target's topic types win over those of the new master. Then the new master has no registrations.
     types_win: bool,
 }
 
@@ -70,7 +70,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
         let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
-            // There is nothing to set, so even parameters that a master cannot return stay in place.
+            // There is nothing to set. So even parameters that a master cannot return stay.
             return;
         }
         let (tree, left_out) = returnable::writable(whole);
@@ -82,7 +82,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Notes which nodes are left out.
+    /// Notes the nodes that are left out.
     fn nodes(&mut self) {
         for (caller_id, api) in self.target.nodes() {
             if let Some(found_api) = self.found.api_of(caller_id)
@@ -108,8 +108,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         (free && !Token::is_ours(caller_id)).then_some(api)
     }
 
-    /// The nodes among `callers` that still have to be registered under `key`: caller id, name that leads to
-    /// `key`, address.
+    /// The nodes among `callers` that must still be registered under `key`: caller id, name that leads to `key`,
+    /// address.
     fn missing(
         &mut self,
         key: &'a str,
@@ -143,8 +143,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The type with which to register a topic. A type that the new master knows is kept, unless the target's
-    /// types win.
+    /// The type with which to register a topic. A type that the new master has stays, unless the target's types win.
     fn topic_type(&self, topic: &str) -> &'a str {
         let known = self.found.type_of(topic);
         let known = known.filter(|known| *known != "*" && !self.types_win);
@@ -184,8 +183,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Unregisters the new master's own subscribers of a topic, so that they are not notified of each
-    /// publisher separately.
+    /// Unregisters the new master's own subscribers of a topic, so that they are not notified of each publisher
+    /// separately.
     fn remove_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
         let found = self.found;
         let subscribers = found
@@ -244,8 +243,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Registers and unregisters a service if the target once had one, because a master that never had a
-    /// service answers `unregisterService` with another message.
+    /// Registers and unregisters a service if the target ever had one. A master that never had a service answers
+    /// `unregisterService` with a different message.
     fn had_services(&mut self) {
         if self.target.registry().had_services
             && !self.model.registry().had_services
@@ -260,8 +259,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.push(Method::UnregisterService, [helper, service, NO_API]);
     }
 
-    /// Whether a service has a provider in the new master. If so, the service and the nodes that provided it
-    /// before are left out.
+    /// Whether a service has a provider in the new master. If so, the service and its previous providers are left out.
     fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
         let Some(found) = self.found.registry().services.get(service) else {
             return false;
@@ -307,7 +305,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Like [`Self::lose`], for a service without a provider: finally a helper registers and unregisters it.
+    /// Like [`Self::lose`], for a service without a provider. At the end a helper registers and unregisters it.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
@@ -351,7 +349,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the types that come before the type of a topic that is about to be registered.
+    /// Adds the types that come before the type of the topic to be registered.
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
             && !self.model.topic_types().contains_key(topic)
@@ -361,8 +359,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the types `*` of topics without publishers. Only a publisher can set them, and it must register
-    /// before the subscribers, who would be notified of it.
+    /// Adds the types `*` of topics without publishers. Only a publisher can set them, and it must register before the
+    /// subscribers, which would be notified of it.
     fn star_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -373,8 +371,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Corrects the types of topics without publishers. Only a publisher can do that, and it must register
-    /// before the subscribers, who would be notified of it.
+    /// Corrects the types of topics without publishers. Only a publisher can do that, and it must register before the
+    /// subscribers, which would be notified of it.
     fn changed_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -396,7 +394,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.types_in = self.types_in.max(end);
     }
 
-    /// A caller id that no node has, and the name by which it reaches `key`.
+    /// A caller id that no node has, with the name by which it can register `key`.
     fn helper(&self, key: &str) -> Option<(String, String)> {
         let is_node = |caller_id: &str| {
             let nodes = [self.target, self.found].map(|master| &master.registry().nodes);
@@ -414,7 +412,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
-            // This is retried at the end, but listed only once.
+            // This is repeated at the end, but listed once.
             if !self.skipped.contains(&skipped) {
                 self.skipped.push(skipped);
             }
@@ -423,7 +421,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.set_type(topic, topic_type, is_star);
     }
 
-    /// Makes a helper register the topic, as a publisher or a subscriber, and unregister it again.
+    /// Registers the topic for a helper, as a publisher or a subscriber, and unregisters it again.
     fn set_type(&mut self, topic: &str, topic_type: &str, as_publisher: bool) {
         let Some((helper, name)) = self.helper(topic) else {
             return self.skip_unnameable(topic, HELPER);
@@ -437,8 +435,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 }
 
-/// The calls that empty a master that holds `found`, so that it can be given exactly `target`. Subscribers
-/// are removed first, so that they are not notified of the rest. Parameters stay if they are already right.
+/// The calls that empty a master that holds `found`, so that it can get exactly `target`. Subscribers are removed
+/// first, so that they are not notified of the rest. Parameters that are already right stay.
 pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));

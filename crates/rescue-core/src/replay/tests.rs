@@ -1,4 +1,4 @@
-//! Inspection and injection against the model of a master.
+//! Tests of inspection and injection against the model of a master.
 
 #[path = "../../../ros1-master/src/master/tests/calls.rs"]
 #[allow(dead_code, reason = "the tests of the model take the rest")]

@@ -1,13 +1,13 @@
-//! The incarnation token: left in a master in order to recognise that process again.
+//! The incarnation token, which rosrescue leaves in a master to recognise that process later.
 
 use crate::{
     master::{self, Method, Request},
     xmlrpc::Reply,
 };
 
-/// The namespace of tokens. It has no leading slash, so no node name and no parameter below `/` can be in it.
+/// The namespace of tokens. It has no leading slash, so it contains no node name and no parameter below `/`.
 const NAMESPACE: &str = "rosrescue/";
-/// The caller id of registrations that are undone at once.
+/// The caller id for registrations that are undone at once.
 pub(super) const HELPER: &str = "rosrescue/injection";
 /// An address that rosmaster accepts but never connects to, because `xmlrpc.client` refuses its scheme.
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
@@ -29,10 +29,10 @@ pub struct Token {
     number: u64,
 }
 
-/// Which token of a session a master bears.
+/// The token that a master has, compared with that of the present incarnation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bears {
-    /// The token of the incarnation asked for: the master has been brought to the whole state.
+    /// The token of the present incarnation: the master has the whole state.
     Present,
     /// The token of an earlier incarnation of the session.
     Earlier,
@@ -43,7 +43,7 @@ pub enum Bears {
 }
 
 impl Token {
-    /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII letters,
+    /// Creates the token of incarnation `number` in the session `id`. Characters of `id` other than ASCII letters,
     /// digits and `-` are replaced by `_`.
     pub fn new(id: &str, number: u64) -> Self {
         let safe = |c: char| {
@@ -61,7 +61,7 @@ impl Token {
         }
     }
 
-    /// The calls that leave the token in a master. The one with the incarnation's number comes last.
+    /// The calls that set the token in a master. The one with the incarnation's number comes last.
     pub fn leave(&self) -> [Request; 2] {
         let session_api = format!("{NO_API}/{}", self.number);
         [(&self.session, session_api.as_str()), (&self.name, NO_API)]
@@ -73,19 +73,19 @@ impl Token {
         subscription(Method::UnsubscribeParam, &self.name, NO_API)
     }
 
-    /// The call that looks up the incarnation's number. Its answer has code 1 if the number is there.
+    /// The call that looks up the incarnation's number. The answer has code 1 if the master has it.
     pub fn lookup(&self) -> Request {
         lookup(&self.name)
     }
 
-    /// The call that looks up the session.
+    /// The call that looks up the session's part of the token.
     pub(super) fn lookup_session(&self) -> Request {
         lookup(&self.session)
     }
 
-    /// What a master bears, from its answers: `number` is whether [`Self::lookup`] found the token, `session`
-    /// is the address that [`Self::lookup_session`] returned. If that address has no number, an earlier
-    /// version of rosrescue left it, and the master is not a later one.
+    /// The token that a master has. `number` says whether [`Self::lookup`] found the number, and `session` is the
+    /// address that [`Self::lookup_session`] returned. An address without a number was left by an earlier version of
+    /// rosrescue, so that master is not a later incarnation.
     pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
         let later = session
             .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())
@@ -98,7 +98,7 @@ impl Token {
         }
     }
 
-    /// Whether this reply to [`Self::lookup`] means that the token is there.
+    /// Whether this reply to [`Self::lookup`] says that the master has the token.
     pub fn is_found(reply: &Reply) -> bool {
         master::is_success(reply)
     }

@@ -1,4 +1,4 @@
-//! What to do with a master that was examined: the table in `docs/architecture.md` (Recovery, 4).
+//! Decides what to do with an examined master, as in the table in `docs/architecture.md` (Recovery, 4).
 
 use super::{Authority, Bears};
 
@@ -7,13 +7,12 @@ use super::{Authority, Bears};
 pub enum Known {
     /// Nothing is known.
     Nothing,
-    /// If it bears the token, this process has already served calls with it.
+    /// If the master has the token, this process has already let calls pass to it.
     ServedIfPresent,
-    /// If it bears the token, it has been injected but its state was never confirmed.
+    /// If the master has the token, the state was injected but not confirmed.
     InjectedIfPresent,
-    /// This process has just started it on a free loopback port, as the successor of a master that it served.
-    /// So it is empty, and it is not read before the injection; reading back afterwards would show if it was
-    /// not empty.
+    /// This process has just started the master on a free loopback port, as the successor of a master that it served.
+    /// So it is empty, and is not read before the injection. Reading it afterwards would show if it was not empty.
     New {
         /// Its process id.
         pid: i32,
@@ -25,18 +24,18 @@ pub enum Known {
 pub enum Treatment {
     /// Begin a session: master and mirror are both empty.
     Begin,
-    /// Give it the mirror's state in addition to what it holds.
+    /// Add the mirror's state to what the master holds.
     Inject,
-    /// Take over its state into the mirror, which is empty.
+    /// Copy the master's state into the mirror, which is empty.
     TakeOver,
-    /// Replace everything that it holds by the mirror's state.
+    /// Replace everything that the master holds by the mirror's state.
     Replace,
-    /// Give it what [`reconcile`](super::reconcile) makes of its state, the mirror and the pending writes.
+    /// Combine the master's state, the mirror and the pending writes with [`reconcile`](super::reconcile).
     Reconcile(Authority),
 }
 
-/// Decides what to do with a master that bears `bears`. A master that bears the present token, has been
-/// served and has missed no write goes on as it is and does not come here.
+/// Decides what to do with a master that has the token `bears`. Not called for a master that can continue unchanged,
+/// because it has the present token, has been served and has missed no write.
 pub fn treatment(
     bears: Bears,
     known: Known,
@@ -47,14 +46,14 @@ pub fn treatment(
         (Bears::Nothing, _) if !mirror_is_empty => Treatment::Inject,
         (Bears::Nothing, _) if master_is_empty => Treatment::Begin,
         (Bears::Nothing, _) => Treatment::TakeOver,
-        // A session that has just begun knows nothing that could replace the master's state.
+        // A new session has no state that could replace the master's.
         (Bears::Earlier, Known::Nothing) if mirror_is_empty => Treatment::TakeOver,
-        // Another incarnation has succeeded this one, so the mirror is newer than anything it holds.
+        // A later incarnation has been served, so the mirror is newer than everything in this master.
         (Bears::Earlier, _) => Treatment::Replace,
         // The checkpoint is older than this master, or another rosrescue has a copy of it.
         (Bears::Later(_), Known::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
         (Bears::Later(_), _) => Treatment::Replace,
-        // It has run every write of the checkpoint that is not pending, and possibly more.
+        // It has run all writes of the checkpoint that are not pending, and perhaps more.
         (Bears::Present, Known::Nothing | Known::ServedIfPresent) => {
             Treatment::Reconcile(Authority::PendingWrites)
         }

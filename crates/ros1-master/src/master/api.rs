@@ -13,9 +13,9 @@ pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 pub(crate) enum Failure {
     /// A check refused a parameter. The text is the message of the answer.
     Refused(String),
-    /// rosmaster raises a `TypeError`, which it answers with code -1. The text is our own.
+    /// rosmaster raises a `TypeError`, which it answers with code -1. The text is not rosmaster's.
     Type(&'static str),
-    /// rosmaster raises another exception, which it answers with code 0. The text is our own.
+    /// rosmaster raises another exception, which it answers with code 0. The text is not rosmaster's.
     Internal(&'static str),
 }
 
@@ -45,8 +45,7 @@ struct Spec {
 
 const MULTICALL: &str = "system.multicall";
 
-/// The public attributes of `ROSMasterHandler` with their Python types. rosmaster takes their names for
-/// methods.
+/// The public attributes of `ROSMasterHandler` with their Python types. rosmaster also treats their names as methods.
 const ATTRIBUTES: [(&str, &str); 11] = [
     ("done", "bool"),
     ("param_server", "ParamDictionary"),
@@ -155,8 +154,8 @@ pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Applied {
     pub reply: Reply,
-    /// The callbacks, in the order in which the master queues them. It sends callbacks to one address one
-    /// after another, and callbacks to different addresses at the same time.
+    /// The callbacks, in the order in which the master queues them. It sends callbacks to one address one after the
+    /// other, and to different addresses at the same time.
     pub notices: Vec<Notice>,
 }
 
@@ -182,7 +181,7 @@ impl Master {
         Applied { reply, notices }
     }
 
-    /// Like [`Master::apply`], but passes the callbacks to `notices`, which copies only what it needs.
+    /// Like [`Master::apply`], but passes the callbacks to `notices`, which can avoid copies.
     pub fn apply_telling(&mut self, request: &Request, notices: &mut dyn NoticeSink) -> Reply {
         let result = match request.method() {
             Method::Multicall => self.run_multicall(request.entries(), notices),
@@ -197,8 +196,8 @@ impl Master {
         }
     }
 
-    /// The result of a read, if rosmaster would give the same result byte for byte. `None` for any other
-    /// call, and where rosmaster's wording may differ.
+    /// The result of a read, if rosmaster would give the same result byte for byte. `None` for any other call, and if
+    /// rosmaster's text may differ.
     pub fn exact_answer(&mut self, read: &Request) -> Option<Value> {
         if self.is_inexact() {
             return None;
@@ -219,8 +218,8 @@ impl Master {
             .validate_and_run(spec, read.params(), &mut ())
             .ok()
             .filter(|(_, _, value)| *value != Value::Nil)?;
-        // A node that only subscribes to parameters may have registered without rosrescue seeing it, and no
-        // other read shows such a node.
+        // A node that only subscribes to parameters may have registered without rosrescue's knowledge. No other read
+        // shows such a node.
         let hidden = *read.method() == Method::LookupNode && code != 1;
         let in_some_order = self.unordered && shows_order(read.method(), &value);
         (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))

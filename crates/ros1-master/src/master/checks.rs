@@ -67,8 +67,8 @@ pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<St
     }
 }
 
-/// rosmaster's `valid_type_name('topic_type')`. rosmaster also accepts a date whose text is `*`, and keeps it
-/// as a date; here it becomes a string.
+/// rosmaster's `valid_type_name('topic_type')`. rosmaster also accepts a date whose text is `*`, and keeps it as a
+/// date. Here it becomes a string.
 pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     match value {
         Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),

@@ -6,11 +6,10 @@ use super::{Master, Method, Request, names};
 const GONE_SERVICE: &str = "rosrpc://127.0.0.1:1";
 
 impl Master {
-    /// The calls that make a master forget a node completely.
+    /// The calls that make a master drop a node completely.
     ///
-    /// If another node has taken over a service of this node, rosmaster keeps a reference to the node. To
-    /// remove that, the node takes the service back and unregisters it, and then the other node's service is
-    /// registered again.
+    /// If another node has taken over a service of this node, rosmaster keeps a reference to the node. To remove it,
+    /// the node takes the service back and unregisters it. Then the other node's service is registered again.
     pub fn forget_calls(&self, caller_id: &str) -> Vec<Request> {
         let mut calls = self.unregister_calls(caller_id);
         let Some(node) = self.registry.nodes.get(caller_id) else {
@@ -23,7 +22,7 @@ impl Master {
                 let params = [&entry.node, &name, &entry.api, self.api_of(&entry.node)?];
                 Some(Request::new(Method::RegisterService, params))
             });
-            // Only if it can be given back to the other node afterwards.
+            // This is only possible if the service can be given back to the other node.
             if let Some(name) = names::name_for(service, caller_id)
                 && again != Some(None)
             {

@@ -263,7 +263,7 @@ impl Master {
             checks::topic_type(topic_type)?,
             checks::api("caller_api", api)?,
         );
-        // It is a date, which rosmaster keeps as one.
+        // This is a date, and rosmaster keeps it as a date.
         self.inexact |= topic_type.as_str().is_none();
         Ok(params)
     }

@@ -54,8 +54,8 @@ impl Master {
         Ok(Value::Array(results))
     }
 
-    /// Whether the answers to all reads of a multicall fit into about `most` bytes of memory. Makes each
-    /// answer and drops it again. Other calls always fit.
+    /// Whether the answers to all reads of a multicall fit into about `most` bytes of memory. Creates each answer and
+    /// drops it again. Other calls always fit.
     pub fn fits(&mut self, request: &Request, mut most: usize) -> bool {
         if *request.method() != Method::Multicall {
             return true;
@@ -72,7 +72,7 @@ impl Master {
         })
     }
 
-    /// Notes where the result shows a dict of the parameter tree itself.
+    /// Notes where the result contains a dict of the parameter tree itself.
     fn watch(&mut self, request: &Request, result: Option<&Value>, at: &[usize]) {
         let (key, subscribes) = match request.method() {
             Method::GetParam => (request.text(1), false),

@@ -54,8 +54,8 @@ impl Notice {
     }
 }
 
-/// Receives callbacks as the master queues them. Arguments are borrowed, because one change may go to
-/// thousands of nodes, each time with a large value. By default callbacks are ignored.
+/// Receives callbacks as the master queues them. Arguments are borrowed, because one change may go to thousands of
+/// nodes, each time with a large value. The default methods ignore the callbacks.
 pub trait NoticeSink {
     /// Receives a [`Notice::PublisherUpdate`] for each address in `to`.
     fn publisher_update(&mut self, _to: &[String], _topic: &str, _publishers: &[String]) {}

@@ -6,10 +6,10 @@ use super::registry::Registrations;
 use super::updates::{GONE, Update, updates};
 use crate::xmlrpc::{Struct, Value};
 
-/// Number of levels of the tree that are kept. rosmaster accepts any depth, through long keys or deep values,
-/// and cannot return more than 491 levels at once. Deeper parts are kept as nil, which bounds recursion over
-/// the tree, including when it is dropped. rosmaster does return deeper parts for a key that leads close
-/// enough to them, but they could not be injected into another master anyway.
+/// Number of levels of the tree that are kept. rosmaster accepts any depth, through long keys or deep values, but
+/// returns at most 491 levels at once. Deeper parts are kept as nil, which limits recursion over the tree, including
+/// when it is dropped. rosmaster does return deeper parts for a key that leads close enough to them, but such parts
+/// could not be injected into another master anyway.
 const DEEPEST_TREE: usize = 512;
 
 #[derive(Clone, Default)]
@@ -17,7 +17,7 @@ pub(crate) struct Params {
     tree: Struct,
     /// Whether anything below [`DEEPEST_TREE`] was left out.
     cut: bool,
-    /// The results of the current multicall that are dicts of the tree itself; see [`Live`].
+    /// The results of the running multicall that are dicts of the tree itself; see [`Live`].
     live: Vec<Live>,
 }
 
@@ -83,8 +83,8 @@ impl Params {
         Some(found)
     }
 
-    /// rosmaster's `set_param`, for a key with a trailing slash. The tree changes even if the updates cannot
-    /// be computed. The updates leave out `ignored`.
+    /// rosmaster's `set_param`, for a key with a trailing slash. The tree changes even if the updates cannot be
+    /// computed. The node `ignored` gets no updates.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
@@ -233,7 +233,7 @@ impl Params {
         });
     }
 
-    /// The dicts noted during the multicall, with their values at its end and their places in its result.
+    /// The dicts noted during the multicall, with their values at its end and their positions in its result.
     pub(crate) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
         let live = std::mem::take(&mut self.live);
         live.into_iter()
@@ -247,7 +247,7 @@ impl Params {
             .collect()
     }
 
-    /// Keeps the values of the noted dicts at `path` and below before they leave the tree.
+    /// Keeps the values of the noted dicts at `path` and below, because they will be removed from the tree.
     fn detach(&mut self, path: &[&str]) {
         let mut live = std::mem::take(&mut self.live);
         for entry in &mut live {
@@ -274,7 +274,7 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
     }
 }
 
-/// Whether an element of a list equals `name`, as Python compares them.
+/// Whether a list's element equals `name`, as Python compares them.
 fn is(name: &str) -> impl Fn(&Value) -> bool {
     move |value| matches!(value, Value::String(text) | Value::DateTime(text) if text == name)
 }
@@ -289,7 +289,7 @@ fn is_deeper(value: &Value, levels: usize) -> bool {
     }
 }
 
-/// Replaces arrays and structs that lie more than `levels` deep by nil.
+/// Replaces arrays and structs that are more than `levels` deep by nil.
 fn cut(value: Value, levels: usize) -> Value {
     match value {
         Value::Array(_) | Value::Struct(_) if levels == 0 => Value::Nil,

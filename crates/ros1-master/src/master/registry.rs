@@ -15,7 +15,7 @@ pub(crate) enum Shared {
     ParamSubscribers,
 }
 
-/// A reference to a node. rosmaster forgets a node as soon as it has no registration left.
+/// A reference to a node. rosmaster drops it when the node has no registration left.
 #[derive(Clone, Default, PartialEq)]
 pub struct Node {
     /// The address of its slave API.
@@ -107,8 +107,7 @@ impl Registry {
         bumped
     }
 
-    /// Like [`Registry::register`], for a service. The node that provides it so far loses it but keeps a
-    /// reference.
+    /// Like [`Registry::register`], for a service. The previous provider loses the service but keeps a reference.
     pub(crate) fn register_service(
         &mut self,
         service: &str,
@@ -127,8 +126,8 @@ impl Registry {
         bumped
     }
 
-    /// The reference to a node. If the address differs, this is a new node of the same name, and all
-    /// registrations of the old one are removed.
+    /// The reference to a node. With a different address, this is a new node of the same name, and all registrations of
+    /// the old one are removed.
     fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
         let mut bumped = None;
         if let Some(node) = self.nodes.get_mut(caller_id)

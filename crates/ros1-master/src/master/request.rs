@@ -5,8 +5,8 @@ use std::borrow::Cow;
 use super::{Kind, Method};
 use crate::xmlrpc::{self, Call, DecodeError, Value};
 
-/// Maximum nesting of multicalls that is parsed. A decoded document cannot hold more, because each multicall
-/// takes three of its levels.
+/// Deepest nesting of multicalls that is parsed. A decoded document cannot contain more, because each multicall takes
+/// three of its levels.
 const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 
 /// One more parameter than any method takes.
@@ -39,10 +39,10 @@ pub struct Request {
 pub enum Entry {
     /// An entry that can be run.
     Request(Request),
-    /// An entry that is answered with a fault of its own, with this text.
+    /// An entry that is answered with a fault with this text.
     Refused(&'static str),
-    /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is
-    /// always the last one. The text is rosmaster's if it starts with `<`, otherwise our own.
+    /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is always the
+    /// last one. The text is rosmaster's only if it starts with `<`.
     Malformed(Cow<'static, str>),
 }
 
@@ -147,9 +147,9 @@ impl Request {
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror can answer this call without a master, because only one answer is possible. It
-    /// cannot answer `shutdown`, errors whose text depends on the Python version, and a method that rosmaster
-    /// exports by accident and that does more than answer.
+    /// Whether the mirror can answer this call without a master, because only one answer is possible. It cannot answer
+    /// `shutdown`, errors whose text depends on the Python version, or a method that rosmaster exports by accident and
+    /// that has an effect.
     pub fn is_answerable(&self) -> bool {
         match &self.method {
             Method::Multicall => self.entries.iter().all(|entry| match entry {
@@ -186,7 +186,7 @@ impl From<Call> for Request {
     }
 }
 
-/// A malformed entry of a multicall becomes nil.
+/// Converts a call. A malformed entry of a multicall becomes nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
         let mut params = request.params;
@@ -260,9 +260,8 @@ impl Entry {
     }
 }
 
-/// The elements that Python finds when it iterates over a value: the characters of a string, the keys of a
-/// struct. Of these only as many are returned as decide the outcome of the call. `None` if Python cannot
-/// iterate over the value.
+/// The elements that Python finds when it iterates over a value: the characters of a string, or the keys of a struct.
+/// Returns only as many as the outcome of the call depends on. `None` if Python cannot iterate over the value.
 fn items(value: Value) -> Option<Vec<Value>> {
     match value {
         Value::Array(elements) => Some(elements),

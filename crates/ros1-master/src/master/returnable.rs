@@ -1,4 +1,4 @@
-//! Which parameter values a master can return. It accepts values that `xmlrpc.client.dumps` cannot encode.
+//! Finds out which parameter values a master can return. It accepts values that `xmlrpc.client.dumps` cannot encode.
 
 use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
 
@@ -22,7 +22,7 @@ fn error_within(value: &Value, depth: usize) -> Option<&'static str> {
     }
 }
 
-/// Whether a reply can hold this value where `levels` more levels of nesting are allowed.
+/// Whether a reply can contain this value where `levels` more levels of nesting are allowed.
 fn is_returnable(value: &Value, levels: usize) -> bool {
     error_within(value, MAX_REPLY_DEPTH - levels).is_none() && !holds_markup(value)
 }
@@ -40,8 +40,8 @@ fn holds_markup(value: &Value) -> bool {
     }
 }
 
-/// Maximum nesting of a namespace in the tree when a multicall returns the tree, which then lies inside the
-/// lists of the result, the entry and the answer.
+/// Deepest nesting of a namespace that a multicall can return with the whole tree. The lists of the result, the entry
+/// and the answer take the other levels.
 const DEEPEST_NAMESPACE: usize = MAX_REPLY_DEPTH - 4;
 
 /// Whether a multicall can return the whole tree in one piece.

@@ -9,7 +9,7 @@ use crate::xmlrpc::Struct;
 pub struct Snapshot {
     /// References to nodes by caller id, including nodes without any registration left.
     pub nodes: IndexMap<String, SnapshotNode>,
-    /// Types by topic. A type stays when the topic has no nodes left.
+    /// Types by topic. A type remains when the topic has no nodes left.
     pub topic_types: IndexMap<String, String>,
     /// Caller ids of the publishers of each topic.
     pub publishers: IndexMap<String, Vec<String>>,
@@ -52,8 +52,8 @@ impl Snapshot {
 pub struct SnapshotNode {
     /// Address of the node's own XML-RPC server.
     pub api: String,
-    /// Services that this node registered and another node has taken over since. The master never forgets
-    /// them, so `lookupNode` still finds the node.
+    /// Services that this node registered and another node has taken over since. The master keeps them forever, so
+    /// `lookupNode` still finds the node.
     pub taken_over_services: Vec<String>,
 }
 

@@ -24,12 +24,12 @@ pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
-    /// Whether something is kept differently than rosmaster keeps it, so that answers may differ. No ROS
-    /// client sends such values.
+    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends such
+    /// values.
     pub(crate) inexact: bool,
-    /// Whether the master behind rosrescue has dictionaries without an order, as on Python 2.
+    /// Whether the modelled master has unordered dictionaries, as on Python 2.
     pub(crate) unordered: bool,
-    /// Whether the master behind rosrescue behaves like rosmaster 1.14.3 and before. `None` if unknown.
+    /// Whether the modelled master behaves like rosmaster 1.14.3 and earlier. `None` if unknown.
     pub(crate) old: Option<bool>,
     pub(crate) pid: i32,
     pub(crate) uri: String,
@@ -145,39 +145,38 @@ impl Master {
         self.inexact || self.params.is_cut()
     }
 
-    /// Sets whether something is kept differently than rosmaster keeps it, so that answers may differ.
+    /// Sets whether something is stored differently than in rosmaster, so that answers may differ.
     pub fn set_inexact(&mut self, inexact: bool) {
         self.inexact = inexact;
     }
 
-    /// Sets whether the master behind rosrescue has dictionaries without an order, as on Python 2.
+    /// Sets whether the modelled master has unordered dictionaries, as on Python 2.
     pub fn set_unordered(&mut self, unordered: bool) {
         self.unordered = unordered;
     }
 
-    /// What [`Self::set_unordered`] has set. Ignored when two masters are compared.
+    /// The value set by [`Self::set_unordered`]. Ignored when two masters are compared.
     pub fn is_unordered(&self) -> bool {
         self.unordered
     }
 
-    /// Sets whether the master behind rosrescue behaves like rosmaster 1.14.3 and before: it also notifies
-    /// the node that sets a parameter, and the value of three of its refusals is 0. `None` if unknown.
+    /// Sets whether the modelled master behaves like rosmaster 1.14.3 and earlier: it also notifies the node that sets
+    /// a parameter, and the value of three of its refusals is 0. `None` if unknown.
     pub fn set_old(&mut self, old: Option<bool>) {
         self.old = old;
     }
 
-    /// What [`Self::set_old`] has set. Ignored when two masters are compared.
+    /// The value set by [`Self::set_old`]. Ignored when two masters are compared.
     pub fn is_old(&self) -> Option<bool> {
         self.old
     }
 
-    /// A call whose answer shows whether a master behaves like rosmaster 1.14.3 and before. It changes
-    /// nothing.
+    /// A call whose answer shows whether a master behaves like rosmaster 1.14.3 and earlier. It changes nothing.
     pub fn ask_if_old() -> Request {
         Request::new(Method::LookupService, [names::CALLER_ID, ""])
     }
 
-    /// What the answer to [`Self::ask_if_old`] shows. `None` if it is not an answer of rosmaster.
+    /// Reads the answer to [`Self::ask_if_old`]. `None` if it is not an answer of rosmaster.
     pub fn shows_old(reply: &Reply) -> Option<bool> {
         match reply {
             Reply::Value(Value::Array(answer)) => match answer.as_slice() {
@@ -260,7 +259,7 @@ impl Master {
         Some(entry.node.as_str())
     }
 
-    /// Counts the state, by walking through all of it.
+    /// Counts the state by walking through all of it.
     pub fn counts(&self) -> Counts {
         let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();
         Counts {
@@ -280,10 +279,10 @@ impl Master {
             && self.params.tree().is_empty()
     }
 
-    /// The calls that unregister everything a node has, as the node itself would send them at its end.
+    /// The calls that unregister everything a node has, as the node itself would when it stops.
     ///
-    /// If another node has taken over a service of this node, the master keeps a reference to it;
-    /// `forget_calls` removes that as well.
+    /// If another node has taken over a service of this node, the master keeps a reference to it. `forget_calls`
+    /// removes that as well.
     pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();

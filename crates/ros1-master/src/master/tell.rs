@@ -1,4 +1,4 @@
-//! The notifications that a master would send for its present state.
+//! Builds the notifications that a master would send for its present state.
 
 use std::sync::Arc;
 
@@ -8,9 +8,9 @@ use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id of rosmaster's calls to nodes.
 pub const MASTER: &str = "/master";
-/// The method that tells a node the publishers of a topic.
+/// The method that sends a topic's publishers to a node.
 pub const PUBLISHER_UPDATE: &str = "publisherUpdate";
-/// The method that tells a node the value of a parameter.
+/// The method that sends a parameter's value to a node.
 pub const PARAM_UPDATE: &str = "paramUpdate";
 
 /// A node that must shut down because another node has taken its name, at another address.
@@ -100,8 +100,8 @@ impl Master {
             .any(|node| self.api_of(node).is_some_and(at))
     }
 
-    /// The node that `call` displaces: if the call registers something under the same name at another
-    /// address, the master tells that node to shut down. Its process id is not known.
+    /// The node that `call` displaces. If the call registers something under the same name at another address, the
+    /// master tells that node to shut down. Its process id is unknown here.
     pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
         let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
@@ -140,7 +140,7 @@ pub fn shutdown(node: &str) -> Call {
     )
 }
 
-/// The reason that rosmaster gives for such a shutdown. An `old` rosmaster does not name the node.
+/// The reason that rosmaster gives for such a shutdown. An `old` rosmaster leaves out the node's name.
 pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     let reason = "new node registered with same name";
     match old {
@@ -149,7 +149,7 @@ pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     }
 }
 
-/// A call to a node or a master that has the caller id as its only parameter.
+/// A call with the caller id as its only parameter, to a node or a master.
 pub fn question(method: &str) -> Call {
     Call::new(method, vec![CALLER_ID.into()])
 }
@@ -159,7 +159,7 @@ pub fn get_pid() -> Call {
     question(Method::GetPid.name())
 }
 
-/// Whether a node can have registered this topic name unchanged: it must be global and canonical.
+/// Whether a node can have registered exactly this topic name: it must be global and canonical.
 pub fn is_plain_topic(topic: &str) -> bool {
     topic.len() > 1
         && topic.starts_with('/')

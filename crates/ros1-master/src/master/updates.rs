@@ -1,4 +1,4 @@
-//! Which subscribers to notify of a changed parameter: `compute_param_updates` of `rosmaster/paramserver.py`.
+//! Finds the subscribers to notify of a changed parameter, like `compute_param_updates` of `rosmaster/paramserver.py`.
 
 use std::{collections::HashSet, sync::LazyLock};
 
@@ -19,8 +19,8 @@ pub(crate) struct Update<'a> {
     pub(crate) value: &'a Value,
 }
 
-/// The updates caused by setting `key`, which ends in a slash and already has this value. They leave out
-/// `ignored`.
+/// The updates caused by setting `key`, which ends in a slash and already has its new value. The node `ignored` gets
+/// none.
 pub(crate) fn updates<'a>(
     subscribers: &'a Registrations,
     key: &'a str,
@@ -63,8 +63,7 @@ pub(crate) fn updates<'a>(
     }
     let length = key.chars().count();
     for (changed, nodes) in below.found {
-        // rosmaster cuts off as many characters as the key has that was set, even if this key does not start
-        // with it.
+        // rosmaster cuts off as many characters as the changed key has, even if this key does not start with it.
         let rest: String = changed.chars().skip(length).collect();
         updates.push(Update {
             nodes,
@@ -87,7 +86,7 @@ struct Below<'a> {
 }
 
 impl Below<'_> {
-    /// Finds keys with subscribers among `members` of the namespace `key`. Leaves `key` as it was.
+    /// Finds keys with subscribers among `members` of the namespace `key`. Restores `key` at the end.
     fn find(&mut self, key: &mut String, members: &Struct) {
         for (name, value) in members {
             // `ns_join` does not join such a name to the namespace.
@@ -112,8 +111,8 @@ impl Below<'_> {
     }
 }
 
-/// Finds the value at `path`. Like rosmaster it announces members whose names contain slashes, but then fails
-/// to find them.
+/// Finds the value at `path`. Like rosmaster, it fails for members whose names contain slashes, although it announces
+/// them.
 fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
         Value::Struct(members) => {

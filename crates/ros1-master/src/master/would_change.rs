@@ -4,8 +4,8 @@ use super::{Entry, Master, Method, Request, names};
 use crate::xmlrpc::Value;
 
 impl Master {
-    /// Whether `call` would change the state. Returns false only if every write in it, in order, is known to leave
-    /// the state unchanged. An unregistration without effect changes nothing.
+    /// Whether `call` would change the state. False only if every write in it, in order, is known to leave the state
+    /// unchanged. An unregistration of something that is not registered changes nothing.
     pub fn would_change(&self, call: &Request) -> bool {
         let entries = call.entries();
         !entries
@@ -14,7 +14,7 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state already is what `call` would make of it. `None` if unknown.
+    /// Whether the state already is as `call` would make it. `None` if unknown.
     fn is_settled(&self, call: &Request) -> Option<bool> {
         let text = |index| call.text(index);
         let caller_id = call.caller()?;
@@ -60,7 +60,7 @@ impl Master {
             }
             Method::SetParam => {
                 let value = call.params().get(2)?;
-                // A struct whose members are in another order is another state.
+                // A struct with its members in another order is a different state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }

@@ -18,8 +18,8 @@ use super::value::{Call, Reply, Struct, Value};
 /// can be read back. It also bounds recursion over values, including when they are dropped.
 pub const MAX_DEPTH: usize = 512;
 
-/// Maximum number of open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`,
-/// `data`); the rest is for the envelope and for clients that nest a little more.
+/// Most open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`, `data`). The others are
+/// for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Decodes a request.
@@ -147,14 +147,14 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
     })
 }
 
-/// The kind of document. Like CPython, the decoder goes by the last such element.
+/// The kind of document. As in CPython, the last such element decides.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Call,
     Fault,
 }
 
-/// The elements that CPython's unmarshaller knows. It ignores all others.
+/// The elements that CPython's unmarshaller knows. It ignores others.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Tag {
     Value,
@@ -210,10 +210,10 @@ struct Unmarshaller<'a> {
     marks: Vec<usize>,
     /// Character data since the last start tag.
     text: Cow<'a, str>,
-    /// A `<value>` is open and has no element in it so far, so its text is an untyped string.
+    /// Whether a `<value>` is open without an element in it so far. Then its text is an untyped string.
     is_bare: bool,
     writer: Writer,
-    /// References in this element are plain text, because the writer does not escape its content.
+    /// Whether references in this element are plain text, because the writer does not escape its content.
     is_unescaped: bool,
 }
 

@@ -8,8 +8,8 @@ use std::slice;
 use super::number::repr;
 use super::value::{Call, Reply, Struct, Value};
 
-/// Maximum nesting that rosmaster can return. Its Python allows 1000 nested calls, and encoding takes two per
-/// level. Measured with rosmaster on Python 3.11, which encodes every reply at the same stack depth.
+/// Deepest nesting that rosmaster can return. Its Python allows 1000 nested calls, and encoding takes two per level.
+/// Measured with rosmaster on Python 3.11, which encodes every reply at the same stack depth.
 pub(crate) const MAX_REPLY_DEPTH: usize = 492;
 
 /// Bytes of binary data per line of base64; they make 76 characters.
@@ -81,9 +81,8 @@ fn encode_fault(code: i32, text: &str) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Initial capacity for a long text: more than 32 MiB. The C library maps such large blocks separately and
-/// returns them as soon as they are freed, so they do not make it keep more freed memory later. Pages that
-/// are never written take no memory.
+/// Initial capacity for a long text: more than 32 MiB. The C library maps such large blocks separately and returns them
+/// as soon as they are freed, so it does not keep their memory. Pages that are never written take no memory.
 const ROOM: usize = 33 << 20;
 
 /// A call or an answer whose only value is an array, encoded element by element. As text it takes a tenth of
@@ -224,7 +223,7 @@ impl Writer {
         self.value_at(value, 0);
     }
 
-    /// Writes a value that lies inside `outer` arrays. Does not recurse, whatever its depth.
+    /// Writes a value inside `outer` arrays. Does not recurse, whatever the value's depth.
     fn value_at(&mut self, value: &Value, outer: usize) {
         let mut open: Vec<Open<'_>> = Vec::new();
         let mut next = Some(value);

@@ -1,10 +1,10 @@
-//! The reasons why a document cannot be decoded.
+//! The errors of decoding.
 
 use thiserror::Error;
 
-/// Maximum length of a value's text in an error, in characters.
+/// Most characters of a value's text in an error.
 pub(super) const TEXT_CHARS_MAX: usize = 40;
-// Reasons for which expat's own error text can be worked out.
+// Reasons from which expat's own error text can be derived.
 pub(super) const NO_ELEMENT: &str = "there is no element";
 pub(super) const NOT_CLOSED: &str = "an element is not closed";
 pub(super) const SECOND_ROOT: &str = "a second root element";
@@ -19,10 +19,10 @@ pub(super) const NOTHING: &str = "it has no params, fault or methodName";
 /// The call has parameters but no method name.
 pub(super) const NO_METHOD: &str = "it has no method name";
 
-/// Why a document was not decoded: CPython would raise an exception too, or it would accept something that is
-/// deliberately not decoded here (see [`DecodeError::Unsupported`]).
+/// Why a document was not decoded. Either CPython would raise an exception too, or it would accept something that is
+/// not decoded here on purpose (see [`DecodeError::Unsupported`]).
 ///
-/// This is never a reason to fail a call: the body can be forwarded unchanged, and the receiver decides.
+/// This is never a reason to fail a call: forward the body unchanged, and let the receiver decide.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum DecodeError {
@@ -46,7 +46,7 @@ pub enum DecodeError {
     /// Too many levels of arrays, structs or elements.
     #[error("nested deeper than {limit} levels at byte {at}; forward the body unchanged")]
     TooDeep { at: usize, limit: usize },
-    /// A `<value>` holds an element that is not a type.
+    /// A `<value>` contains an element that is not a type.
     #[error("unknown type <{tag}> at byte {at}; forward the body unchanged")]
     UnknownType {
         /// Position after the tag, in bytes.
@@ -119,7 +119,7 @@ impl DecodeError {
 /// Expat's error text for the problem `what` at byte `at`.
 fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
     let body = std::str::from_utf8(body).ok()?;
-    // Positions are computed for plain line feeds only, and without a byte order mark.
+    // Positions are computed only for plain line feeds and without a byte order mark.
     if body.contains(['\r', '\u{feff}']) {
         return None;
     }
@@ -166,7 +166,7 @@ fn inside<'t>(text: &'t str, begin: &str, end: &str) -> Option<&'t str> {
     Some(text.strip_prefix(begin)?.split_once(end)?.0)
 }
 
-/// Whether this is, or might be, the name of an XML-RPC element.
+/// Whether this is, or may be, the name of an XML-RPC element.
 fn is_name(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic())
         && text.bytes().all(|b| b.is_ascii_alphanumeric())

@@ -1,12 +1,12 @@
-//! XML-RPC values as JSON for other programs.
+//! Serializes XML-RPC values as JSON for other programs.
 
 use base64::Engine as _;
 use serde::{Serialize, Serializer};
 
 use super::{Struct, Value};
 
-/// Dates, binary data (as base64), integers beyond 32 bits, infinities and NaN become strings, because JSON
-/// lacks them.
+/// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, infinities and NaN become strings,
+/// because JSON lacks them.
 impl Serialize for Value {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {

@@ -1,4 +1,4 @@
-//! Numbers and binary data as Python reads and writes them.
+//! Reads and writes numbers and binary data as Python does.
 
 use super::value::Value;
 
@@ -38,8 +38,8 @@ pub(super) fn int(text: &str) -> Option<Value> {
     })
 }
 
-/// Python's `float(text)`, for ASCII text. Every `nan` becomes the same one, because Python's text form does
-/// not show the sign and payload.
+/// Python's `float(text)`, for ASCII text. Every `nan` becomes the same one, because Python's text does not show sign
+/// and payload.
 pub(super) fn float(text: &str) -> Option<f64> {
     // Rust accepts exactly what Python accepts, except for white space and underscores.
     let number: f64 = match text.parse() {
@@ -111,8 +111,8 @@ fn shortest(number: f64) -> String {
     let shortest = format!("{number:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
     let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
-    // Below 1e-307 two texts of up to 15 digits can identify the same number, but numbers there have far too
-    // many digits to lie exactly between the two.
+    // Below 1e-307 two texts of up to 15 digits can identify the same number. But numbers there have far too many
+    // digits to be exactly between the two.
     if digits <= 15 {
         return shortest;
     }

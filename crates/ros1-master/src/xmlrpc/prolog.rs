@@ -1,4 +1,4 @@
-//! The XML declaration and the encoding of a document.
+//! Reads the XML declaration and the encoding of a document.
 
 use std::borrow::Cow;
 
@@ -12,9 +12,8 @@ use super::scan::{checked_attributes, is_in_xml};
 ///
 /// # Errors
 ///
-/// For an encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython all 8-bit
-/// codecs), for bytes that are not valid in it, for characters that XML does not allow, and for a bad
-/// declaration.
+/// For an encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, and CPython all 8-bit codecs),
+/// for bytes that are not valid in it, for characters that XML does not allow, and for a bad declaration.
 pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     let encoding = match Reader::from_reader(body).read_event() {
         Ok(Event::Decl(declaration)) => declared(&declaration)?,
@@ -45,8 +44,8 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     Ok(text)
 }
 
-/// The document without its document type, if that is just a name and so declares nothing. `None` if there is
-/// no such document type.
+/// The document without its document type, if that is only a name and so declares nothing. `None` if there is no such
+/// document type.
 pub fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
     const DOCTYPE: &[u8] = b"<!DOCTYPE";
     let declared = match body.starts_with(b"<?xml") {
@@ -81,7 +80,7 @@ fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> 
     let is_plain = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_');
     let is_fine = attributes.iter().all(|attribute| {
         let (name, value) = (attribute.key.0, &attribute.value);
-        // Each name at most once, and in this order.
+        // Each name comes at most once, and in this order.
         names.any(|next| next == name)
             && value.bytes().all(is_plain)
             && (name != "standalone" || value == "yes" || value == "no")

@@ -37,7 +37,7 @@ pub(super) enum LineEnds {
     Kept,
 }
 
-/// Reads a document event by event and checks the rules of XML.
+/// Reads a document event by event, and checks the rules of XML.
 pub(super) struct Scanner<'a> {
     reader: Reader<&'a [u8]>,
     /// Number of open elements.
@@ -198,7 +198,7 @@ pub(super) fn checked_attributes<'t>(
         .collect()
 }
 
-/// Checks that a name is there and is ASCII.
+/// Checks that a name is not empty, and is ASCII.
 fn check_name(name: &str, at: usize) -> Result<(), DecodeError> {
     let is_inner = |b: u8| b.is_ascii_digit() || b == b'-' || b == b'.';
     let is_name = |b: u8| b.is_ascii_alphabetic() || b == b'_' || b == b':' || is_inner(b);
@@ -217,8 +217,7 @@ fn is_space(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\n' | b'\r')
 }
 
-/// Whether XML 1.0 allows this character. Like expat, this knows only the two non-characters of the first
-/// plane.
+/// Whether XML 1.0 allows this character. Like expat, this excludes only the non-characters of the first plane.
 pub(super) fn is_in_xml(character: char) -> bool {
     matches!(character, '\t' | '\n' | '\r' | ' '..='\u{fffd}' | '\u{10000}'..)
 }

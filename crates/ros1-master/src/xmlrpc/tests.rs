@@ -1,4 +1,4 @@
-//! One test per quirk. `tests/codec` checks the same quirks against CPython itself.
+//! One test for each special case. `tests/codec` checks the same cases against CPython.
 
 use super::number::repr;
 use super::{
@@ -6,7 +6,7 @@ use super::{
     encode_reply,
 };
 
-/// The only parameter of a call that has `inside` between `<value>` and `</value>`.
+/// The only parameter of a call with `inside` between `<value>` and `</value>`.
 fn decoded(inside: &str) -> Result<Value, DecodeError> {
     let body = format!(
         "<methodCall><methodName>m</methodName><params><param><value>{inside}</value></param>\
@@ -48,7 +48,7 @@ fn line_ends_become_line_feeds_unless_written_as_references() {
     assert_eq!(value("a&#13;&#xA;b"), text("a\r\nb"));
 }
 
-/// The master holds them as it writes them.
+/// A master's values contain these characters as they are in its reply.
 #[test]
 fn a_decoded_reply_keeps_the_characters_that_cpython_does_not_escape() {
     let date = |text: &str| Value::DateTime(text.to_owned());
@@ -447,7 +447,7 @@ fn doubles_are_written_as_python_writes_them() {
         (f64::NAN, "nan"),
         (f64::INFINITY, "inf"),
         (f64::NEG_INFINITY, "-inf"),
-        // Halfway between two texts of the shortest length, which end in 0.2 and 0.3.
+        // These numbers are halfway between two texts of the shortest length, which end in 0.2 and 0.3.
         (f64::from_bits(0x4307_6b26_abd3_448a), "823967287502993.2"),
     ] {
         assert_eq!(repr(number), text);

@@ -12,9 +12,9 @@ type Members = IndexMap<String, Value>;
 
 /// An XML-RPC struct. It keeps the order of its keys, like a Python dict.
 ///
-/// A clone shares its members until one of the two is changed. Only then are these members copied; structs
-/// inside them stay shared. So copying a large parameter tree is free, and changing the tree while a copy
-/// exists costs as much as copying the members of the namespaces on the way to the change.
+/// A clone shares its members until one of the two is changed. Only then are these members copied; structs inside them
+/// stay shared. So copying a large parameter tree is free. Changing it while a copy exists costs as much as copying the
+/// members of the namespaces on the path to the change.
 #[derive(Clone, Debug, Default)]
 pub struct Struct(Arc<Members>);
 
@@ -93,11 +93,11 @@ impl<'a> IntoIterator for &'a Struct {
     }
 }
 
-/// One XML-RPC value.
+/// An XML-RPC value.
 ///
-/// Two values are equal if they look the same on the wire: doubles with the same bits, so `nan` equals `nan`
-/// and `-0.0` differs from `0.0`; `1`, `1.0` and `true` all differ. Structs must have their keys in the same
-/// order, because replies show it.
+/// Two values are equal if they look the same on the wire. Doubles need the same bits, so `nan` equals `nan`, and
+/// `-0.0` differs from `0.0`. `1`, `1.0` and `true` all differ. Structs must have their keys in the same order, because
+/// replies show it.
 #[derive(Clone, Debug)]
 pub enum Value {
     /// `<nil/>`. rosmaster accepts it inside values but can never return it.

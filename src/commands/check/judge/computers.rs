@@ -1,4 +1,4 @@
-//! Several computers: `--cluster`.
+//! Judges the facts about `--cluster`.
 
 use super::{
     super::{
@@ -21,7 +21,7 @@ impl Findings {
                 return self.bad(SUBJECT, error.to_string(), todo);
             }
             Some(Err(Unusable::Etcd(error))) => {
-                let todo = "correct the options of etcd: with these, `core` does not start";
+                let todo = "correct the etcd options: with these, `core` does not start";
                 return self.bad(SUBJECT, error.to_string(), todo);
             }
         };

@@ -1,4 +1,4 @@
-//! Port, addresses and names.
+//! Judges port, addresses and names.
 
 use super::{
     super::{
@@ -9,9 +9,9 @@ use super::{
 };
 use crate::ros_env;
 
-/// A name that takes longer to look up delays every call to its node.
+/// A name lookup that takes longer than this, in milliseconds, is a finding: it delays every call to the node.
 const SLOW: u128 = 1000;
-/// Of what bypasses rosrescue.
+/// Subject of findings about clients that bypass rosrescue.
 const BYPASS: &str = "unprotected";
 const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 
@@ -23,7 +23,7 @@ impl Findings {
             taken,
         }) = &facts.port
         else {
-            // Said of ROS_MASTER_URI.
+            // The finding about ROS_MASTER_URI covers it.
             return;
         };
         if let Some(error) = error {
@@ -144,7 +144,7 @@ impl Findings {
         }
     }
 
-    /// The master is on another computer, and answers.
+    /// Findings about a master that answers on another computer.
     pub(super) fn elsewhere(&mut self, facts: &Facts, uri: &str) {
         const SUBJECT: &str = "ROS_MASTER_URI";
         match &facts.elsewhere {
@@ -170,7 +170,7 @@ impl Findings {
         }
     }
 
-    /// `ROS_IP` and `ROS_HOSTNAME`.
+    /// Checks `ROS_IP` and `ROS_HOSTNAME`.
     pub(super) fn address(&mut self, facts: &Facts) {
         let env = &facts.env;
         for (subject, value) in [("ROS_HOSTNAME", &env.hostname), ("ROS_IP", &env.ip)] {
@@ -207,7 +207,7 @@ impl Findings {
         }
     }
 
-    /// The name that nodes of this computer register.
+    /// Checks the name that nodes of this computer register.
     pub(super) fn own_name(&mut self, facts: &Facts) {
         let (own, env) = (&facts.own, &facts.env);
         let is_set = env.hostname.is_some() || env.ip.is_some();
@@ -217,7 +217,7 @@ impl Findings {
             false => ("host name", &own.name),
         };
         if name.trim() != name {
-            // Said of the variable.
+            // The finding about the variable covers it.
             return;
         }
         let others = others(facts);
@@ -252,7 +252,7 @@ impl Findings {
         self.slow(subject, own);
     }
 
-    /// An address in `ROS_IP` that may change.
+    /// Checks whether the address in `ROS_IP` may change.
     pub(super) fn lease(&mut self, facts: &Facts) {
         let Some(lease) = &facts.lease else { return };
         let how = match (lease.is_leased, lease.is_wireless) {
@@ -271,7 +271,7 @@ impl Findings {
         );
     }
 
-    /// Running nodes of another master.
+    /// Reports running nodes of another master.
     pub(super) fn strays(&mut self, facts: &Facts) {
         for (process, uri) in &facts.strays {
             let port = ros_env::MasterUri::parse(uri).ok().map(|uri| uri.port);
@@ -294,7 +294,7 @@ impl Findings {
         }
     }
 
-    /// What talks to the master behind a `proxy`.
+    /// Reports clients that talk directly to the master behind a `proxy`.
     pub(super) fn bypass(&mut self, facts: &Facts) {
         let Some(behind) = &facts.behind else { return };
         let uri = &behind.uri;
@@ -321,7 +321,7 @@ impl Findings {
             self.warn(
                 subject,
                 format!(
-                    "looking {} up takes {} ms",
+                    "the lookup of {} takes {} ms",
                     host.name,
                     host.took.as_millis()
                 ),
@@ -363,7 +363,7 @@ impl Findings {
     }
 }
 
-/// A name and its addresses, or an address.
+/// Describes a name with its addresses, or an address.
 fn leads(host: &Host) -> String {
     let addresses = list(host.addresses.as_deref().unwrap_or_default());
     match addresses == host.name {
@@ -372,7 +372,7 @@ fn leads(host: &Host) -> String {
     }
 }
 
-/// Another computer that takes part, if one is known.
+/// Another computer of the robot, if one is known.
 fn others(facts: &Facts) -> Option<String> {
     let hosts = facts.node_hosts.iter().map(|(host, _)| host);
     let mut far = hosts.chain(&facts.master_host);

@@ -1,4 +1,4 @@
-//! This computer and the ROS on it.
+//! Judges this computer and its ROS.
 
 use super::{
     super::{
@@ -11,22 +11,23 @@ use super::{
 };
 use crate::{clock, status::software};
 
-/// Less free space than this is used up by a checkpoint and ROS's logs in no time, in bytes.
+/// Least free space, in bytes. A checkpoint and ROS's logs soon use up less.
 const LITTLE_SPACE: u64 = 500 << 20;
 const NO_SPACE: u64 = 20 << 20;
-/// Checkpoint, reports and logs are some ten files for each start and each rescue.
+/// Least number of files that can still be created. Each start and each rescue creates some ten files: checkpoint,
+/// reports and logs.
 const FEW_INODES: u64 = 1000;
 const NO_INODES: u64 = 10;
-/// With fewer open files connections of clients become scarce; with fewer still rosrescue hardly works.
+/// Least limit of open files. With fewer, client connections run out.
 const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
-/// rosmaster and rosrescue take some 40 MB.
+/// Least free memory, in bytes. rosmaster and rosrescue need some 40 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
-/// More settings in launch files than this hide the other findings.
+/// Most settings in launch files that are listed. More would hide the other findings.
 const SETTINGS_MOST: usize = 10;
-/// 2024-01-01: this program is younger.
+/// 2024-01-01, in seconds since 1970. A clock before it is wrong, because this program is younger.
 const EARLIEST: f64 = 1_704_067_200.0;
-/// A clock that is so far behind its own files has been set back.
+/// A clock that is this many seconds behind existing files was set back.
 const BEHIND_FILES: f64 = 120.0;
 impl Findings {
     pub(super) fn disk(&mut self, disk: &Disk, port: Option<&Port>) {
@@ -197,13 +198,13 @@ impl Findings {
         }
     }
 
-    /// Masters beside rosrescue.
+    /// Reports masters beside rosrescue.
     pub(super) fn masters(&mut self, facts: &Facts) {
         let port = facts.port.as_ref().ok().map(|port| port.number);
         let proxied = facts.proxied.as_ref().map(|(uri, _)| uri.port);
         let others = facts.masters.iter().filter(|process| {
             let at = |port: Option<u16>| port.is_some_and(|port| process.ports.contains(&port));
-            // The first is told with the port; the second is wanted.
+            // The finding about the port covers the first one, and the second one is intended.
             !at(port) && !at(proxied)
         });
         let others: Vec<_> = others.map(named).collect();
@@ -248,7 +249,7 @@ impl Findings {
         }
     }
 
-    /// Launch files that send nodes to another master.
+    /// Reports launch files that send nodes to another master.
     pub(super) fn launches(&mut self, launches: &Launches) {
         const SUBJECT: &str = "launch files";
         let count = launches.settings.len();

@@ -30,7 +30,7 @@ fn nowhere(name: &str) -> Host {
     }
 }
 
-/// A robot with nothing to say about.
+/// A robot without problems.
 fn robot() -> Facts {
     Facts {
         version: "1.0.0",
@@ -123,7 +123,7 @@ fn port(facts: &mut Facts) -> &mut Port {
     facts.port.as_mut().unwrap()
 }
 
-/// What is said when `spoil` is so, beside what is in order.
+/// The warnings and problems that remain after `spoil` has broken one thing.
 fn said(spoil: impl FnOnce(&mut Facts)) -> Vec<Finding> {
     let mut facts = robot();
     spoil(&mut facts);
@@ -132,7 +132,7 @@ fn said(spoil: impl FnOnce(&mut Facts)) -> Vec<Finding> {
     found
 }
 
-/// One thing is said, with these words and something to do.
+/// Asserts that `spoil` causes exactly one finding, with these words and something to do.
 #[track_caller]
 fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut Facts)) {
     let found = said(spoil);

@@ -1,4 +1,4 @@
-//! The document: defines which value stands under which key.
+//! Defines the document: which value is under which key.
 
 use indexmap::IndexMap;
 
@@ -168,7 +168,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
     ];
-    // A count that is missing is read as 0.
+    // A missing count is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
     members.extend(counts.map(|(name, count)| (name, integer(count))));
     members
@@ -289,7 +289,7 @@ fn read_displaced(value: Value) -> Option<Displaced> {
     })
 }
 
-/// Reverses [`write_record`], after the caller has read the number.
+/// Reverses [`write_record`], except for the number, which the caller has read.
 pub(super) fn read_record(line: &str) -> Result<Entry, String> {
     let entries = match yaml::read(line)? {
         Value::Array(entries) => entries,
@@ -347,7 +347,7 @@ fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
-    // Taken out rather than cloned. The order of the remaining keys does not matter.
+    // Taken out instead of cloned. The order of the remaining keys does not matter.
     document
         .swap_remove(key)
         .and_then(structure)

@@ -1,26 +1,25 @@
-//! Encodes values as YAML.
+//! Encodes values as YAML, in block style and in flow style.
 //!
-//! One emitter for both styles. Every string and key is double-quoted on one line. Numbers have a form that
-//! YAML 1.1 and 1.2 resolve alike. Types that YAML lacks are written as `!!pairs`, which no XML-RPC value
-//! uses otherwise. serde-saphyr's writer is not used because it has no integers beyond 128 bits, spreads
-//! texts over several lines, and takes four times as long for a record (1.1 us instead of 0.25 us).
+//! Every string and key is double-quoted on one line. Numbers have a form that YAML 1.1 and 1.2 read alike. Types that
+//! YAML lacks are written as `!!pairs`, which no XML-RPC value uses otherwise. serde-saphyr's writer is not used: it
+//! has no integers beyond 128 bits, spreads texts over several lines, and takes four times as long for a record (1.1 us
+//! instead of 0.25 us).
 
 use std::io::Write;
 
 use super::{DEPTH_MAX, EncodeError};
 use crate::xmlrpc::{Struct, Value};
 
-/// Structs below this level are written in one line, because indentation would take more space than content.
+/// Deepest level of structs with one line per member. Deeper ones are written in one line: their indentation would take
+/// more space than their content.
 const BLOCK_LEVELS_MAX: usize = 32;
-/// Maximum length of a key. YAML 1.1 and 1.2 look for the `:` of an implicit key only within 1,024
-/// characters.
+/// Longest key, in bytes. YAML 1.1 and 1.2 look for the `:` of an implicit key only within 1,024 characters.
 const KEY_BYTES_MAX: usize = 1_000;
-/// Maximum length of a decimal integer. CPython refuses to read longer ones (`sys.get_int_max_str_digits`,
-/// 4,300).
+/// Most digits of a decimal integer. CPython refuses to read more (`sys.get_int_max_str_digits`, 4,300).
 const INT_DIGITS_MAX: usize = 4_000;
-/// The kind of a `!!pairs` entry that holds a date.
+/// The kind of `!!pairs` entry that holds a date.
 pub(super) const DATE_TIME: &str = "dateTime.iso8601";
-/// The kind of a `!!pairs` entry that holds a large integer.
+/// The kind of `!!pairs` entry that holds a large integer.
 pub(super) const BIG_INT: &str = "int";
 
 /// Writes `members` in block style, one line each, indented by `indent` columns.
@@ -170,8 +169,8 @@ fn is_plain_big_int(digits: &str) -> bool {
         && digits.parse::<i32>().is_err()
 }
 
-/// Writes a double with the fewest digits that are read back as the same bits. YAML 1.1 requires a point in
-/// every float and a sign in every exponent. Every NaN is `.nan`, because it is one `nan` on the wire.
+/// Writes a double with the fewest digits that are read back as the same bits. YAML 1.1 requires a point in every float
+/// and a sign in every exponent. Every NaN is written as `.nan`, because XML-RPC has only one `nan`.
 fn double(out: &mut Vec<u8>, number: f64) {
     if number.is_nan() {
         return out.extend_from_slice(b".nan");
@@ -223,7 +222,7 @@ pub(super) fn date_time(stamp: &str) -> Option<String> {
     Some(format!("{}T{time}", date.replace('-', "")))
 }
 
-/// Writes `text` double-quoted on one line, so that every reader reads it back exactly.
+/// Writes `text` in double quotes on one line, so that every YAML reader reads it back exactly.
 pub(super) fn quoted(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
     let plain = text
@@ -257,8 +256,8 @@ fn is_plain(byte: u8) -> bool {
     matches!(byte, b' '..=b'~') && byte != b'"' && byte != b'\\'
 }
 
-/// Whether a non-ASCII character is written unescaped. It is not if PyYAML refuses it, if YAML 1.1 breaks
-/// lines at it, or if it is invisible.
+/// Whether a non-ASCII character is written unescaped. It is escaped if PyYAML refuses it, if YAML 1.1 breaks lines at
+/// it, or if it is invisible.
 fn is_shown(character: char) -> bool {
     !matches!(character,
         '\u{0}'..='\u{a0}' | '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}'

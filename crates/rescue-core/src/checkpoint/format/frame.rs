@@ -23,21 +23,21 @@ use super::{
 pub const FORMAT_VERSION: u32 = 1;
 
 const MAGIC: &str = "# rosrescue checkpoint v";
-/// Maximum length of the first line, whatever its numbers.
+/// Longest first line, in bytes.
 const HEADER_BYTES_MAX: usize = 256;
 /// Length of a record's check sums: ` #`, eight digits, a blank and eight digits.
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Maximum number of a generation or a record. Counting continues from the numbers in a file; a higher number
-/// was never written, and adding to it could overflow.
+/// Highest number of a generation or a record. Counting continues from the numbers in a file. A higher number was never
+/// written, and adding to it could overflow.
 const COUNT_MAX: u64 = u64::MAX / 2;
 
-/// Ties a file's records to its snapshot.
+/// Connects a file's records to its snapshot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp(u32);
 
-/// Puts the first line before a snapshot.
+/// Adds the first line to a snapshot.
 pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
@@ -74,10 +74,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
     out.push(b'\n');
 }
 
-/// The stamp of records that belong to no file.
+/// The stamp of records outside of any file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends the line of a record that belongs to no file.
+/// Appends the line of a record outside of any file.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
     push_body(out, record.seq, &record.entry)?;
@@ -85,11 +85,11 @@ pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError
     Ok(())
 }
 
-/// Reads lines that were written by [`push_record`].
+/// Reads lines that [`push_record`] has written.
 ///
 /// # Errors
 ///
-/// If the lines are not what was written; the text says why.
+/// If the lines are not what was written. The text says why.
 pub fn read_records(lines: &[u8]) -> Result<Vec<Record>, String> {
     let lines = lines
         .strip_suffix(b"\n")
@@ -148,7 +148,7 @@ pub struct Header {
     length: usize,
 }
 
-/// A record's line whose check sums are right.
+/// A record's line with valid check sums.
 #[derive(Debug)]
 pub struct Line<'a> {
     pub seq: u64,
@@ -156,7 +156,7 @@ pub struct Line<'a> {
     body: &'a [u8],
 }
 
-/// A file split into its parts. The YAML has not been read yet.
+/// A file split into its parts. Its YAML is not parsed yet.
 #[derive(Debug)]
 pub struct Framed<'a> {
     pub header: Option<Header>,
@@ -164,11 +164,11 @@ pub struct Framed<'a> {
     pub lines: Vec<Line<'a>>,
     pub torn: Option<Range<usize>>,
     pub damaged: Vec<Damage>,
-    /// Whether damage follows the last whole line, so that an unknown number of records may be missing.
+    /// Whether damage follows the last valid line. Then an unknown number of records may be missing.
     pub end_lost: bool,
 }
 
-/// Reads the whole parts of a file.
+/// Reads the undamaged parts of a file.
 ///
 /// # Errors
 ///
@@ -223,7 +223,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     if hex(digits) != Some(stamp) {
         return Ok(None);
     }
-    // The check sum of the line is right from here on.
+    // From here on, the line's check sum is known to be valid.
     let Some((version, fields)) = std::str::from_utf8(checked)
         .ok()
         .and_then(|line| line.strip_prefix(MAGIC)?.split_once(' '))
@@ -253,9 +253,9 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     Ok(header)
 }
 
-/// Whether a file without a whole first line and without a whole record is a damaged checkpoint rather than
-/// another program's file. It is if it is empty, begins with zeros (as after a crash of the machine), or
-/// still has most of the start of the first line or of the document's frame.
+/// Whether a file without a valid first line and without a valid record is a damaged checkpoint, or else another
+/// program's file. It is a checkpoint if it is empty, begins with zeros (as after a crash of the computer), or still
+/// has most of the start of the first line or of the document.
 fn resembles(bytes: &[u8]) -> bool {
     let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
     let differing = bytes
@@ -269,7 +269,7 @@ fn resembles(bytes: &[u8]) -> bool {
 }
 
 impl<'a> Framed<'a> {
-    /// A file of which no part is whole.
+    /// A file without any undamaged part.
     pub fn unreadable(bytes: &'a [u8]) -> Self {
         let (lines, damaged) = (Vec::new(), Vec::new());
         Self {
@@ -306,8 +306,7 @@ impl<'a> Framed<'a> {
             .map_err(|why| SnapshotError::Content { why })
     }
 
-    /// The records with numbers above `after`. A line whose check sums are right but whose content is not
-    /// valid is added to `damaged`.
+    /// The records with numbers above `after`. A line with valid check sums and invalid content is added to `damaged`.
     pub fn records(&self, after: u64, damaged: &mut Vec<Damage>) -> Vec<Record> {
         let lines = self.lines.iter().filter(|line| line.seq > after);
         lines
@@ -333,8 +332,9 @@ impl<'a> Framed<'a> {
             .collect()
     }
 
-    /// Finds the whole lines of the journal and describes the damage to the others. If the first line is
-    /// damaged, it is unknown where the journal starts, but no line of a snapshot looks like a record.
+    /// Finds the valid lines of the journal, and describes the damage of the others. If the first line is damaged, it
+    /// is unknown where the journal starts. All lines can be searched then, because no line of a snapshot looks like a
+    /// record.
     fn scan_lines(&mut self) {
         let start = match self.header {
             Some(header) => usize::try_from(header.snapshot)
@@ -343,13 +343,13 @@ impl<'a> Framed<'a> {
         };
         let mut stamp = self.header.map(|header| header.stamp);
         let mut offset = start;
-        // Where the bytes after the last whole line start, and whether they look like an incomplete append.
+        // Where the bytes after the last valid line start, and whether they look like an incomplete append.
         let mut tail: Option<(usize, bool)> = None;
         let mut tail_damage: Vec<Damage> = Vec::new();
         let mut rest = self.bytes.get(start..).unwrap_or_default();
         while !rest.is_empty() {
             let at = offset;
-            // This cannot fail, because it reads from memory. It is the fastest way to find the end of the line.
+            // This cannot fail, because it reads from memory. It is the fastest way to find the line's end.
             let line_length = (&mut &*rest).skip_until(b'\n').unwrap_or(rest.len());
             let (line, behind) = rest.split_at(line_length);
             (rest, offset) = (behind, offset + line_length);
@@ -398,7 +398,7 @@ impl<'a> Framed<'a> {
     }
 }
 
-/// The number, stamp and body of a line whose check sums are right.
+/// Number, stamp and body of a line with valid check sums.
 fn open_line(line: &[u8]) -> Option<(u64, Stamp, &[u8])> {
     let (checked, digits) = line.split_last_chunk::<8>()?;
     let checked = checked.strip_suffix(b" ")?;

@@ -3,11 +3,11 @@
 use super::{EncodeError, emit};
 use crate::xmlrpc::{Struct, Value};
 
-/// Maximum length of a value that is shown to the user, in characters.
+/// Most characters of a value in a message.
 const SHOWN: usize = 100;
 
-/// The parameter tree as YAML that `rosparam load` reads correctly, and a sentence for each parameter that is
-/// left out or changed because rosparam cannot carry it.
+/// Converts the parameter tree to YAML that `rosparam load` reads correctly. Also returns a sentence for each parameter
+/// that was left out or changed because rosparam cannot send it.
 ///
 /// # Errors
 ///
@@ -23,7 +23,7 @@ pub fn for_rosparam(tree: &Struct) -> Result<(Vec<u8>, Vec<String>), EncodeError
     Ok((yaml, left_out))
 }
 
-/// `value` in one line for the user: as it is written in a checkpoint, but shortened.
+/// `value` in one line for messages: as in a checkpoint, but shortened.
 pub fn shown(value: &Value) -> String {
     let mut line = Vec::new();
     if emit::flow(&mut line, value, 0).is_err() {

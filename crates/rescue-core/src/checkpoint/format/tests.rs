@@ -26,8 +26,8 @@ fn file() -> (Vec<u8>, Vec<usize>) {
     (bytes, starts)
 }
 
-/// A debug build tries only every seventh place, to save time. 7 and 61 are prime, so every position in a
-/// line and in a byte is tried at some point.
+/// A debug build tries only every seventh place, to save time. 7 and 61 are prime, so every position in a line and in a
+/// byte is tried.
 const CUT_STEP: usize = if cfg!(debug_assertions) { 7 } else { 1 };
 /// A debug build flips only every 61st bit; see [`CUT_STEP`].
 const FLIP_STEP: usize = if cfg!(debug_assertions) { 61 } else { 16 };
@@ -77,7 +77,7 @@ fn every_flipped_bit_in_a_large_file_is_noticed() {
     assert_flips_noticed(step.unwrap_or(FLIP_STEP));
 }
 
-/// The check sums say that the file is whole, but its numbers are the highest that there are.
+/// The check sums are valid, but the numbers are the highest possible ones.
 #[test]
 fn numbers_too_high_to_continue_counting_are_damage() {
     let checkpoint = |seq| Checkpoint {

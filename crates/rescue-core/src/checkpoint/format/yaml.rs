@@ -1,10 +1,8 @@
 //! Converts YAML to values.
 //!
-//! Reads the events of serde-saphyr's parser and does not use serde, because serde's data model lacks scalar
-//! styles, tags, and integers beyond 64 bits, which distinguish the values. It accepts only what `emit`
-//! writes: no anchors, no aliases, no other tags. So no text can expand to more than its own length. No
-//! function recurses.
-//! anchors, no aliases, no other tags. So no text can build more than its own length. Nothing recurses.
+//! It reads the events of serde-saphyr's parser and does not use serde. serde's data model lacks scalar styles, tags,
+//! and integers beyond 64 bits, which distinguish the values. It accepts only what `emit` writes: no anchors, no
+//! aliases, no other tags. So no text can expand to more than its own length. No function recurses.
 
 use std::borrow::Cow;
 
@@ -29,7 +27,7 @@ enum Open {
 }
 
 pub(super) fn read(text: &str) -> Result<Value, String> {
-    // The document itself adds a few levels around the deepest value.
+    // The document adds a few levels around the deepest value.
     let nesting = DEPTH_MAX + 8;
     let options = granit_parser::options! {
         emit_comments: false,
@@ -128,8 +126,7 @@ fn scalar(text: Cow<'_, str>, style: ScalarStyle, tag: Option<&Tag>) -> Option<V
 
 fn plain(text: &str) -> Option<Value> {
     Some(match text {
-        // The parser reports `~` where nothing follows a key. Here that is the journal, whose lines are read
-        // separately.
+        // The parser reports `~` for a key without a value. Here that is the journal, whose lines are read separately.
         "null" | "~" => Value::Nil,
         "true" => Value::Bool(true),
         "false" => Value::Bool(false),
@@ -145,7 +142,7 @@ fn plain(text: &str) -> Option<Value> {
             } else if first.is_ascii_digit() && magnitude.contains('.') {
                 Value::Double(text.parse().ok()?)
             } else if first.is_ascii_lowercase() && text == magnitude {
-                // Only the keys of the document itself are plain words.
+                // Only the document's own keys are unquoted words.
                 Value::String(text.to_owned())
             } else {
                 return None;

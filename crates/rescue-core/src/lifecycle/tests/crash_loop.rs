@@ -54,7 +54,7 @@ fn a_master_that_cannot_be_spawned_is_retried_with_growing_pauses() {
                 .feed(Input::SpawnFailed { pending: true }, &[])
                 .wake(Duration::from_millis(pause_ms), &[Action::Spawn]);
         }
-        // A master that can be spawned ends the series.
+        // A master that can be started ends the series.
         script
             .feed(Input::Spawned, &[Action::Connect])
             .serve(true)
@@ -97,7 +97,7 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
             &[]
         };
         match death % 3 {
-            // The next master listens before the first look.
+            // The next master listens before it is checked for the first time.
             0 => {
                 let actions = [Action::OpenGate].iter().chain(said).copied();
                 script
@@ -129,7 +129,7 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
     script.feed(Input::Wake, &[Action::ReportCalm]);
 }
 
-/// The number of starts within any minute is bounded, whatever the masters die of and when.
+/// The number of starts within any minute is bounded, whatever the masters die of and whenever they do.
 #[test]
 fn the_rate_of_restarts_is_bounded() {
     const MOST: usize = 16;

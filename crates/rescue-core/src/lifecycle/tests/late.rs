@@ -3,7 +3,7 @@
 use super::super::evidence::Effort;
 use super::*;
 
-/// What a master does: idle, or one that wants the processor.
+/// What a master does during a sample.
 #[derive(Clone, Copy, PartialEq)]
 enum Does {
     Nothing,
@@ -12,7 +12,7 @@ enum Does {
 }
 
 impl Script {
-    /// Samples our master if the machine wants to, then feeds `input`.
+    /// Samples the child if the state machine asks for it, then feeds `input`.
     fn feed_seen(&mut self, does: Does, input: Input, expected: &[Action]) -> &mut Self {
         if self.machine.needs_sample(self.now, input) {
             let ran = match does {
@@ -33,7 +33,7 @@ impl Script {
         self.feed(input, expected)
     }
 
-    /// Misses a probe each half second until the gate is shut.
+    /// Misses a probe every half second until the gate is shut.
     fn miss_all(&mut self, does: Does, then: Action) -> &mut Self {
         for _ in 1..PROBING.count {
             self.now += Duration::from_millis(500);
@@ -61,14 +61,14 @@ fn a_late_master_is_stood_in_for_and_given_what_it_missed() {
             .feed(Input::Slow, &[])
             .feed(Input::CaughtUp, &[Action::OpenGate])
             .wake(PROBING.interval, &[Action::Probe])
-            // No probe is started while one is under way.
+            // No probe is started while another one is running.
             .feed(Input::Late, &[Action::StandIn])
             .feed(Input::LateAnswered, &[Action::CatchUp])
             .feed(
                 Input::NotCaughtUp,
                 &[Action::ShutGate(Cause::Late), Action::Connect],
             )
-            // This answer belongs to an earlier time.
+            // This answer belongs to the time before.
             .feed(Input::LateAnswered, &[])
             .feed(Input::CaughtUp, &[])
             .serve(false)
@@ -151,7 +151,7 @@ fn a_master_that_hangs_at_last_is_killed_at_last() {
         .miss_all(Does::Starve, STARVED)
         .wake(FIRST_PAUSE, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine]);
-    // The last sample before still shows it starved.
+    // The previous sample still shows it starved.
     script.now += Duration::from_secs(3);
     script
         .feed_seen(Does::Nothing, Input::Unreachable, &[STARVED])
@@ -199,7 +199,7 @@ fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
         actions
     };
     assert_eq!(refuse(&mut script, Does::Work, 120), []);
-    // Then it waits forever.
+    // From then on it waits forever.
     let actions = refuse(&mut script, Does::Nothing, 2);
     assert_eq!(actions.first(), Some(&Action::Kill));
     script.feed(Input::Exited, &[Action::Spawn]);

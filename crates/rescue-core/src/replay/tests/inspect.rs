@@ -1,7 +1,7 @@
 use super::*;
 use crate::replay::{Bears, Inspection, NotAMaster, Token, difference};
 
-/// Reads the state of `master` in the way rosrescue does over the network.
+/// Reads the state of `master` as rosrescue does over the network.
 fn look(master: &mut Master, previous: &Master) -> Master {
     let token = Token::new("m", 1);
     let reply = master.apply(&Inspection::call(&token)).reply;
@@ -69,7 +69,7 @@ fn an_inspection_believes_the_master_about_changes() {
         master.apply(&call);
     }
     let found = look(&mut master.clone(), &previous);
-    // `/s` is another process now, so the subscriptions of the old one are not its own.
+    // `/s` is another process now, which does not have the old one's subscriptions.
     assert_eq!(found, master);
 }
 
@@ -94,7 +94,7 @@ fn an_empty_master_shows_no_state_and_no_token() {
     }
     master.apply(&set("/a", 1));
     assert!(!look(&mut master).is_empty());
-    // A later number is found even while the master also bears an earlier one.
+    // A later number is found even if the master also has an earlier one.
     let [session, _] = Token::new("m", 12).leave();
     master.apply(&session);
     assert_eq!(look(&mut master).bears(), Bears::Later(12));

@@ -33,7 +33,7 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     (master, outcome.notices)
 }
 
-/// Brings `target` to an empty master, and checks that the master then holds it and has sent no callback.
+/// Brings an empty master to `target`, and checks that it then holds `target` and has sent no callback.
 fn restores(target: &Master) -> Plan {
     let plan = Plan::new(target, &Master::default(), &token());
     let (master, notices) = run(&plan, &Master::default());
@@ -104,7 +104,7 @@ fn only_addresses_that_the_master_already_had_are_read_back() {
 
 #[test]
 fn each_topic_type_out_of_order_takes_one_helper_registration() {
-    // `/late` got its subscriber before anything was published, so its type comes first.
+    // `/late` had a subscriber before any topic was published, so its type comes first.
     let master = after([
         subscribe("/s", "/late", "a/B"),
         publish("/p", "/early", "a/B"),
@@ -174,7 +174,7 @@ fn unreturnable_parameters_are_left_out_and_named_by_key() {
     assert_eq!(restored, after([set("/good", 1), set("/ns/fine", 2)]));
 }
 
-/// A master in any state can be brought to exactly any other state, and no node notices.
+/// A master in any state can be brought to exactly any other state, and no node is notified.
 #[test]
 fn a_state_is_replaced_without_any_callback() {
     let roscore = roscore();
@@ -228,7 +228,7 @@ fn tokens_are_not_restored() {
     assert_eq!(plan.skipped(), []);
 }
 
-/// A roscore that was started again by someone else, with a `/rosout` of its own.
+/// A roscore that another program has restarted, with a `/rosout` of its own.
 fn roscore() -> Master {
     after([
         set("/run_id", "new"),
@@ -355,7 +355,7 @@ fn verification_finds_every_kind_of_deviation_and_shows_no_values() {
     assert!(plan.verify(&Reply::Value(Value::Array(vec![]))).is_err());
 }
 
-/// The type of a topic that came and went while the master did not answer.
+/// The topic was used only while the master did not answer.
 #[test]
 fn a_type_without_nodes_keeps_its_place_in_a_master_that_is_emptied_first() {
     let mut target = after([
@@ -369,7 +369,7 @@ fn a_type_without_nodes_keeps_its_place_in_a_master_that_is_emptied_first() {
     assert_eq!(plan.expected(), &target);
 }
 
-/// The types of topics that were registered with another type while the master did not answer.
+/// The topics were registered with another type while the master did not answer.
 #[test]
 fn a_changed_type_is_corrected_in_a_master_that_is_emptied_first() {
     let before = [

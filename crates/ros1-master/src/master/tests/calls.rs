@@ -1,4 +1,4 @@
-//! Tests of the model alone. `tests/differential` checks that it equals a real rosmaster.
+//! Tests of calls on the model. `tests/differential` checks that the model equals a real rosmaster.
 
 use crate::{
     master::{Entry, Master, Method, Notice, Request},

@@ -1,9 +1,9 @@
-//! What a call may cost: never more than it costs a master, however the call is made.
+//! Tests that no call costs more than it would cost a master.
 
 use super::*;
 use crate::master::NoticeSink;
 
-/// Records the receivers of a value, and where the value lies in memory.
+/// Records the receivers of a value, and the value's address in memory.
 #[derive(Default)]
 struct Lent(Vec<(usize, String, *const Value)>);
 

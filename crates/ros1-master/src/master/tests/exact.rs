@@ -1,4 +1,4 @@
-//! Which reads the model answers byte for byte as rosmaster does, and which it leaves to the master.
+//! Tests which reads the model answers byte for byte as rosmaster does, and which it leaves to the master.
 
 use super::*;
 use crate::xmlrpc::MAX_DEPTH;

@@ -1,4 +1,4 @@
-//! The quirks of the parameter server.
+//! Tests of the parameter server's special cases.
 
 use super::*;
 
@@ -81,7 +81,7 @@ fn param_updates_go_to_subscribers_above_below_and_at_the_key() {
         key: key.to_owned(),
         value: value.clone(),
     };
-    // `/set`, which made the change, is left out. The root and the exact keys come first.
+    // `/set` made the change and is left out. The root and the exact keys come first.
     assert_eq!(
         told,
         [
@@ -91,7 +91,7 @@ fn param_updates_go_to_subscribers_above_below_and_at_the_key() {
             update("/leaf", "/a/b/", &2.into()),
         ]
     );
-    // Setting a scalar above a subscribed key notifies nobody below.
+    // Setting a scalar above a subscribed key notifies no subscriber below it.
     assert_eq!(notices(&mut master, &set("/a", 1)).len(), 2);
     let told = notices(&mut master, &call("deleteParam", &["/set", "/a"]));
     assert_eq!(told.len(), 5);

@@ -1,4 +1,4 @@
-//! One test for each behaviour of rosmaster that is not what one would expect.
+//! One test for each surprising behaviour of rosmaster.
 
 use super::*;
 
@@ -268,8 +268,8 @@ fn a_node_without_any_registration_is_forgotten() {
     assert_eq!(master.unregister_calls("/nobody"), []);
 }
 
-/// rosmaster 1.14.3 and before answers 0 in place of an empty list or name, and notifies the node that sets a
-/// parameter as well.
+/// rosmaster 1.14.3 and earlier answers 0 in place of an empty list or name, and also notifies the node that sets a
+/// parameter.
 #[test]
 fn rosmaster_1_14_3_and_before_refuses_and_notifies_differently() {
     let value = |old, call: &Request| {

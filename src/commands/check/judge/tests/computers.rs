@@ -15,7 +15,7 @@ use crate::{
     config::ClusterError,
 };
 
-/// A cluster of three with nothing to say about.
+/// A cluster of three computers without problems.
 fn cluster() -> Cluster {
     let endpoints = ["http://a:2379", "http://b:2379", "http://c:2379"];
     Cluster {

@@ -16,7 +16,7 @@ use crate::ros_env::MasterUri;
 fn a_robot_in_order_has_nothing_to_be_told() {
     assert_eq!(said(|_| {}), []);
     assert!(judge(&robot()).len() >= 8);
-    // Also while rosrescue runs, with its own master, and its checkpoint in use.
+    // The same holds while rosrescue runs, with its own master and its checkpoint in use.
     let found = said(|facts| {
         port(facts).taken = taken(rosrescue(None));
         facts.disk.holder = Some(Some(7));
@@ -212,7 +212,7 @@ fn names_that_lead_nowhere_or_elsewhere() {
     );
 }
 
-/// Where only nodes run, what serves the robot is not missed.
+/// On a computer with nodes alone, the check does not ask for what serves the robot.
 #[test]
 fn another_computer_of_the_robot() {
     let elsewhere = |facts: &mut Facts| {

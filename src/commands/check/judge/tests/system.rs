@@ -133,7 +133,7 @@ fn the_master_of_a_proxy() {
         facts.rosmaster = None;
         facts.proxied = Some((MasterUri::parse("http://robot:11411").unwrap(), server));
         facts.masters = vec![process(9, "rosmaster", 11411)];
-        // It is wanted there.
+        // A master at that address is intended.
         facts
             .units
             .push(unit("roscore.service", Kind::Roscore, true));

@@ -1,4 +1,4 @@
-//! What the nodes have in common. `tests/field/clients/measure.py` describes what they do and print.
+//! Common parts of the nodes. `tests/field/clients/measure.py` describes what they do and print.
 
 use std::fmt::{Debug, Display};
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ pub const TICK: Duration = Duration::from_millis(100);
 
 rosrust::rosmsg_include!(std_msgs / String, std_srvs / Trigger);
 
-/// The name of the node, which is the only argument.
+/// The node's name, which is the only argument.
 pub fn name() -> String {
     std::env::args().nth(1).expect("usage: PROGRAM NAME")
 }
@@ -19,7 +19,7 @@ pub fn say(what: impl Display) {
     println!("{what}");
 }
 
-/// Prints how call `number` of a kind ended, and after how many milliseconds.
+/// Prints how call `number` of a kind ended, and how long it took in milliseconds.
 pub fn outcome<E: Debug>(what: &str, number: i32, start: Instant, result: Result<(), E>) {
     let ms = start.elapsed().as_millis();
     match result {

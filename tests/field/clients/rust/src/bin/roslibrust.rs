@@ -1,4 +1,4 @@
-//! A node of roslibrust with its feature `ros1`. It has no calls for parameters.
+//! A node of roslibrust with its feature `ros1`, which has no calls for parameters.
 
 use std::time::Instant;
 
