@@ -321,7 +321,7 @@ pub async fn run(
             rate: Rate::new(Instant::now()),
             hide: config.hide,
             stop: halt.clone(),
-            desk: Default::default(),
+            state: Default::default(),
         },
     });
     let permits = Arc::new(Semaphore::new(config.max_connections));
@@ -351,7 +351,9 @@ pub async fn run(
         match runs {
             Runs::Single(post) => {
                 let ends = (stop.clone(), halt.clone());
-                let (driver, first) = post.alone(rosmaster, port, rosout, restored, ends).await;
+                let (driver, first) = post
+                    .start_single(rosmaster, port, rosout, restored, ends)
+                    .await;
                 Begun::Single(Box::new(driver), first)
             }
             Runs::Member(member) => Begun::Member(member),

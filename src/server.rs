@@ -33,7 +33,7 @@ use crate::status::stats::Stats;
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
-    /// Who may call, and who may change something.
+    /// The networks that may call and make changes.
     pub(crate) access: Access,
     /// When each refused address was last logged.
     pub(crate) refused: Mutex<Said>,

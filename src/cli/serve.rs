@@ -10,7 +10,7 @@ use super::{cluster::ClusterArgs, tools::HideArgs};
 /// Heading of the options that few robots need.
 const ADVANCED: &str = "Advanced options";
 
-/// Options of `rosrescue core`. The short ones are roscore's.
+/// Options of `rosrescue core`. Those with a short form are roscore's.
 #[derive(Args, Clone, Debug)]
 pub struct CoreArgs {
     /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
@@ -306,7 +306,7 @@ pub enum SyncPolicy {
     Never,
 }
 
-/// Who answers reads.
+/// The side that answers reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Reads {
     /// The mirror

@@ -65,7 +65,7 @@ impl Ledger {
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         let heard = concern.heard();
-        if !idle || inner.order.holds_read(&heard) {
+        if !idle || inner.order.read_must_wait(&heard) {
             return None;
         }
         let number = inner.order.begin(now, heard);

@@ -202,7 +202,7 @@ impl MasterProcess {
     }
 
     /// Kills the master at once, so that it notifies no more nodes. The returned future waits for its end.
-    pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
+    pub(crate) fn kill_and_wait(mut self) -> impl Future<Output = ()> + Send + 'static {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
             process::signal_process(pid, rustix::process::Signal::KILL);

@@ -39,7 +39,7 @@ const PAGE: usize = 32;
 /// Settings of a client.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Each is `http://HOST:PORT` or `https://HOST:PORT`.
+    /// The endpoints, each `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
     pub access: Access,
 }

@@ -36,7 +36,9 @@ impl Findings {
         let runs = port.and_then(|port| port.taken.as_ref());
         let runs = runs.is_some_and(|taken| matches!(taken.server, Server::Rosrescue { .. }));
         if let (Some(holder), false) = (disk.holder, runs) {
-            let who = holder.map_or_else(String::new, |pid| format!(", process {pid}"));
+            let who = holder
+                .pid
+                .map_or_else(String::new, |pid| format!(", process {pid}"));
             return self.bad(
                 SUBJECT,
                 format!("{path} is in use by another rosrescue{who}"),
