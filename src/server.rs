@@ -39,7 +39,7 @@ pub struct Server {
     pub(crate) refused: Mutex<Said>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
-    /// Signals that a request of rosrescue itself has arrived: then the master's address is rosrescue's own.
+    /// Signals that a request from this rosrescue has arrived here: the master's address leads back to it.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,
     /// Connections without a request in progress.

@@ -21,8 +21,8 @@ pub struct CoreArgs {
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// Number of rosmaster threads that notify nodes. roscore has 3. With more, an unreachable node delays the
-    /// others less
+    /// Number of rosmaster threads that notify nodes. roscore has 3. With more threads, an unreachable
+    /// node delays other nodes less
     #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT", help_heading = ADVANCED)]
     #[arg(default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,

@@ -14,8 +14,8 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// How long before an outage a change may be whose notifications the dead master has not sent. Unreachable nodes can
-/// hold up its three notifier threads.
+/// A dead master may not have sent the notifications of changes that happened up to this long before the outage.
+/// Unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
 /// Longest time to tell a node to shut down, with all retries.
 const TELLING: Duration = Duration::from_secs(60);

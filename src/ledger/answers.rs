@@ -37,7 +37,7 @@ impl Ledger {
             return None;
         }
         if *read.method() == Method::GetParamNames {
-            // Most reads concern parameters alone. Copying that tree is cheap, but walking it is not.
+            // This walks the whole tree. It works on a copy without the lock, and copying the tree costs nothing.
             let mut params = inner.mirror.with_params_only();
             drop(inner);
             return params.exact_answer(read);
@@ -132,7 +132,7 @@ impl Ledger {
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // The writes were applied, but the answer cannot be encoded. A retry changes nothing and fails again.
+            // The writes were applied, but the answer cannot be encoded. The master refuses a refused write again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()

@@ -66,7 +66,7 @@ pub(crate) struct Seen {
     kept: Option<PathBuf>,
     /// How many times records were withheld from the store.
     gaps: u64,
-    /// How many of these gaps a complete checkpoint has closed.
+    /// Number of the [gaps](Self::gaps) that a complete checkpoint has closed.
     gaps_over: u64,
 }
 

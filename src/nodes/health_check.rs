@@ -306,7 +306,7 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // The answer fits several names, so no name is reconciled.
+                // If the answer could fit several names, none of them is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure

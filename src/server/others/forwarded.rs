@@ -43,7 +43,7 @@ impl Forwarded {
         Some(Sent { of, number })
     }
 
-    /// The writes among these calls.
+    /// The writes that were sent to a leader and are not answered yet.
     pub(crate) fn writes(&self) -> Vec<Request> {
         let calls = self.lock();
         let calls = calls.calls.values().flat_map(Request::calls);

@@ -29,7 +29,7 @@ const UNFAIR_PART: u32 = 2;
 pub struct Effort {
     /// Whether a thread runs or waits for the processor.
     pub runnable: bool,
-    /// Whether a thread waits for a disk, and no thread for anything else.
+    /// Whether a thread waits for a disk and cannot be interrupted (state `D`).
     pub on_disk: bool,
     /// Whether every thread was stopped, by SIGSTOP or a debugger.
     pub stopped: bool,
