@@ -39,7 +39,7 @@ pub(super) struct Post {
     pub(super) supervision: Supervision,
     pub(super) probing: Probing,
     pub(super) probe_timeout: Duration,
-    /// Most disk space for the checkpoints kept from rescues, in bytes.
+    /// Maximum disk space for the checkpoints kept from rescues, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
     pub(super) checkpoint: PathBuf,

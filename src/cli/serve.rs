@@ -90,7 +90,7 @@ pub struct CommonArgs {
     /// Whether a start restores the checkpoint
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
     pub restore: RestoreChoice,
-    /// Most space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
+    /// Maximum space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
     #[arg(
         long,
         env = "ROSRESCUE_HISTORY",
@@ -230,7 +230,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
     pub master_connections: u32,
-    /// Most connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
+    /// Maximum number of connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
     #[arg(
         long,
         env = "ROSRESCUE_MAX_CONNECTIONS",

@@ -14,8 +14,8 @@ use crate::{
 /// Up to this many pending writes, an unregistration that changes nothing in the mirror also becomes pending.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
-/// Most memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a large
-/// state could need any amount. Larger multicalls wait for the master.
+/// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
+/// large state could need any amount. Larger multicalls wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
 /// The same limit while there is a master. It then answers larger multicalls.

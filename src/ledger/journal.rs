@@ -25,7 +25,7 @@ pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 /// Why nothing is recorded after [`DISK_PATIENCE`].
 pub(crate) const SILENT: &str = "the disk has not answered for 5 s";
 
-/// Most jobs that wait for the disk: about one for each client that waits for an answer.
+/// Maximum number of jobs that wait for the disk: about one for each client that waits for an answer.
 const JOBS_MAX: usize = 2048;
 
 type Job = Box<dyn FnOnce(&mut Store) + Send>;

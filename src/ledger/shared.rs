@@ -11,9 +11,9 @@ use crate::{
     master::{Master, Request},
 };
 
-/// Most changes that are remembered for computers that were cut off.
+/// Maximum number of changes that are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
-/// Most bytes of these changes, approximately.
+/// Maximum number of bytes of these changes, approximately.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
 /// The role of this ledger among the robot's computers.

@@ -35,7 +35,7 @@ use crate::{
 
 /// Pause before a node is asked again to confirm a removal.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
-/// Most questions to a node whose answers keep changing.
+/// Maximum number of questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
 
 /// The result of asking the nodes at one port.

@@ -49,9 +49,9 @@ const JSON: &str = "application/json";
 
 /// Version of `/state.json`. It changes when a field is removed or changes its meaning.
 const SCHEMA: u32 = 1;
-/// Most nodes, topics or services in `/state.json`.
+/// Maximum number of nodes, topics or services in `/state.json`.
 const LISTED: usize = 5000;
-/// Most characters of a query value.
+/// Maximum number of characters of a query value.
 const ASKED: usize = 500;
 
 /// Content security policy: a page may only load its own script, style and data.

@@ -14,10 +14,10 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Most calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a few
-/// milliseconds at most.
+/// Maximum number of calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a
+/// few milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
-/// Most bytes of bodies in a batch.
+/// Maximum number of bytes of bodies in a batch.
 pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]

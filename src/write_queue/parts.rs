@@ -9,7 +9,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Most entries of a multicall that is sent whole, as the client's own bytes.
+/// Maximum number of entries of a multicall that is sent whole, as the client's own bytes.
 const ENTRIES_WHOLE: usize = 2 * CALLS_MAX;
 
 /// The parts of a long multicall, in order. Each is a multicall of a batch's size.

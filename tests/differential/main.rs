@@ -64,7 +64,7 @@ const THREE_EACH: u64 = 3;
 const READS: [&str; 2] = ["master", "mirror"];
 /// Number of nodes that receive callbacks.
 const NODES: usize = 5;
-/// Most runs for finding a shorter script.
+/// Maximum number of runs for finding a shorter script.
 const PATIENCE: usize = 300;
 /// Longest time for finding a shorter script. One run with takeovers may take half a minute.
 const SHRINKING: Duration = Duration::from_secs(120);

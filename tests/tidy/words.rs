@@ -104,9 +104,9 @@ const PHRASES: &[(&str, &str)] = &[
     ("whoever", "(name the program or person)"),
 ];
 
-/// Most words of a sentence in `--help`.
+/// Maximum number of words of a sentence in `--help`.
 const HELP_WORDS: usize = 25;
-/// Most words of a sentence in the documents that a new user reads first.
+/// Maximum number of words of a sentence in the documents that a new user reads first.
 const GUIDE_WORDS: usize = 30;
 
 /// Files and folders whose words are not checked: this list, the examples of how to write, and the code of several

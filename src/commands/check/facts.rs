@@ -37,7 +37,7 @@ use crate::{
 
 /// Longest time for one name lookup. A dead name server takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
-/// Most addresses in launch files that are looked up.
+/// Maximum number of addresses in launch files that are looked up.
 const LOOKUPS_MOST: usize = 4;
 /// Names of services that set the clock.
 const CLOCKS: [&str; 6] = [

@@ -29,7 +29,7 @@ use crate::{
     },
 };
 
-/// Most listeners, because each holds a connection. Further pages poll the status.
+/// Maximum number of listeners, because each holds a connection. Further pages poll the status.
 const LISTENERS: usize = 16;
 /// Time after which a listener must make room for a new one. The kernel accepts many events for a peer that never
 /// reads, so a write does not show whether the listener reads. A browser reconnects.
