@@ -11,7 +11,7 @@ use crate::{
     upstream::Upstream,
 };
 
-/// Limits the log lines that the master has ended or is killed, and that a new one is started.
+/// Limits the log lines about the end of a master, and about the start of a new one.
 static ENDED: Pair = Pair::new();
 
 /// Process id of a child, and how it ended.
