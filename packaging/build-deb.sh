@@ -15,7 +15,7 @@ while [ $# -gt 0 ]; do
     case $1 in
     --debug) profile=dev fast=--fast ;;
     --version) version=$2 && shift ;;
-    *) echo "build-deb.sh: what is $1? It takes --debug and --version VERSION" >&2 && exit 2 ;;
+    *) echo "build-deb.sh: unknown argument $1; use --debug and --version VERSION" >&2 && exit 2 ;;
     esac
     shift
 done
@@ -33,7 +33,7 @@ else
     program=$target/dist/rosrescue
 fi
 
-# What comes from the definition of the command line.
+# Completions and manual pages, made from the definition of the command line.
 assets=target/package
 rm -rf "$assets"
 mkdir -p "$assets/completions"

@@ -8,7 +8,7 @@ cd "$(dirname "$0")/.."
 checkout=$PWD
 root=$checkout/target/field/ubuntu-16.04/root
 
-# What the program may need at most.
+# The newest C library that the program may need.
 newest=GLIBC_2.18
 
 # Fetched here: the old system has no certificates.

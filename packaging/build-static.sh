@@ -8,7 +8,7 @@ cd "$(dirname "$0")/.."
 target=${1:-$(uname -m)-unknown-linux-musl}
 case $target in
 *-linux-musl*) ;;
-*) echo "build-static.sh: $target is no musl target, such as $(uname -m)-unknown-linux-musl" >&2 && exit 2 ;;
+*) echo "build-static.sh: $target is not a musl target such as $(uname -m)-unknown-linux-musl" >&2 && exit 2 ;;
 esac
 
 if ! libraries=$(rustc --print target-libdir --target "$target" 2>/dev/null); then

@@ -266,7 +266,9 @@ impl Runs {
                 let rosout = supervised.as_ref().map(|supervised| supervised.rosout);
                 let rosmaster = supervised.map(|supervised| supervised.rosmaster);
                 let ends = (stop.clone(), halt.clone());
-                let (driver, first) = parts.alone(rosmaster, port, rosout, restored, ends).await;
+                let (driver, first) = parts
+                    .start_single(rosmaster, port, rosout, restored, ends)
+                    .await;
                 Begun::Single(Box::new(driver), first)
             }
             Self::Member(member) => Begun::Member(member),

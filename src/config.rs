@@ -83,7 +83,7 @@ pub struct Config {
     /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
     pub checkpoint_is_given: bool,
     pub restore: Restore,
-    /// Most space for kept checkpoints, in bytes.
+    /// Maximum space for kept checkpoints, in bytes.
     pub history: u64,
     /// When the journal is synced to the disk.
     pub sync: SyncPolicy,
@@ -108,9 +108,9 @@ pub struct Config {
     pub resync_interval: Option<Duration>,
     /// Whether the mirror or the master answers reads while there is a master.
     pub reads: Reads,
-    /// Most connections to the master for reads.
+    /// Maximum number of connections to the master for reads.
     pub master_connections: usize,
-    /// Most connections from clients.
+    /// Maximum number of connections from clients.
     pub max_connections: usize,
     /// Largest request body in bytes.
     pub max_body: usize,

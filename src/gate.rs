@@ -152,7 +152,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_look_tells_of_a_change_that_nobody_has_waited_for() {
+    async fn a_look_reports_a_change_that_was_not_waited_for() {
         let (tx, mut rx) = gate();
         tx.set(State::StandingIn);
         assert_eq!(rx.look_changed(), (State::StandingIn, true));

@@ -67,7 +67,7 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     let mut worker = Worker::start(listeners, 0)?;
     let mut count = 0;
     loop {
-        let end = worker.attend(&signals, |signal| restarts.stop(signal));
+        let end = worker.run_until_end(&signals, |signal| restarts.stop(signal));
         let (pause, again_and_again) =
             match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
                 Next::Exit(status) => return Ok(status),
@@ -187,7 +187,7 @@ impl Worker {
     }
 
     /// Waits for the worker's end, and passes signals on. Calls `stopping` for each signal.
-    fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut(i32)) -> End {
+    fn run_until_end(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut(i32)) -> End {
         loop {
             match signals.recv() {
                 Ok(SIGCHLD) => {

@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_long_rest_it_is_as_at_first() {
+    fn after_a_long_rest_the_limit_is_as_at_the_start() {
         let limit = Limit::new();
         let start = Instant::now();
         let burst = |at: Instant| (0..20).filter(|_| limit.pass(at).is_some()).count();
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn an_all_clear_follows_whatever_line_has_told_of_the_trouble() {
+    fn an_all_clear_follows_any_line_that_reported_the_trouble() {
         let pair = Pair::new();
         let now = Instant::now();
         // Without an alarm, as at the start, the all-clear is an ordinary line.

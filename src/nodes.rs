@@ -51,7 +51,7 @@ const OWED_AFTER: Duration = Duration::from_millis(50);
 /// master has sent its own, unless it has a long backlog.
 const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
-/// Most nodes that are remembered because they do not answer `paramUpdate`.
+/// Maximum number of nodes that are remembered because they do not answer `paramUpdate`.
 const MUTE_MOST: usize = 1024;
 
 /// What rosrescue knows of the nodes beyond their registrations.

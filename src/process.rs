@@ -342,7 +342,7 @@ pub(crate) fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// The output of `program`, if it ends within `limit`, trimmed as roslaunch's `command=` does.
+/// The output of `program`, if it ends within `limit`, in the form that roslaunch's `command=` would use.
 pub(crate) async fn output_of(
     program: &str,
     arguments: &[&str],

@@ -25,7 +25,7 @@ mod tests {
     const LONG: Duration = Duration::from_secs(1);
 
     #[tokio::test]
-    async fn own_addresses_are_told_from_others() {
+    async fn own_addresses_are_distinguished_from_others() {
         for own in ["127.0.0.1", "127.9.9.9", "[::1]", "0.0.0.0", "localhost"] {
             assert!(
                 !is_elsewhere(&format!("http://{own}:4711/"), LONG).await,

@@ -33,13 +33,13 @@ use crate::status::stats::Stats;
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
-    /// Who may call, and who may change something.
+    /// The networks that may call and make changes.
     pub(crate) access: Access,
     /// When each refused address was last logged.
     pub(crate) refused: Mutex<Said>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
-    /// Signals that a request of rosrescue itself has arrived: then the master's address is rosrescue's own.
+    /// Signals that a request from this rosrescue has arrived here: the master's address leads back to it.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,
     /// Connections without a request in progress.

@@ -74,7 +74,7 @@ pub enum CallError {
     /// The reply's body ended early or exceeded a limit.
     #[error("the master's reply is incomplete: {0}")]
     BrokenReply(Box<dyn std::error::Error + Send + Sync>),
-    /// The reply is complete, but not XML-RPC. Only for calls made by rosrescue.
+    /// The reply is complete, but not XML-RPC. Checked only for calls made by rosrescue.
     #[error("the master's reply is not XML-RPC (HTTP status {status}): {reason}")]
     NotXmlRpc { status: StatusCode, reason: String },
 }

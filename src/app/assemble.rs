@@ -233,7 +233,7 @@ pub(super) fn server(
             rate: Rate::new(Instant::now()),
             hide: config.hide.clone(),
             stop: halt,
-            desk: Default::default(),
+            state: Default::default(),
         },
     }
 }

@@ -40,7 +40,7 @@ pub(super) struct Parts {
     pub(super) supervision: Supervision,
     pub(super) probing: Probing,
     pub(super) probe_timeout: Duration,
-    /// Most disk space for the checkpoints kept from rescues, in bytes.
+    /// Maximum disk space for the checkpoints kept from rescues, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
     pub(super) checkpoint: PathBuf,
@@ -96,7 +96,7 @@ impl Parts {
     /// whether to run rosout; `None` skips all of roscore's other duties. `restored` says whether the mirror comes from
     /// a checkpoint whose session continues. When the first token of `ends` is cancelled, rosout is stopped, and then
     /// the second token is cancelled.
-    pub(super) async fn alone(
+    pub(super) async fn start_single(
         &self,
         rosmaster: Option<Rosmaster>,
         port: Option<u16>,
@@ -195,7 +195,7 @@ impl Duty {
             Ok(ended) => ended.ok().flatten(),
             Err(panic) => resume(panic),
         };
-        let ended = process.map(MasterProcess::end);
+        let ended = process.map(MasterProcess::kill_and_wait);
         async move {
             if let Some(roscore) = self.roscore {
                 // A panic in that task must not prevent the rest.

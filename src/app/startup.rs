@@ -114,7 +114,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             Decision::Fresh(why) => {
                 // A crashed rosrescue may have left its master running. It is taken over.
                 master_uri = session.master_uri.filter(|_| !session.closed);
-                // With a new token, masters of this session reveal a copy of the old checkpoint as older than they are.
+                // The new session keeps this token. So its masters show that a copy of the old checkpoint is older.
                 token = (session.mark, session.incarnation);
                 let kept;
                 (store, kept) = set_aside(store).await;

@@ -41,7 +41,7 @@ pub struct ClusterArgs {
     #[arg(long, env = "ROSRESCUE_ALONE", value_enum, requires = "cluster", help_heading = COMPUTERS)]
     #[arg(default_value_t = WhenCutOff::Serve)]
     pub alone: WhenCutOff,
-    /// Certificate of the authority that signed the certificates of etcd, a PEM file, for https
+    /// CA certificate of etcd, a PEM file, for https
     #[arg(long, env = "ROSRESCUE_CLUSTER_CA", value_name = "FILE", help_heading = COMPUTERS)]
     #[arg(requires = "cluster")]
     pub cluster_ca: Option<PathBuf>,
@@ -84,7 +84,7 @@ pub enum WhenCutOff {
 /// The parsed value of `--cluster`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Members {
-    /// Each is `http://HOST:PORT` or `https://HOST:PORT`. All use the same scheme.
+    /// The etcd endpoints, each `http://HOST:PORT` or `https://HOST:PORT`, all with the same scheme.
     pub endpoints: Vec<String>,
     pub robot: String,
 }

@@ -9,7 +9,7 @@ use super::{OutputArgs, TargetArgs, cluster::name};
 /// Options of `rosrescue top`.
 #[derive(Args, Clone, Debug)]
 pub struct TopArgs {
-    /// Which one.
+    /// The running rosrescue.
     #[command(flatten)]
     pub target: TargetArgs,
     /// Stop after this many updates, one per second [default: until q, Ctrl-C or a signal]
@@ -24,7 +24,7 @@ pub struct TopArgs {
 /// Options of `rosrescue handover`.
 #[derive(Args, Clone, Debug)]
 pub struct HandoverArgs {
-    /// Which one; any of the robot's computers will do.
+    /// The running rosrescue, on any of the computers of the robot.
     #[command(flatten)]
     pub target: TargetArgs,
     /// Computer that should lead: its name, the beginning of its name, or its address [default: any follower]
@@ -39,7 +39,7 @@ pub struct HandoverArgs {
     )]
     #[arg(value_parser = seconds)]
     pub timeout: f64,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -47,7 +47,7 @@ pub struct HandoverArgs {
 /// Options of `rosrescue wait`.
 #[derive(Args, Clone, Debug)]
 pub struct WaitArgs {
-    /// Which one.
+    /// The running rosrescue.
     #[command(flatten)]
     pub target: TargetArgs,
     /// What to wait for: `answered`, `master`, `protected`, or the /NAME of a node. `answered`: rosrescue answers
@@ -65,7 +65,7 @@ pub struct WaitArgs {
     )]
     #[arg(value_parser = seconds)]
     pub timeout: f64,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }

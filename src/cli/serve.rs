@@ -10,7 +10,7 @@ use super::{cluster::ClusterArgs, tools::HideArgs};
 /// Heading of the options that few robots need.
 const ADVANCED: &str = "Advanced options";
 
-/// Options of `rosrescue core`. The short ones are roscore's.
+/// Options of `rosrescue core`. Those with a short form are roscore's.
 #[derive(Args, Clone, Debug)]
 pub struct CoreArgs {
     /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
@@ -21,8 +21,8 @@ pub struct CoreArgs {
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// Number of rosmaster threads that notify nodes. roscore has 3. With more, an unreachable node delays the
-    /// others less
+    /// Number of rosmaster threads that notify nodes. roscore has 3. With more threads, an unreachable
+    /// node delays other nodes less
     #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT", help_heading = ADVANCED)]
     #[arg(default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,
@@ -90,7 +90,7 @@ pub struct CommonArgs {
     /// Whether a start restores the checkpoint
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
     pub restore: RestoreChoice,
-    /// Most space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
+    /// Maximum space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
     #[arg(
         long,
         env = "ROSRESCUE_HISTORY",
@@ -230,7 +230,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
     pub master_connections: u32,
-    /// Most connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
+    /// Maximum number of connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
     #[arg(
         long,
         env = "ROSRESCUE_MAX_CONNECTIONS",
@@ -306,7 +306,7 @@ pub enum SyncPolicy {
     Never,
 }
 
-/// Who answers reads.
+/// The side that answers reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Reads {
     /// The mirror

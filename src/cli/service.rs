@@ -17,7 +17,7 @@ Examples:
   sudo rosrescue install -- proxy --master http://127.0.0.1:11312
   rosrescue install --user                   without root, as a service of your own")]
 pub struct InstallArgs {
-    /// Which service, and how.
+    /// Which systemd to use, and whether to ask.
     #[command(flatten)]
     pub scope: ScopeArgs,
     /// User that runs the service [default: the user who called sudo]
@@ -36,7 +36,7 @@ pub struct InstallArgs {
 /// Options of `rosrescue uninstall`.
 #[derive(Args, Clone, Debug)]
 pub struct UninstallArgs {
-    /// Which service, and how.
+    /// Which systemd to use, and whether to ask.
     #[command(flatten)]
     pub scope: ScopeArgs,
 }
@@ -56,7 +56,7 @@ pub struct ScopeArgs {
     /// Do not ask. Required without a terminal
     #[arg(short, long)]
     pub yes: bool,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }

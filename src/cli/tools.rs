@@ -78,10 +78,10 @@ pub struct HideArgs {
 /// Options of `rosrescue status`.
 #[derive(Args, Clone, Debug)]
 pub struct StatusArgs {
-    /// Which one.
+    /// The running rosrescue.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -110,7 +110,7 @@ pub struct CheckArgs {
     /// The cluster options of `core`.
     #[command(flatten)]
     pub cluster: ClusterArgs,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -118,7 +118,7 @@ pub struct CheckArgs {
 /// Options of `rosrescue drill`.
 #[derive(Args, Clone, Debug)]
 pub struct DrillArgs {
-    /// Which one.
+    /// The running rosrescue.
     #[command(flatten)]
     pub target: TargetArgs,
     /// What to kill, with SIGKILL
@@ -169,7 +169,7 @@ pub struct DrillArgs {
     /// Do not ask before killing
     #[arg(short, long)]
     pub yes: bool,
-    /// In which form.
+    /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
 }

@@ -17,7 +17,7 @@ use super::{
     machine::{Alive, Answer, Guard, Leader, Op, Settings, View},
 };
 
-/// Most robots that [`Etcd::robots`] lists.
+/// Maximum number of robots that [`Etcd::robots`] lists.
 const ROBOTS_MOST: usize = 16;
 /// Upper end of the key range with all robots: `0` follows `/` in ASCII.
 const ROBOTS_END: &str = "0";

@@ -24,7 +24,7 @@ pub enum Way {
 /// was committed before, and no other record of an earlier term will follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Place {
-    /// The term in which the record was written.
+    /// The leader's term at that time.
     pub term: u64,
     /// The record's number.
     pub seq: u64,

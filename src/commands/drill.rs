@@ -73,7 +73,7 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
     };
     let stop = CancellationToken::new();
     let ended = tokio::select! {
-        verdict = drill.hold(&status, &stop) => verdict,
+        verdict = drill.run(&status, &stop) => verdict,
         _ = interrupt.recv() => Err(interrupted()),
         _ = terminate.recv() => Err(interrupted()),
     };
@@ -155,11 +155,7 @@ impl Drill<'_> {
     }
 
     /// Runs the whole drill, without [`Self::tidy_up`].
-    async fn hold(
-        &mut self,
-        status: &Status,
-        stop: &CancellationToken,
-    ) -> Result<Verdict, Failure> {
+    async fn run(&mut self, status: &Status, stop: &CancellationToken) -> Result<Verdict, Failure> {
         let start = Instant::now();
         eprintln!("watching normal operation, and finding topics with messages");
         let api = self.target.api.clone();

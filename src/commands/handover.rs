@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn the_outcome_is_what_was_asked_for_or_not() {
+    fn the_outcome_says_whether_the_requested_computer_leads() {
         for (from, to, wanted, handed_over, text) in [
             ("a", Some("b"), None, true, "a led, b leads now, after"),
             ("a", Some("b"), Some("b"), true, "a led, b leads now, after"),

@@ -21,7 +21,8 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Most calls in one multicall; its size is limited as well. Other callers get their turn between two multicalls.
+/// Maximum number of calls in one multicall; its size is limited as well. Other callers get their turn between two
+/// multicalls.
 const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 

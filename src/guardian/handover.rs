@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn sockets_are_taken_by_the_process_that_they_are_for() {
+    fn sockets_are_used_only_by_the_process_that_they_are_for() {
         assert_eq!(giver_of(&[]), None);
         let fds = (LISTEN_FDS, "2");
         assert_eq!(giver_of(&[fds]), None);

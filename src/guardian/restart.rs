@@ -6,8 +6,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// How many workers in a row may fail before they answer calls and still be replaced at once. Also the number of deaths
-/// within [`SPAN`] from which on they are reported as repeated.
+/// How many workers in a row may fail before they answer calls and still be replaced at once. Also the most deaths
+/// within [`SPAN`] that are not reported as repeated.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
 /// The first pause. Each following one is twice as long.

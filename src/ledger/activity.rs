@@ -14,16 +14,16 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// How long before an outage a change may be whose notifications the dead master has not sent. Unreachable nodes can
-/// hold up its three notifier threads.
+/// A dead master may not have sent the notifications of changes that happened up to this long before the outage.
+/// Unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
 /// Longest time to tell a node to shut down, with all retries.
 const TELLING: Duration = Duration::from_secs(60);
 /// Limit for three lists: topics, parameters of one node, and changes in the outbox.
 const NOTICES: usize = 4096;
-/// Most bytes of names in a remembered registration.
+/// Maximum number of bytes of names in a remembered registration.
 const LOST_MOST: usize = 1024;
-/// Most nodes that are remembered after they unregistered.
+/// Maximum number of nodes that are remembered after they unregistered.
 const NODES: usize = 1024;
 
 /// A change for which a master may send a late notification.
@@ -124,7 +124,7 @@ type Unsent = (String, Subject, Arc<Call>);
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
-    /// Most subscribers of any single topic.
+    /// Maximum number of subscribers of any single topic.
     subscribers: usize,
     /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,

@@ -14,8 +14,8 @@ use crate::{
 /// Up to this many pending writes, an unregistration that changes nothing in the mirror also becomes pending.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
-/// Most memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a large
-/// state could need any amount. Larger multicalls wait for the master.
+/// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
+/// large state could need any amount. Larger multicalls wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
 /// The same limit while there is a master. It then answers larger multicalls.
@@ -37,7 +37,7 @@ impl Ledger {
             return None;
         }
         if *read.method() == Method::GetParamNames {
-            // Most reads concern parameters alone. Copying that tree is cheap, but walking it is not.
+            // This walks the whole tree. It works on a copy without the lock, and copying the tree costs nothing.
             let mut params = inner.mirror.with_params_only();
             drop(inner);
             return params.exact_answer(read);
@@ -65,7 +65,7 @@ impl Ledger {
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         let heard = concern.heard();
-        if !idle || inner.order.holds_read(&heard) {
+        if !idle || inner.order.read_must_wait(&heard) {
             return None;
         }
         let number = inner.order.begin(now, heard);
@@ -132,7 +132,7 @@ impl Ledger {
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // The writes were applied, but the answer cannot be encoded. A retry changes nothing and fails again.
+            // The writes were applied, but the answer cannot be encoded. The master refuses a refused write again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()

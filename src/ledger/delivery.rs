@@ -61,7 +61,7 @@ impl Drop for Delivery {
 
 /// The read has to wait: the master may be notifying its caller of a change right now.
 #[derive(Debug)]
-pub(crate) struct Held;
+pub(crate) struct MustWait;
 
 impl Ledger {
     /// Runs `work` on the order and the mirror.
@@ -93,12 +93,12 @@ impl Ledger {
         self: &Arc<Self>,
         now: Instant,
         read: Option<&Request>,
-    ) -> Result<Option<Delivery>, Held> {
+    ) -> Result<Option<Delivery>, MustWait> {
         let Some(read) = read else { return Ok(None) };
         let begun = self.with_order(|order, mirror| {
             let heard = heard_by_read(read, mirror);
-            match order.holds_read(&heard) {
-                true => Err(Held),
+            match order.read_must_wait(&heard) {
+                true => Err(MustWait),
                 false => Ok(order.begin(now, heard)),
             }
         });

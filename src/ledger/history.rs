@@ -7,7 +7,7 @@ use crate::{checkpoint::store::history, limit::Limit};
 
 pub(crate) struct Rescues {
     ledger: Arc<Ledger>,
-    /// Most disk space for all kept states, in bytes; 0 keeps none.
+    /// Maximum disk space for all kept states, in bytes; 0 keeps none.
     bytes_most: u64,
     /// Limits how often a state is kept. In a crash loop masters die every few seconds with the same state, and memory
     /// cards wear out.

@@ -25,7 +25,7 @@ pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 /// Why nothing is recorded after [`DISK_PATIENCE`].
 pub(crate) const SILENT: &str = "the disk has not answered for 5 s";
 
-/// Most jobs that wait for the disk: about one for each client that waits for an answer.
+/// Maximum number of jobs that wait for the disk: about one for each client that waits for an answer.
 const JOBS_MAX: usize = 2048;
 
 type Job = Box<dyn FnOnce(&mut Store) + Send>;
@@ -66,7 +66,7 @@ pub(crate) struct Seen {
     kept: Option<PathBuf>,
     /// How many times records were withheld from the store.
     gaps: u64,
-    /// How many of these gaps a complete checkpoint has closed.
+    /// Number of the [gaps](Self::gaps) that a complete checkpoint has closed.
     gaps_over: u64,
 }
 

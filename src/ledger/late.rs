@@ -23,9 +23,9 @@ pub(super) struct Behind {
 /// How to bring a late master up to date.
 #[derive(Debug)]
 pub(crate) enum CatchUp {
-    /// It has missed nothing.
+    /// The master has missed nothing.
     Nothing,
-    /// It must run the writes that it has missed.
+    /// The master must run the writes that it has missed.
     Run(Box<Missed>),
 }
 

@@ -2,9 +2,9 @@
 
 use crate::{master::Request, xmlrpc::Value};
 
-/// Most pending writes.
+/// Maximum number of pending writes.
 const COUNT_MAX: usize = 10_000;
-/// Most memory of the pending writes in bytes, approximately.
+/// Maximum memory of the pending writes in bytes, approximately.
 const BYTES_MAX: usize = 16 << 20;
 
 /// There are too many pending writes to tell which parts of a master's state are newer than the mirror.

@@ -11,9 +11,9 @@ use crate::{
     master::{Master, Request},
 };
 
-/// Most changes that are remembered for computers that were cut off.
+/// Maximum number of changes that are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
-/// Most bytes of these changes, approximately.
+/// Maximum number of bytes of these changes, approximately.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
 /// The role of this ledger among the robot's computers.
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_first_write_that_changes_nothing_waits_for_nobody() {
+    async fn a_first_write_that_changes_nothing_does_not_wait() {
         let ledger = ledger();
         ledger.leave();
         ledger.follow(&[record(7, set(1))]).unwrap();
@@ -596,7 +596,7 @@ mod tests {
     }
 
     #[test]
-    fn changes_that_nobody_is_given_become_one_state() {
+    fn changes_that_are_not_taken_become_one_state() {
         let ledger = ledger();
         assert!(ledger.take_as_state().is_none());
         ledger.leave();
@@ -633,7 +633,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_state_that_the_others_lack_is_given_to_them_as_a_whole() {
+    async fn a_state_that_other_computers_lack_is_sent_to_them_as_a_whole() {
         let ledger = ledger();
         answer(&ledger, &set(1));
         ledger.leave();

@@ -7,7 +7,7 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Most bytes of a reply in a log line.
+/// Maximum number of bytes of a reply in a log line.
 const LOGGED_REPLY: usize = 300;
 
 /// Summarizes a reply for the log, without parameter values.

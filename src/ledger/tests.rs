@@ -54,7 +54,7 @@ fn a_reply_of_a_master_that_was_succeeded_does_not_count() {
 }
 
 #[test]
-fn a_master_that_answers_otherwise_than_the_mirror_casts_doubt() {
+fn a_different_answer_of_the_master_puts_the_mirror_in_doubt() {
     let ledger = ledger();
     let publish = publish("/t");
     let now = Instant::now();
@@ -170,7 +170,7 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
 
 /// A call in flight when the master goes away may still run when it is back, even if the call changes nothing now.
 #[test]
-fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
+fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     let ledger = ledger();
     let now = Instant::now();
     let set = call("setParam", &["/n", "/a", "1"]);
@@ -195,7 +195,7 @@ fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
 
 /// The registration that it removes may be on its way to a slow master.
 #[test]
-fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
+fn an_unregistration_without_effect_is_left_to_the_master() {
     let ledger = ledger();
     let now = Instant::now();
     let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);

@@ -35,7 +35,7 @@ use crate::{
 
 /// Pause before a node is asked again to confirm a removal.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
-/// Most questions to a node whose answers keep changing.
+/// Maximum number of questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
 
 /// The result of asking the nodes at one port.
@@ -306,7 +306,7 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // The answer fits several names, so no name is reconciled.
+                // If the answer could fit several names, none of them is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure

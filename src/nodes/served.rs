@@ -7,10 +7,10 @@ use std::{
 
 use crate::{health::port_of, master::Request, ros_env::MasterUri};
 
-/// Most hosts that are remembered. A robot has few.
+/// Maximum number of hosts that are remembered. A robot has few.
 const MOST: usize = 1024;
 
-/// The hosts of nodes that register here. A host is removed when its nodes register at another computer.
+/// The hosts of nodes that have registered at this computer's rosrescue.
 #[derive(Clone, Debug, Default)]
 pub struct Served(Arc<Mutex<HashSet<String>>>);
 

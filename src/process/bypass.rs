@@ -264,7 +264,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clients_of_the_master_are_told_from_its_own_ends_and_from_other_connections() {
+    fn clients_of_the_master_are_distinguished_from_other_connections() {
         let place = Place {
             port: 11_312,
             addresses: vec!["127.0.0.1".parse().unwrap()],
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn own_connections_are_none_and_an_open_port_is_seen() {
+    async fn own_connections_do_not_count_and_an_open_port_is_noticed() {
         for (address, is_open) in [("127.0.0.1:0", false), ("0.0.0.0:0", true)] {
             let listener = TcpListener::bind(address).unwrap();
             let port = listener.local_addr().unwrap().port();

@@ -5,7 +5,7 @@ use std::{fs, time::Duration};
 
 use crate::lifecycle::evidence::Effort;
 
-/// Most processes that are counted together.
+/// Maximum number of processes that are counted together.
 const FAMILY_MOST: usize = 64;
 
 /// The effort of the process `pid` and its descendants: a wrapper may have started the master. `None` if there is no

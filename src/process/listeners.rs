@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stranger_at_the_port_of_our_master_is_told_from_its_own_processes() {
+    fn a_stranger_at_the_masters_port_is_distinguished_from_its_processes() {
         let child = |pid| pid == 7;
         assert_eq!(judge(false, &[], true, child), Holder::Unknown);
         assert_eq!(judge(true, &[7], false, child), Holder::Master);

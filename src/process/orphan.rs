@@ -70,7 +70,7 @@ impl Rosmaster {
         for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
             tracing::info!(
                 pid,
-                "killing a rosmaster that an earlier rosrescue left behind and that does not serve"
+                "killing a useless rosmaster that an earlier rosrescue left running"
             );
             signal_process(pid, Signal::KILL);
         }
@@ -102,7 +102,7 @@ fn choose(
     serving.map(Orphan::Serving)
 }
 
-/// Whether the command line of the process `pid` gives it `port`.
+/// Whether the process `pid` was started with `port` as its port.
 fn is_told(pid: u32, port: u16) -> bool {
     let command_line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     let words: Vec<_> = command_line.split(|byte| *byte == 0).collect();
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn only_an_orphan_that_bears_the_name_was_left_behind() {
+    async fn only_an_orphan_with_the_owner_variable_counts_as_left_behind() {
         let folder = tempfile::tempdir().unwrap();
         let owner = owner(&folder.path().join("checkpoint"));
         let mut kept = Command::new("sleep")
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_master_is_starting_if_it_was_told_a_port_at_which_nobody_listens() {
+    fn a_master_is_starting_if_no_process_listens_at_its_port() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
         let mut starting = Command::new("sh")

@@ -32,7 +32,7 @@ use crate::{
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
 /// Time limit for each step in which a late master catches up. Writes wait for it.
 const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
-/// Most rounds of comparing and repairing a master that differs from what was injected.
+/// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 /// Time limit for calls of closed connections to end. A `setParam` of 60,000 keys takes some 10 s.
 const SETTLE_LIMIT: Duration = Duration::from_secs(60);

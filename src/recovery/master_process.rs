@@ -11,7 +11,7 @@ use crate::{
     upstream::Upstream,
 };
 
-/// Limits the log lines that the master has ended or is killed, and that a new one is started.
+/// Limits the log lines about the end of a master, and about the start of a new one.
 static ENDED: Pair = Pair::new();
 
 /// Process id of a child, and how it ended.
@@ -202,7 +202,7 @@ impl MasterProcess {
     }
 
     /// Kills the master at once, so that it notifies no more nodes. The returned future waits for its end.
-    pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
+    pub(crate) fn kill_and_wait(mut self) -> impl Future<Output = ()> + Send + 'static {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
             process::signal_process(pid, rustix::process::Signal::KILL);

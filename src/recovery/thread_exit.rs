@@ -72,7 +72,7 @@ time.sleep(3600)
     }
 
     #[tokio::test]
-    async fn the_end_of_a_thread_is_told() {
+    async fn the_end_of_a_thread_is_reported() {
         if !is_possible() {
             assert!(of(std::process::id().try_into().unwrap()).is_err());
             return;

@@ -15,7 +15,7 @@ use crate::master::Kind;
 
 /// Pause between two log lines about the same address. A refused node calls again up to 20 times per second.
 const SAY_AGAIN: Duration = Duration::from_secs(60);
-/// Most addresses that are remembered for that. Calls from further addresses are counted but not logged.
+/// Maximum number of addresses that are remembered for that. Calls from further addresses are counted but not logged.
 const REMEMBERED: usize = 1000;
 
 /// The networks of `--allow` and `--allow-write`. An empty list allows all clients.

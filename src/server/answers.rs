@@ -19,10 +19,10 @@ use super::{body::SMALL, replies::HttpReply};
 /// Slowest reading of a large answer, in bytes per second. A slower client is closed when other answers need its
 /// memory.
 const RATE: u32 = 256 << 10;
-/// Most credit that a client gains by reading faster than [`RATE`]. After a pause of this length it counts as slow.
+/// Maximum credit that a client gains by reading faster than [`RATE`]. After a pause of this length it counts as slow.
 const AHEAD: Duration = Duration::from_millis(250);
-/// Most answers that may wait for memory although they are already encoded. They go before those that are not, so that
-/// few answers must be encoded twice.
+/// Maximum number of answers that may wait for memory although they are already encoded. They go before those that are
+/// not, so that few answers must be encoded twice.
 const WAITING: usize = 4;
 
 /// Tracks how fast one connection reads its large answers.

@@ -17,13 +17,13 @@ use crate::{
     },
 };
 
-/// Most clients listed on the status page. There may be thousands.
+/// Maximum number of clients listed on the status page. There may be thousands.
 const LISTED: usize = 1000;
-/// Most characters of a caller id that are kept. A client may send a caller id of any length, and stay connected for
-/// hours.
+/// Maximum number of characters of a caller id that are kept. A client may send a caller id of any length, and stay
+/// connected for hours.
 const CALLER_ID: usize = 200;
 
-/// Most callers of ended connections whose times are kept. Tools use a new name each time.
+/// Maximum number of callers of ended connections whose times are kept. Tools use a new name each time.
 const CALLERS: usize = 256;
 
 /// The connections of clients, and how long their calls took.

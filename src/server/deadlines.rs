@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn an_answer_may_be_taken_slowly_but_not_never() {
+    async fn an_answer_may_be_read_slowly_but_must_be_read() {
         let (mut peer, ours) = tokio::io::duplex(64);
         let idle = Idle::among(16);
         let mut stream = Timed::new(ours, Deadlines::default(), &idle, Arc::default());

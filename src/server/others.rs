@@ -92,8 +92,8 @@ impl Passing {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps what an answer holds. Returns the number for [`Self::end`]. A silent follower delays others no longer than
-    /// a client that does not read.
+    /// Keeps `held`, which must not be dropped before the caller has the answer. Returns the answer's number, for
+    /// [`Self::end`]. A follower that stays silent delays others no longer than a client that does not read.
     fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();

@@ -49,9 +49,9 @@ const JSON: &str = "application/json";
 
 /// Version of `/state.json`. It changes when a field is removed or changes its meaning.
 const SCHEMA: u32 = 1;
-/// Most nodes, topics or services in `/state.json`.
+/// Maximum number of nodes, topics or services in `/state.json`.
 const LISTED: usize = 5000;
-/// Most characters of a query value.
+/// Maximum number of characters of a query value.
 const ASKED: usize = 500;
 
 /// Content security policy: a page may only load its own script, style and data.
@@ -84,18 +84,18 @@ pub struct Pages {
     /// Ends the event streams.
     pub stop: CancellationToken,
     /// The state that pages share.
-    pub(crate) desk: Desk,
+    pub(crate) state: PageState,
 }
 
 /// The state that pages share.
 #[derive(Debug)]
-pub(crate) struct Desk {
+pub(crate) struct PageState {
     feed: Feed,
     /// Permit to build the complete state, which happens one request at a time.
     reading: Semaphore,
 }
 
-impl Default for Desk {
+impl Default for PageState {
     fn default() -> Self {
         Self {
             feed: Feed::default(),
@@ -224,7 +224,7 @@ struct Totals {
 
 async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
     // Never closed.
-    let _turn = server.pages.desk.reading.acquire().await;
+    let _turn = server.pages.state.reading.acquire().await;
     let server = server.clone();
     let work = move || {
         let pages = &server.pages;

@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn the_worst_has_the_name_and_all_of_it_is_said() {
+    fn the_worst_condition_gives_the_name_and_all_are_described() {
         let mut facts = Facts::new(Mode::Proxy);
         let good = of(OPEN, None, &facts);
         assert!(good.is_good(), "{good:?}");

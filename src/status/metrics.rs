@@ -23,7 +23,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
         ("crash_loop", "whether the master dies again and again", Some(flag(status.crash_loop).into())),
         ("guarded", "whether a guardian or systemd restarts rosrescue if it dies", Some(flag(status.guarded).into())),
-        ("action_needed", "whether somebody has to act: /status.json says what to do", Some(flag(status.condition.action.is_some()).into())),
+        ("action_needed", "whether an operator must act: /status.json says what to do", Some(flag(status.condition.action.is_some()).into())),
         ("master_deaths_total", "masters that have died", Some(status.deaths as f64)),
         ("worker_restarts_total", "restarts of rosrescue itself after it died, in this session", Some(status.worker_restarts as f64)),
         ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),

@@ -245,7 +245,7 @@ async fn handshake(
     Ok((sender, Box::new(driver)))
 }
 
-/// Whether a server that answers like this accepts another request on the connection.
+/// Whether a server accepts another request on the connection after an answer with this version and these headers.
 fn keeps_alive(version: Version, headers: &HeaderMap) -> bool {
     let values = headers.get_all(CONNECTION).into_iter();
     let mut words = values.flat_map(|value| value.to_str().unwrap_or_default().split(','));

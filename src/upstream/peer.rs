@@ -12,7 +12,7 @@ use thiserror::Error;
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
 use crate::{master, ros_env::MasterUri, xmlrpc};
 
-/// Most idle connections that are kept.
+/// Maximum number of idle connections that are kept.
 const IDLE_MOST: usize = 64;
 /// Prefix of the path of calls for the leader of a term. The term follows.
 const PATH: &str = "/cluster/";

@@ -14,10 +14,10 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Most calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a few
-/// milliseconds at most.
+/// Maximum number of calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a
+/// few milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
-/// Most bytes of bodies in a batch.
+/// Maximum number of bytes of bodies in a batch.
 pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]
@@ -157,7 +157,7 @@ pub(crate) struct Batch {
 }
 
 /// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over
-/// calls that have to [wait](Order::hold), and over later ones about the same subjects.
+/// calls that have to [wait](Order::must_wait), and over later ones about the same subjects.
 pub(crate) fn pack(
     queue: &mut VecDeque<Item>,
     order: &mut Order,
@@ -176,12 +176,12 @@ pub(crate) fn pack(
         }
         let is_about_passed = || item.concern.subjects().any(|it| passed_over.has(it));
         let is_behind = index > 0 && (item.is_last() || is_about_passed());
-        let held = match is_behind {
+        let wait = match is_behind {
             true => None,
-            false => order.hold(now, &item.concern),
+            false => order.must_wait(now, &item.concern),
         };
-        if is_behind || held.is_some() {
-            let until = held.and_then(|held| held.until);
+        if is_behind || wait.is_some() {
+            let until = wait.and_then(|wait| wait.until);
             batch.until = batch.until.into_iter().chain(until).min();
             if item.is_last() {
                 break;

@@ -1,5 +1,5 @@
-//! Unregisters a node when another node registers its port, with `--reap-dead-nodes`. The node is not asked, because a
-//! node cannot answer before its registration is done.
+//! Unregisters a node when another node registers its port, with `--reap-dead-nodes`. The registering node is not asked
+//! first, because it cannot answer before its registration is done.
 
 use std::{sync::Arc, time::Instant};
 

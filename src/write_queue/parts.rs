@@ -9,7 +9,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Most entries of a multicall that is sent whole, as the client's own bytes.
+/// Maximum number of entries of a multicall that is sent whole, as the client's own bytes.
 const ENTRIES_WHOLE: usize = 2 * CALLS_MAX;
 
 /// The parts of a long multicall, in order. Each is a multicall of a batch's size.
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_that_decide_about_others_keep_the_multicall_whole() {
+    fn entries_that_affect_each_other_keep_the_multicall_whole() {
         let with = |last: Request| Request::multicall(many(1000).into_iter().chain([last]));
         let of = |method| Request::new(method, ["/n", "/a", "/a"]);
         assert!(sizes(with(of(Method::HasParam)), 0).is_some());

@@ -82,8 +82,9 @@ pub(super) async fn round_trip(
             reply.map(Received::Reply).map_err(Into::into)
         }
         None => {
-            let held = held(&link, &token, &mut verified).await;
-            held.map(|held| Received::Held(held.into()))
+            let state = read_state(&link, &token, &mut verified).await;
+            state
+                .map(|state| Received::Held(state.into()))
                 .map_err(Into::into)
         }
     };
@@ -104,7 +105,11 @@ async fn connect(link: Link, token: Token) -> Result<Verified, VerifyError> {
 }
 
 /// Reads the state of the connected master.
-async fn held(link: &Link, token: &Token, verified: &mut Verified) -> Result<Master, InspectError> {
+async fn read_state(
+    link: &Link,
+    token: &Token,
+    verified: &mut Verified,
+) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
     let mut first = inspect::first(&mut verified.connection, token).await?;
     if !verified.connection.keeps_order() {

@@ -1,7 +1,7 @@
 """CPython's side of the comparison. Reads one request per line, and prints one answer per line.
 
-    call HEX    what rosmaster makes of a request: `ok METHOD VALUES`, or `raise WHY`
-    reply HEX   what a Python client makes of an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
+    call HEX    how rosmaster understands a request: `ok METHOD VALUES`, or `raise WHY`
+    reply HEX   how a Python client understands an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
     fault HEX   the text of the fault that a server answers to a request
     echo HEX    the answer, in hex, of a server whose method `echo` returns its parameter
 """

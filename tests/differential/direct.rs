@@ -11,7 +11,7 @@ use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
 use crate::support::unordered;
 
-/// Most calls that a successor has answered before it gets the state.
+/// Maximum number of calls that a successor has answered before it gets the state.
 const FOUND: usize = 15;
 
 /// A random sequence with one or two successors.

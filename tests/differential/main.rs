@@ -64,7 +64,7 @@ const THREE_EACH: u64 = 3;
 const READS: [&str; 2] = ["master", "mirror"];
 /// Number of nodes that receive callbacks.
 const NODES: usize = 5;
-/// Most runs for finding a shorter script.
+/// Maximum number of runs for finding a shorter script.
 const PATIENCE: usize = 300;
 /// Longest time for finding a shorter script. One run with takeovers may take half a minute.
 const SHRINKING: Duration = Duration::from_secs(120);
@@ -95,7 +95,11 @@ fn nodes() -> Vec<Node> {
 }
 
 /// Plays `script`. If that fails, searches for a shorter script that fails too, and panics.
-fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), Failure>) {
+fn play_or_shorten(
+    what: &str,
+    script: &Script,
+    mut run: impl FnMut(&Script) -> Result<(), Failure>,
+) {
     let Err(first) = run(script) else { return };
     // Printed at once and not with the test's output, because the search takes long.
     let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
@@ -149,7 +153,7 @@ fn a_bare_rosmaster_answers_as_the_model_does() {
     let (start, mut played) = (Instant::now(), 0);
     for seed in first..first + count {
         let script = direct::script(seed, calls, NODES);
-        hold(&format!("seed {seed}"), &script, |script| {
+        play_or_shorten(&format!("seed {seed}"), &script, |script| {
             direct::run(script, &nodes, &mut spare)
         });
         played += script.calls();
@@ -161,7 +165,7 @@ fn a_bare_rosmaster_answers_as_the_model_does() {
 }
 
 #[test]
-fn through_rosrescue_no_crash_of_the_master_can_be_told() {
+fn no_crash_of_the_master_is_visible_through_rosrescue() {
     let nodes = nodes();
     let mut tally = Tally::default();
     let (scripts, alone) = scripts();
@@ -188,7 +192,7 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
             "seed {seed} with {crashes} crashes{}, --reads {reads}",
             if core { " of core" } else { "" }
         );
-        hold(&what, &script, |script| {
+        play_or_shorten(&what, &script, |script| {
             crashes::run(script, &nodes, core, reads, &mut tally)
         });
         played += script.calls();
@@ -212,7 +216,7 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
 }
 
 #[test]
-fn through_several_computers_no_takeover_can_be_told() {
+fn no_takeover_is_visible_through_several_computers() {
     let nodes = nodes();
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let servers = runtime.block_on(Servers::new(1));
@@ -234,7 +238,7 @@ fn through_several_computers_no_takeover_can_be_told() {
         let script = takeovers::script(seed, calls, takeovers, NODES);
         let computers = if seed % THREE_EACH == 0 { 3 } else { 2 };
         let what = format!("seed {seed} with {takeovers} takeovers of {computers} computers");
-        hold(&what, &script, |script| {
+        play_or_shorten(&what, &script, |script| {
             takeovers::run(script, &nodes, &servers, computers, &mut tally)
         });
         played += script.calls();

@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_crash_loses_or_doubles_what_was_under_way_and_repeats_true_lists() {
+    fn a_crash_may_lose_or_repeat_running_callbacks_and_repeats_true_lists() {
         let expected = [("a", false), ("x", true), ("y", true), ("b", false)];
         for heard in [
             &["a", "x", "y", "b"][..],

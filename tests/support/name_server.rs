@@ -67,7 +67,7 @@ impl NameServer {
         *self.says.lock().unwrap() = Says::Always(address, delay);
     }
 
-    /// Answers no more questions.
+    /// Stops answering.
     pub(crate) fn fall_silent(&self) {
         *self.says.lock().unwrap() = Says::Nothing;
     }

@@ -4,7 +4,8 @@ use std::{collections::BTreeSet, fs, path::Path, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
-/// Most bytes of documents: people read no more. The last entry is all of `docs` without the decisions and the help.
+/// Maximum number of bytes of documents: people read no more. The last entry is all of `docs` without the decisions and
+/// the help.
 const BYTES_MOST: [(&str, usize); 3] = [
     ("README.md", 8 << 10),
     ("docs/architecture.md", 20 << 10),

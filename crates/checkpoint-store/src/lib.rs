@@ -38,7 +38,7 @@ use journal::Active;
 pub use journal::{SyncJob, Synced};
 pub use load::Loaded;
 pub use lock::DiskLock;
-pub use lock::holder_of;
+pub use lock::{LockHolder, holder_of};
 use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{Change, CheckJob, Checked};

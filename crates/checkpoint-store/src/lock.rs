@@ -88,11 +88,19 @@ fn is_claimed(checkpoint: &Path) -> bool {
     tried == Err(rustix::io::Errno::WOULDBLOCK)
 }
 
-/// Whether a rosrescue uses this checkpoint, and its process id if known.
-pub fn holder_of(checkpoint: &Path) -> Option<Option<u32>> {
+/// The rosrescue that uses a checkpoint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LockHolder {
+    /// Its process id, if known.
+    pub pid: Option<u32>,
+}
+
+/// The rosrescue that uses this checkpoint. `None` if none does.
+pub fn holder_of(checkpoint: &Path) -> Option<LockHolder> {
     let mut path = checkpoint.as_os_str().to_owned();
     path.push(".lock");
-    is_claimed(checkpoint).then(|| holder_in(Path::new(&path)))
+    let pid = || holder_in(Path::new(&path));
+    is_claimed(checkpoint).then(|| LockHolder { pid: pid() })
 }
 
 fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {

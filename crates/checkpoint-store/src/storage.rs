@@ -99,7 +99,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Disk;
 
-/// Most symbolic links that Linux follows for one path.
+/// Maximum number of symbolic links that Linux follows for one path.
 const SYMLINKS_MAX: usize = 40;
 
 impl Disk {

@@ -29,7 +29,7 @@ use super::{
 const CONNECT_LIMIT: Duration = Duration::from_secs(1);
 /// Largest answer, in bytes: a page of a range.
 const ANSWER_BYTES_MAX: usize = 64 << 20;
-/// Most idle connections that are kept.
+/// Maximum number of idle connections that are kept.
 const IDLE_MOST: usize = 4;
 
 /// The credentials of this computer at etcd.

@@ -33,13 +33,13 @@ pub use wire::{Kv, Txn, TxnOp, TxnResult};
 const NEXT_AFTER: Duration = Duration::from_millis(250);
 /// Pause after all endpoints have failed. It counts as part of the request's time limit.
 const ROUND_PAUSE: Duration = Duration::from_millis(100);
-/// Most keys in one page of a range. Their values take 16 MiB at most.
+/// Maximum number of keys in one page of a range. Their values take 16 MiB at most.
 const PAGE: usize = 32;
 
 /// Settings of a client.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Each is `http://HOST:PORT` or `https://HOST:PORT`.
+    /// The endpoints, each `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
     pub access: Access,
 }

@@ -10,7 +10,7 @@ use std::{
 
 use tokio::sync::{Semaphore, watch};
 
-/// Most lookups at the same time. A dead name server blocks a thread for some ten seconds.
+/// Maximum number of lookups at the same time. A dead name server blocks a thread for some ten seconds.
 const LOOKUPS: usize = 64;
 
 /// The addresses of a name without a port, or why there are none.

@@ -36,7 +36,7 @@ const COMMON: [&str; 6] = [
 /// The reaction of a node to a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sign {
-    /// It answered.
+    /// The node answered.
     Alive,
     /// The node's port refuses connections, so its process is gone.
     Dead,

@@ -79,9 +79,9 @@ struct InFlight {
     answers: Vec<u64>,
 }
 
-/// A call must wait.
+/// A call, or a notification, has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Held {
+pub struct MustWait {
     /// When to ask again at the latest. `None` if a change will be reported.
     pub until: Option<Instant>,
 }
@@ -115,25 +115,25 @@ impl Order {
 
     /// Whether a call must wait before it goes to the master. It must if it may notify a node while an answer to that
     /// node about the same subject is on its way.
-    pub fn hold(&mut self, now: Instant, concern: &Concern) -> Option<Held> {
-        let held = match concern.is_anything() {
-            true => self.under_way.any(now),
+    pub fn must_wait(&mut self, now: Instant, concern: &Concern) -> Option<MustWait> {
+        let wait = match concern.is_anything() {
+            true => self.under_way.must_wait(now),
             false => concern.tells().iter().find_map(|subject| {
                 let port = concern.port_if_name(subject);
-                self.under_way.before(now, subject, port)
+                self.under_way.must_wait_for(now, subject, port)
             }),
         };
-        self.awaited |= held.is_some();
-        held.map(|until| Held { until })
+        self.awaited |= wait.is_some();
+        wait
     }
 
     /// Whether a read must wait until the master has answered a call. Otherwise the read's answer could be older than a
     /// notification that the master sends to the reader.
-    pub fn holds_read(&mut self, heard: &[Heard]) -> bool {
+    pub fn read_must_wait(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
-        let held = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
-        self.awaited |= held;
-        held
+        let waits = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
+        self.awaited |= waits;
+        waits
     }
 
     /// Notes that the master gets calls that may notify nodes of `tells`. `answers` are the numbers of these calls'
@@ -287,11 +287,16 @@ impl Order {
     }
 
     /// Whether an answer to the node at `port` about `subject` is on its way, and until when it delays others.
-    pub fn is_under_way(&mut self, now: Instant, port: &str, subject: &Subject) -> Option<Held> {
+    pub fn is_under_way(
+        &mut self,
+        now: Instant,
+        port: &str,
+        subject: &Subject,
+    ) -> Option<MustWait> {
         match self.under_way.answer_to(now, port, subject)? {
             under_way::Answer::UnderWay { limit } => {
                 self.awaited = true;
-                Some(Held { until: limit })
+                Some(MustWait { until: limit })
             }
             under_way::Answer::Written { .. } => None,
         }

@@ -22,7 +22,7 @@ use super::{
     units::{self, Unit},
 };
 use crate::{
-    checkpoint::store,
+    checkpoint::store::{self, LockHolder},
     cli::CheckArgs,
     clock, config,
     process::{
@@ -37,7 +37,7 @@ use crate::{
 
 /// Longest time for one name lookup. A dead name server takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
-/// Most addresses in launch files that are looked up.
+/// Maximum number of addresses in launch files that are looked up.
 const LOOKUPS_MOST: usize = 4;
 /// Names of services that set the clock.
 const CLOCKS: [&str; 6] = [
@@ -190,8 +190,8 @@ pub(super) struct Disk {
     pub(super) refused: Option<String>,
     /// Type and source of the file system, such as `ext4` and `/dev/sda1`.
     pub(super) mount: Option<(String, String)>,
-    /// Set if another rosrescue uses the file, with its process id if known.
-    pub(super) holder: Option<Option<u32>>,
+    /// The other rosrescue that uses the file.
+    pub(super) holder: Option<LockHolder>,
     /// Whether the path is a folder.
     pub(super) is_folder: bool,
 }

@@ -12,7 +12,7 @@ use quick_xml::{XmlVersion, events::Event, reader::Reader};
 use super::units;
 
 const VARIABLE: &str = "ROS_MASTER_URI";
-/// Most launch files that are read.
+/// Maximum number of launch files that are read.
 const FILES_MOST: usize = 4000;
 /// How long the search may take.
 const TIME_MOST: Duration = Duration::from_secs(1);

@@ -28,7 +28,7 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 const IMPORT_LIMIT: Duration = Duration::from_secs(20);
 /// Largest answer to getPid, in bytes.
 const MAX_REPLY: usize = 64 << 10;
-/// Most nodes that are named for each host.
+/// Maximum number of nodes that are named for each host.
 const SOME: usize = 3;
 
 /// What answers at an address.

@@ -19,7 +19,7 @@ use crate::{
 const LIMIT: Duration = Duration::from_secs(10);
 /// Pause between two calls of a loop.
 const PAUSE: Duration = Duration::from_millis(5);
-/// Most failures that are reported.
+/// Maximum number of failures that are reported.
 const MOST: usize = 5;
 
 /// The Master API at an address, called by one node.

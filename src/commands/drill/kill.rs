@@ -18,7 +18,7 @@ const AFTER: Duration = Duration::from_millis(1500);
 const LOOK: Duration = Duration::from_millis(20);
 /// How long a master is stopped with `--hang`. It counts as hung after some 1.6 s.
 const HANG: Duration = Duration::from_secs(4);
-/// Most deaths within a minute that are not a crash loop.
+/// Maximum number of deaths within a minute that are not a crash loop.
 const DEATHS: usize = 5;
 const DEATHS_WITHIN: Duration = Duration::from_secs(61);
 impl Drill<'_> {

@@ -207,7 +207,7 @@ mod tests {
     use crate::{master, nodes::client};
 
     #[tokio::test]
-    async fn the_node_says_what_it_is_and_remembers_what_it_was_told() {
+    async fn the_node_answers_for_itself_and_keeps_its_notifications() {
         let node = Node::start("/drill".to_owned()).await.unwrap();
         node.heard.subscribes("/chatter", true);
         let ask = async |call| {

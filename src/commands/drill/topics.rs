@@ -19,7 +19,7 @@ const FEWEST: u64 = 10;
 const SHORTEST_GAP: Duration = Duration::from_secs(1);
 /// How much longer than normal a pause must be to count as a failure.
 const LONGER: u32 = 10;
-/// Most topics that are tried when none is named.
+/// Maximum number of topics that are tried when none is named.
 const CANDIDATES: usize = 12;
 
 /// What arrived over one connection.

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::commands::counted;
 
-/// Most sentences of one kind.
+/// Maximum number of sentences of one kind.
 const MOST: usize = 12;
 
 /// One kill.

@@ -99,7 +99,7 @@ fn a_record_is_awaited_until_it_is_written_or_synced() {
 }
 
 #[test]
-fn what_a_silent_disk_was_not_given_is_in_the_next_whole_checkpoint() {
+fn records_withheld_from_a_silent_disk_are_in_the_next_complete_checkpoint() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
     journal.append(entry(0));

@@ -8,10 +8,10 @@ use std::{
 
 use crate::{cluster::merge::weight, master::Request};
 
-/// Most calls that are remembered.
+/// Maximum number of calls that are remembered.
 const MOST: usize = 1000;
-/// Most bytes of one call, approximately. A call that is too large to remember is later reported as lost, although it
-/// is in the journal.
+/// Maximum number of bytes of one call, approximately. A call that is too large to remember is later reported as lost,
+/// although it is in the journal.
 const BYTES_MOST: usize = 1 << 20;
 
 /// The calls that were sent to a leader.
@@ -43,7 +43,7 @@ impl Forwarded {
         Some(Sent { of, number })
     }
 
-    /// The writes among these calls.
+    /// The writes that were sent to a leader and are not answered yet.
     pub(crate) fn writes(&self) -> Vec<Request> {
         let calls = self.lock();
         let calls = calls.calls.values().flat_map(Request::calls);

@@ -29,7 +29,7 @@ use crate::{
     },
 };
 
-/// Most listeners, because each holds a connection. Further pages poll the status.
+/// Maximum number of listeners, because each holds a connection. Further pages poll the status.
 const LISTENERS: usize = 16;
 /// Time after which a listener must make room for a new one. The kernel accepts many events for a peer that never
 /// reads, so a write does not show whether the listener reads. A browser reconnects.
@@ -93,7 +93,7 @@ impl Default for Feed {
 
 /// Adds a listener, and returns the stream of events as the reply.
 pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
-    let feed = &server.pages.desk.feed;
+    let feed = &server.pages.state.feed;
     let listeners = feed.listeners.lock();
     let mut listeners = listeners.unwrap_or_else(PoisonError::into_inner);
     listeners.retain(|(_, task)| !task.is_finished());
@@ -167,11 +167,11 @@ async fn look(server: Arc<Server>) {
         };
         let Ok((same, latest)) = tokio::task::spawn_blocking(look).await else {
             // The task panicked. The next listener starts another one.
-            pages.desk.feed.running.store(false, Ordering::Release);
+            pages.state.feed.running.store(false, Ordering::Release);
             break;
         };
         known = same;
-        pages.desk.feed.latest.send_if_modified(|before| {
+        pages.state.feed.latest.send_if_modified(|before| {
             let is_new = *before != latest;
             *before = latest;
             is_new
@@ -184,11 +184,11 @@ async fn look(server: Arc<Server>) {
             } => {}
         }
         shut = gate.look();
-        if pages.desk.feed.latest.receiver_count() == 0 {
-            pages.desk.feed.running.store(false, Ordering::Release);
+        if pages.state.feed.latest.receiver_count() == 0 {
+            pages.state.feed.running.store(false, Ordering::Release);
             // A listener may have been added just before.
-            let is_needed = pages.desk.feed.latest.receiver_count() > 0;
-            if !is_needed || pages.desk.feed.running.swap(true, Ordering::AcqRel) {
+            let is_needed = pages.state.feed.latest.receiver_count() > 0;
+            if !is_needed || pages.state.feed.running.swap(true, Ordering::AcqRel) {
                 break;
             }
         }

@@ -8,11 +8,11 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Most entries in one answer. The answer says what it leaves out, and a page can ask for that.
+/// Maximum number of entries in one answer. The answer says what it leaves out, and a page can ask for that.
 const ENTRIES: usize = 1000;
-/// Most characters of a value. A robot description may have a million.
+/// Maximum number of characters of a value. A robot description may have a million.
 const TEXT: usize = 2000;
-/// Most results of a search.
+/// Maximum number of results of a search.
 const FOUND: usize = 200;
 
 /// A parameter or a namespace.

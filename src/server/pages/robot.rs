@@ -13,7 +13,7 @@ use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Node
 pub(super) struct Node {
     pub(super) name: String,
     pub(super) health: Health,
-    /// When that was last known, in seconds since 1970.
+    /// When `health` was last known, in seconds since 1970.
     pub(super) checked_at: Option<u64>,
     /// The node's XML-RPC address.
     pub(super) api: String,

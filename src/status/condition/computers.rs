@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_leader_writes_wait_and_after_a_while_somebody_has_to_look() {
+    fn without_a_leader_writes_wait_and_after_a_while_an_operator_is_needed() {
         let mut cluster = ClusterFacts::of_three();
         cluster.leaderless = Some(Instant::now());
         let short = of(State::Elsewhere, &cluster);

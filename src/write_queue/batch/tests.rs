@@ -99,7 +99,7 @@ fn a_publisher_waits_for_the_answers_to_subscribers_and_nothing_else_does() {
 }
 
 #[test]
-fn an_answer_that_its_client_does_not_read_holds_nobody_up_for_long() {
+fn an_answer_that_its_client_does_not_read_delays_others_only_briefly() {
     let ledger = ledger();
     let mut queue = VecDeque::from([item(subscribe("/a", "/t")), item(publish("/b", "/t"))]);
     let first = next(&ledger, &mut queue);
@@ -115,7 +115,7 @@ fn an_answer_that_its_client_does_not_read_holds_nobody_up_for_long() {
 }
 
 #[test]
-fn calls_of_our_own_and_those_that_cannot_be_read_overtake_nothing() {
+fn calls_by_rosrescue_and_undecodable_calls_overtake_nothing() {
     let ledger = ledger();
     let unreadable = || Item::new(Some((Head::default(), Bytes::new())), None).0;
     let own = || Item::new(None, Some(Arc::new(set("/x", 1)))).0;
@@ -163,7 +163,7 @@ fn a_single_call_goes_out_as_its_own_bytes() {
 }
 
 #[test]
-fn replies_come_apart_only_when_each_is_there() {
+fn a_batch_reply_is_split_only_if_it_has_every_result() {
     let fault = Struct::from([
         ("faultCode".to_owned(), Value::Int(1)),
         ("faultString".to_owned(), Value::from("no")),

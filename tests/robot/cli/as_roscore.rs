@@ -24,7 +24,7 @@ fn complete(client: &Client) -> State {
 
 /// The bare `rosrescue` is `rosrescue core`, at the port of `ROS_MASTER_URI`.
 #[test]
-fn a_bare_rosrescue_is_a_core_that_says_what_roscore_says() {
+fn a_bare_rosrescue_is_a_core_and_prints_what_roscore_prints() {
     let scratch = Scratch::new();
     let [theirs, ours] = [false, true].map(|is_ours| {
         let port = free_port();

@@ -9,7 +9,7 @@ use crate::support::{
 
 /// Standard error is a file here. Like a socket of journald, it is recognised by device and inode.
 #[test]
-fn journald_is_told_the_priority_of_each_line_and_nobody_else_is() {
+fn log_lines_have_priorities_only_for_journald() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let path = scratch.path("journal");
@@ -123,7 +123,10 @@ fn each_rescue_leaves_a_report_beside_the_checkpoint() {
         reports.sort();
         reports
     };
-    assert!(reports(&robot).is_empty(), "an ordinary start is no rescue");
+    assert!(
+        reports(&robot).is_empty(),
+        "an ordinary start is not a rescue"
+    );
     for count in 1..=2 {
         robot.crash_master();
         eventually("a report is written", || reports(&robot).len() == count);

@@ -91,7 +91,7 @@ fn usage_errors_end_with_2_and_say_which() {
 }
 
 #[test]
-fn variables_of_core_are_no_matter_of_proxy() {
+fn proxy_ignores_variables_of_core() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = || {
@@ -111,7 +111,7 @@ fn variables_of_core_are_no_matter_of_proxy() {
 }
 
 #[test]
-fn a_new_session_is_said_to_be_one() {
+fn a_new_session_is_reported_as_new() {
     let scratch = Scratch::new();
     let mut rescue = Setup::core(&scratch, free_port()).start();
     rescue.wait_line("what it did", |line| line.contains("a new session started"));

@@ -37,7 +37,7 @@ fn an_orderly_stop_leaves_nothing_behind() {
 }
 
 #[test]
-fn an_orderly_stop_in_an_outage_keeps_what_was_answered_and_answers_nothing_falsely() {
+fn a_clean_stop_in_an_outage_keeps_answered_writes_and_gives_no_false_answer() {
     let mut robot = Robot::start(Mode::Proxy);
     robot.kill_master();
     let client = robot.client();
@@ -116,7 +116,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) % 256)
 "#;
 
 #[test]
-fn a_terminal_that_is_closed_ends_it_in_good_order() {
+fn closing_the_terminal_stops_rosrescue_cleanly() {
     let scratch = Scratch::new();
     let port = free_port().to_string();
     let setup = Setup::bare(&scratch, ["core", "-v", "-p", &port]).wrapped(|command| {

@@ -192,7 +192,7 @@ fn it_fails_when_a_node_dies_and_its_stream_is_cut() {
 }
 
 #[test]
-fn it_fails_when_nobody_starts_the_master_again() {
+fn it_fails_when_the_master_is_not_restarted() {
     let robot = Robot::start(Mode::Proxy);
     let before = robot.client().ok("getSystemState", vec!["/test".into()]);
     let options = ["--yes", "--times", "1", "--limit", "2"];

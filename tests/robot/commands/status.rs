@@ -88,7 +88,7 @@ fn it_prints_no_commands_for_a_terminal() {
 }
 
 #[test]
-fn nobody_there_or_somebody_else_is_exit_status_3() {
+fn no_rosrescue_or_another_program_at_the_port_is_exit_status_3() {
     let scratch = Scratch::new();
     let nobody = Tool::rosrescue(&scratch, free_port(), &["status"]);
     assert_eq!(nobody.exit(), 3, "{nobody:?}");
@@ -106,7 +106,7 @@ fn nobody_there_or_somebody_else_is_exit_status_3() {
 }
 
 #[test]
-fn a_newer_rosrescue_is_said_to_be_one() {
+fn a_newer_rosrescue_is_reported_as_newer() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     thread::spawn(move || {

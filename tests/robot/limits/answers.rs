@@ -12,7 +12,7 @@ use crate::support::{
 const LARGE: usize = 5_000_000;
 /// Number of clients. Their answers take more than three times the memory that is available.
 const CLIENTS: usize = 90;
-/// Most memory that these clients may use, in MB: the 128 MB reserved for answers, plus the answers that are being
+/// Maximum memory that these clients may use, in MB: the 128 MB reserved for answers, plus the answers that are being
 /// encoded. It once was 240 MB.
 const COST: u64 = (CLIENTS * LARGE / 1_000_000) as u64 * 2 / 3;
 

@@ -22,7 +22,7 @@ struct Garbled {
 }
 
 impl Garbled {
-    /// Starts a master that gives `answer` to calls which mention `/garbled`. `reads` is who answers reads.
+    /// Starts a master that gives `answer` to calls which mention `/garbled`. `reads` says whether the mirror or the master answers reads.
     fn start(answer: Vec<u8>, reads: &str) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);

@@ -93,7 +93,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     );
     before.assert_same(
         &after.without_node("/coming").with_params_of(&before),
-        "but for what was called",
+        "except for the running calls",
     );
     let both = [node.api.clone(), coming.api.clone()];
     eventually("the subscriber is told of the new publisher", || {

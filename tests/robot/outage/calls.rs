@@ -11,7 +11,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
-fn calls_during_an_outage_are_answered_so_that_nodes_work_on() {
+fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/gain", 7);

@@ -129,7 +129,7 @@ fn a_pattern_that_is_none_is_refused_in_a_sentence() {
 }
 
 #[test]
-fn a_hundred_thousand_parameters_are_sent_in_parts_and_hold_up_nobody() {
+fn a_hundred_thousand_parameters_are_sent_in_parts_and_delay_no_other_request() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let client = robot.client();
     let many =

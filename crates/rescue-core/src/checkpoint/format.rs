@@ -119,7 +119,7 @@ pub enum EncodeError {
     /// A value is nested too deeply to be read back.
     #[error("a parameter is nested deeper than {limit} levels; it cannot be kept in a checkpoint")]
     TooDeep {
-        /// [`DEPTH_MAX`].
+        /// The deepest nesting allowed: [`DEPTH_MAX`].
         limit: usize,
     },
 }

@@ -29,7 +29,7 @@ const UNFAIR_PART: u32 = 2;
 pub struct Effort {
     /// Whether a thread runs or waits for the processor.
     pub runnable: bool,
-    /// Whether a thread waits for a disk, and no thread for anything else.
+    /// Whether a thread waits for a disk and cannot be interrupted (state `D`).
     pub on_disk: bool,
     /// Whether every thread was stopped, by SIGSTOP or a debugger.
     pub stopped: bool,
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_master_that_is_stopped_or_wants_nothing_hangs() {
+    fn a_stopped_or_idle_master_that_does_not_answer_hangs() {
         assert_eq!(verdict(|_, _, _| {}), Verdict::Hung);
         let stop = |effort: &mut Effort| {
             effort.stopped = true;
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn an_endless_loop_is_no_progress_for_ever() {
+    fn an_endless_loop_does_not_count_as_progress_forever() {
         let start = Instant::now();
         let mut evidence = Evidence::default();
         let mut verdicts = Vec::new();
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_known_at_first_and_what_cannot_be_seen_hangs() {
+    fn there_is_no_verdict_at_first_and_an_invisible_process_counts_as_hung() {
         let mut evidence = Evidence::default();
         assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
         let mut sample = Sample {

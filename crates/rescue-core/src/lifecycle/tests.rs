@@ -122,7 +122,7 @@ fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
 }
 
 #[test]
-fn a_master_of_others_whose_thread_ends_dies_once() {
+fn an_external_master_whose_thread_ends_dies_once() {
     let lost = [Action::ShutGate(Cause::ThreadEnded), Action::Connect];
     let mut script = Script::serving(Supervision::Theirs);
     script
@@ -141,7 +141,7 @@ fn a_master_of_others_whose_thread_ends_dies_once() {
 }
 
 #[test]
-fn a_thread_that_ended_alone_is_no_death() {
+fn the_end_of_a_single_thread_does_not_count_as_a_death() {
     let mut script = Script::serving(Supervision::Ours);
     script
         .feed(
@@ -153,7 +153,7 @@ fn a_thread_that_ended_alone_is_no_death() {
 }
 
 #[test]
-fn an_idle_connection_that_the_master_closed_is_no_death() {
+fn a_closed_idle_connection_does_not_count_as_a_death() {
     let mut script = Script::serving(Supervision::Ours);
     script.lose().serve(true);
     assert_eq!(script.machine.deaths(), 0);
@@ -331,7 +331,7 @@ fn a_child_that_never_listens_is_killed() {
 }
 
 #[test]
-fn a_child_whose_port_was_taken_is_replaced_at_once_and_is_no_death() {
+fn a_child_whose_port_was_taken_is_replaced_at_once_without_counting_as_a_death() {
     let mut script = Script::new(Supervision::Ours);
     let start = Input::Start {
         left: false,

@@ -37,7 +37,7 @@ fn begin(order: &mut Order, now: Instant, call: &Request) -> u64 {
 }
 
 fn holds(order: &mut Order, now: Instant, call: &Request) -> bool {
-    order.hold(now, &Concern::of(Some(call))).is_some()
+    order.must_wait(now, &Concern::of(Some(call))).is_some()
 }
 
 /// The list of publishers in the `publisherUpdate` to send, and the number of the notification.
@@ -70,10 +70,10 @@ fn a_write_that_notifies_a_node_waits_for_an_answer_to_that_node_about_the_same_
     ] {
         assert_eq!(holds(&mut order, now, &write), waits, "{write:?}");
     }
-    assert!(order.hold(now, &Concern::of(None)).is_some());
+    assert!(order.must_wait(now, &Concern::of(None)).is_some());
     assert!(order.written(now, subscribed));
     assert!(!holds(&mut order, now, &publish("/b", "/t")));
-    assert!(order.hold(now, &Concern::of(None)).is_none());
+    assert!(order.must_wait(now, &Concern::of(None)).is_none());
 
     let watch = call("subscribeParam", &["/a", "http://a:1/", "/k/x"]);
     begin(&mut order, now, &watch);
@@ -105,9 +105,9 @@ fn the_answer_to_a_read_of_a_subscribed_parameter_counts_as_well() {
         &call("setParam", &["/b", "/k/x", "1"])
     ));
     order.sent(&[param("/k/")], Vec::new());
-    assert!(order.holds_read(&heard));
+    assert!(order.read_must_wait(&heard));
     assert!(order.settled());
-    assert!(!order.holds_read(&heard));
+    assert!(!order.read_must_wait(&heard));
 }
 
 #[test]
@@ -270,5 +270,5 @@ fn a_node_does_not_wait_for_its_own_registrations() {
     let mut order = Order::default();
     let watch = Concern::of(Some(&call("subscribeParam", &["/a", "http://a:1/", "/k"])));
     order.sent(watch.tells(), Vec::new());
-    assert!(!order.holds_read(&watch.heard()));
+    assert!(!order.read_must_wait(&watch.heard()));
 }

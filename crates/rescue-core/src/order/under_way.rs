@@ -5,7 +5,7 @@ use std::{
     time::Instant,
 };
 
-use super::{BySubject, Heard, RECENT, Subject};
+use super::{BySubject, Heard, MustWait, RECENT, Subject};
 
 /// The answers and notifications on their way, by number, and the answers written recently.
 #[derive(Debug, Default)]
@@ -33,8 +33,10 @@ struct Entry {
 }
 
 impl Entry {
-    fn holds_up(&self, now: Instant) -> bool {
-        self.written.is_none() && self.limit.is_none_or(|limit| now < limit)
+    /// Whether it delays others, and until when.
+    fn delays(&self, now: Instant) -> Option<MustWait> {
+        let delays = self.written.is_none() && self.limit.is_none_or(|limit| now < limit);
+        delays.then_some(MustWait { until: self.limit })
     }
 }
 
@@ -101,22 +103,22 @@ impl UnderWay {
         }
     }
 
-    /// Whether anything on its way delays others, and until when.
-    pub(super) fn any(&self, now: Instant) -> Option<Option<Instant>> {
-        let mut entries = self.entries.values();
-        entries.find(|entry| entry.holds_up(now)).map(|it| it.limit)
+    /// Whether a call about any subject must wait for something on its way.
+    pub(super) fn must_wait(&self, now: Instant) -> Option<MustWait> {
+        self.entries.values().find_map(|entry| entry.delays(now))
     }
 
-    /// Whether anything about `subject` is on its way to a port other than `port`, and until when it delays others.
-    pub(super) fn before(
+    /// Whether a call about `subject` must wait for something on its way to a port other than `port`.
+    pub(super) fn must_wait_for(
         &self,
         now: Instant,
         subject: &Subject,
         port: Option<&str>,
-    ) -> Option<Option<Instant>> {
+    ) -> Option<MustWait> {
         let mut entries = self.concerned(subject);
-        entries.find_map(|(_, entry, heard)| {
-            (entry.holds_up(now) && port != Some(&heard.port)).then_some(entry.limit)
+        entries.find_map(|(_, entry, heard)| match port == Some(&heard.port) {
+            true => None,
+            false => entry.delays(now),
         })
     }
 
@@ -135,9 +137,8 @@ impl UnderWay {
             .filter(|(_, entry, heard)| entry.kind == Kind::Answer && heard.port == port);
         let mut last = None;
         for (_, entry, _) in to_port {
-            if entry.holds_up(now) {
-                let limit = entry.limit;
-                return Some(Answer::UnderWay { limit });
+            if let Some(MustWait { until }) = entry.delays(now) {
+                return Some(Answer::UnderWay { limit: until });
             }
             last = last.max(entry.written);
         }

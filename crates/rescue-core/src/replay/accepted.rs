@@ -48,7 +48,7 @@ pub struct Accepted<'a> {
     pub certain: bool,
 }
 
-/// The writes in `call` that the master has executed, according to its `reply`.
+/// The writes in `call` that the master has answered, according to its `reply`.
 ///
 /// A write has been executed if its answer has code 1. In a few cases rosmaster changes its state and still answers
 /// with an error: to a `setParam` whose callbacks cannot be computed, and to a `subscribeParam` of a value that cannot

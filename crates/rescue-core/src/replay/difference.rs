@@ -5,7 +5,7 @@ use indexmap::IndexMap;
 use crate::master::Master;
 use crate::xmlrpc::{Struct, Value};
 
-/// Most sentences.
+/// Maximum number of sentences.
 const SENTENCES_MAX: usize = 20;
 
 /// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if the two

@@ -10,7 +10,7 @@ use super::{Token, order};
 use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
-/// Most mismatches in an error.
+/// Maximum number of mismatches in an error.
 const MISMATCHES_MAX: usize = 20;
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.

@@ -39,7 +39,7 @@ pub struct Request {
 pub enum Entry {
     /// An entry that can be run.
     Request(Request),
-    /// An entry that is answered with a fault with this text.
+    /// An entry that is answered with a fault. This is the fault's text.
     Refused(&'static str),
     /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is always the
     /// last one. The text is rosmaster's only if it starts with `<`.

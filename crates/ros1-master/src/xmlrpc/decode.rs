@@ -18,8 +18,8 @@ use super::value::{Call, Reply, Struct, Value};
 /// can be read back. It also bounds recursion over values, including when they are dropped.
 pub const MAX_DEPTH: usize = 512;
 
-/// Most open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`, `data`). The others are
-/// for the envelope and for clients that nest a little more.
+/// Maximum number of open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`, `data`).
+/// The others are for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Decodes a request.

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-/// Most characters of a value's text in an error.
+/// Maximum number of characters of a value's text in an error.
 pub(super) const TEXT_CHARS_MAX: usize = 40;
 // Reasons from which expat's own error text can be derived.
 pub(super) const NO_ELEMENT: &str = "there is no element";

@@ -23,7 +23,7 @@ const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
 /// Least free memory, in bytes. rosmaster and rosrescue need some 40 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
-/// Most settings in launch files that are listed. More would hide the other findings.
+/// Maximum number of settings in launch files that are listed. More would hide the other findings.
 const SETTINGS_MOST: usize = 10;
 /// 2024-01-01, in seconds since 1970. A clock before it is wrong, because this program is younger.
 const EARLIEST: f64 = 1_704_067_200.0;
@@ -36,7 +36,9 @@ impl Findings {
         let runs = port.and_then(|port| port.taken.as_ref());
         let runs = runs.is_some_and(|taken| matches!(taken.server, Server::Rosrescue { .. }));
         if let (Some(holder), false) = (disk.holder, runs) {
-            let who = holder.map_or_else(String::new, |pid| format!(", process {pid}"));
+            let who = holder
+                .pid
+                .map_or_else(String::new, |pid| format!(", process {pid}"));
             return self.bad(
                 SUBJECT,
                 format!("{path} is in use by another rosrescue{who}"),

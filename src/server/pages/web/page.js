@@ -121,7 +121,7 @@ function connect() {
   };
   source.onerror = () => {
     setLink("lost", "no answer from rosrescue, retrying");
-    // The browser itself comes again after a lost connection, but not after a refusal.
+    // The browser reconnects by itself after a lost connection, but not after a refusal.
     if (source.readyState === EventSource.CLOSED) setTimeout(refused, 2000);
   };
   source.addEventListener("status", (event) => {
@@ -152,7 +152,7 @@ async function refused() {
       readState();
     }
   } catch {
-    // It is away.
+    // rosrescue does not answer.
   }
   connect();
 }
@@ -172,7 +172,7 @@ async function compareClocks() {
     // The header has whole seconds.
     skew = Math.abs(offset) > 2000 ? offset : 0;
   } catch {
-    // It is away again.
+    // rosrescue does not answer again.
   }
 }
 
@@ -197,7 +197,7 @@ async function readState() {
       if (isOther) showGraph();
     }
   } catch {
-    // The next event asks again.
+    // The next event requests it again.
   }
   setTimeout(() => {
     reading = false;
@@ -444,7 +444,7 @@ function fit(smallest = 0) {
   const scale = Math.max(smallest, Math.min(1, clientWidth / whole.width, clientHeight / whole.height));
   const width = clientWidth / scale;
   const height = clientHeight / scale;
-  // What is too large is shown from its beginning, or around a node that needs attention.
+  // A graph that is too large is shown from its beginning, or around a node that needs attention.
   const from = (start, length, shown, at) => {
     if (shown >= length) return start - (shown - length) / 2;
     return at === undefined ? start : Math.max(start, Math.min(at - shown / 2, start + length - shown));
@@ -733,7 +733,7 @@ function namespace(entry, name) {
   return made;
 }
 
-// ---- what the person does
+// ---- input
 
 for (const name of tabs) {
   $(`tab-${name}`).addEventListener("click", () => selectTab(name));

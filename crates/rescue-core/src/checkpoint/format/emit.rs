@@ -15,7 +15,7 @@ use crate::xmlrpc::{Struct, Value};
 const BLOCK_LEVELS_MAX: usize = 32;
 /// Longest key, in bytes. YAML 1.1 and 1.2 look for the `:` of an implicit key only within 1,024 characters.
 const KEY_BYTES_MAX: usize = 1_000;
-/// Most digits of a decimal integer. CPython refuses to read more (`sys.get_int_max_str_digits`, 4,300).
+/// Maximum number of digits of a decimal integer. CPython refuses to read more (`sys.get_int_max_str_digits`, 4,300).
 const INT_DIGITS_MAX: usize = 4_000;
 /// The kind of `!!pairs` entry that holds a date.
 pub(super) const DATE_TIME: &str = "dateTime.iso8601";

@@ -3,7 +3,7 @@
 use super::{EncodeError, emit};
 use crate::xmlrpc::{Struct, Value};
 
-/// Most characters of a value in a message.
+/// Maximum number of characters of a value in a message.
 const SHOWN: usize = 100;
 
 /// Converts the parameter tree to YAML that `rosparam load` reads correctly. Also returns a sentence for each parameter

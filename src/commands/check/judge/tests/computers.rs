@@ -47,7 +47,7 @@ fn peer_port(endpoint: &str) -> Result<u64, EtcdError> {
 }
 
 #[test]
-fn a_cluster_in_order_has_nothing_to_be_told() {
+fn a_cluster_without_problems_has_no_findings() {
     assert_eq!(said(|facts| given(facts, |_| {})), []);
 }
 

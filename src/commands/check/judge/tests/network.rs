@@ -10,16 +10,16 @@ use super::{
     },
     host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
 };
-use crate::ros_env::MasterUri;
+use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
 
 #[test]
-fn a_robot_in_order_has_nothing_to_be_told() {
+fn a_robot_without_problems_has_no_findings() {
     assert_eq!(said(|_| {}), []);
     assert!(judge(&robot()).len() >= 8);
     // The same holds while rosrescue runs, with its own master and its checkpoint in use.
     let found = said(|facts| {
         port(facts).taken = taken(rosrescue(None));
-        facts.disk.holder = Some(Some(7));
+        facts.disk.holder = Some(LockHolder { pid: Some(7) });
         facts.node_hosts = vec![(host("robot", "10.0.0.7", true), vec!["/a".to_owned()])];
     });
     assert_eq!(found, []);

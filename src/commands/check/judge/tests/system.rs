@@ -12,7 +12,7 @@ use super::{
     },
     one, process, rosrescue, said, unit,
 };
-use crate::ros_env::MasterUri;
+use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
 
 #[test]
 fn where_the_checkpoint_goes() {
@@ -24,7 +24,7 @@ fn where_the_checkpoint_goes() {
         "checkpoint",
         "in use by another rosrescue, process 9",
         |facts| {
-            facts.disk.holder = Some(Some(9));
+            facts.disk.holder = Some(LockHolder { pid: Some(9) });
         },
     );
     one(Problem, "checkpoint", "is a folder", |facts| {
