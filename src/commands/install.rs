@@ -178,6 +178,14 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
         .map_err(|error| Failure::Failed(format!("cannot find this program's file: {error}")))?;
 
     let mut plan = Plan::default();
+    if let Some(user) = &run_as
+        && named_user(args, &caller).is_none()
+        && rustix::process::geteuid().is_root()
+    {
+        plan.notes.push(format!(
+            "shown for {user}. Without sudo, name the user that runs the service, as in --run-as robot"
+        ));
+    }
     plan.obstacles
         .extend(misplaced(&program).filter(|_| !place.user));
     let (disabled, before) = plan.meet_others(place, &service);
@@ -481,7 +489,23 @@ fn caller_environment() -> BTreeMap<String, String> {
         .collect()
 }
 
-/// The user that runs the service. `None` for a user's own service.
+/// The user that runs the service, if an option or sudo names it.
+fn named_user(args: &InstallArgs, caller: &BTreeMap<String, String>) -> Option<String> {
+    let of_caller = || caller.get("SUDO_USER").cloned();
+    args.run_as.clone().or_else(of_caller)
+}
+
+/// The name of the user who runs this process.
+fn own_name() -> Result<String, Failure> {
+    let output = system::Command::new("id").arg("-un").output();
+    let name = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
+    let name = name.map_err(|error| Failure::Failed(format!("id: {error}")))?;
+    Some(name)
+        .filter(|name| !name.is_empty())
+        .ok_or_else(|| Failure::Failed("this user has no name: use --run-as".to_owned()))
+}
+
+/// The user that runs the service. `None` for a user's own service. A dry run needs no sudo.
 fn account(
     args: &InstallArgs,
     place: &Place,
@@ -490,21 +514,15 @@ fn account(
     if place.user {
         return Ok(None);
     }
-    let of_caller = || {
-        // A dry run needs no sudo.
-        let names = if args.scope.dry_run {
-            &["SUDO_USER", "USER", "LOGNAME"][..]
-        } else {
-            &["SUDO_USER"]
+    let Some(user) = named_user(args, caller) else {
+        return match args.scope.dry_run {
+            true => own_name().map(Some),
+            false => Err(Failure::Usage(
+                "name the user that runs the service, as in --run-as robot: without sudo, install cannot know it"
+                    .to_owned(),
+            )),
         };
-        names.iter().find_map(|&name| caller.get(name).cloned())
     };
-    let user = args.run_as.clone().or_else(of_caller).ok_or_else(|| {
-        Failure::Usage(
-            "name the user that runs the service, as in --run-as robot: without sudo, install cannot know it"
-                .to_owned(),
-        )
-    })?;
     let nobody = || {
         Failure::Usage(format!(
             "--run-as: there is no user `{user}` on this computer"

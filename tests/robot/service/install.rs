@@ -13,6 +13,9 @@ fn rosrescue(scratch: &Scratch, arguments: &[&str]) -> Output {
     let mut command = Command::new(PROGRAM);
     scratch.prepare(&mut command);
     command
+        .env_remove("USER")
+        .env_remove("LOGNAME")
+        .env_remove("SUDO_USER")
         .env_remove("ROS_HOME")
         .env_remove("ROS_LOG_DIR")
         .env_remove("XDG_CONFIG_HOME");
@@ -63,6 +66,22 @@ fn impossible_options_are_explained_in_one_sentence() {
         assert!(said.contains(sentence), "{arguments:?}: {said}");
     }
     assert!(!scratch.path(".config").exists());
+}
+
+/// Root may have no sudo and no variable with a name, as in a container.
+#[test]
+fn a_dry_run_needs_no_sudo() {
+    let scratch = Scratch::new();
+    let user = Command::new("id").arg("-un").output().unwrap().stdout;
+    let user = String::from_utf8(user).unwrap();
+    let output = rosrescue(&scratch, &["install", "--dry-run"]);
+    // Its program is not in a system folder, which is all that is in the way.
+    let said = said(&output, 1);
+    for line in ["run     systemctl enable", &format!("User={user}")] {
+        assert!(said.contains(line), "{line}: {said}");
+    }
+    let is_root = user.trim() == "root";
+    assert_eq!(said.contains("as in --run-as robot"), is_root, "{said}");
 }
 
 #[test]
