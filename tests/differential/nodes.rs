@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use rosrescue::master::Notice;
 use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
-use crate::support::FakeMaster;
+use crate::support::{FakeMaster, sorted, unordered};
 
 /// Whether a failure was found, and only a shorter script is searched for.
 pub(crate) static HURRIED: AtomicBool = AtomicBool::new(false);
@@ -103,8 +103,10 @@ pub(crate) fn as_call(notice: &Notice) -> (&str, Call) {
 
 pub(crate) fn blank(mut call: Call) -> Call {
     for param in &mut call.params {
-        if let Value::Struct(members) = param {
-            *members = Struct::new();
+        match param {
+            Value::Struct(members) => *members = Struct::new(),
+            list if unordered() => *list = sorted(list),
+            _ => {}
         }
     }
     call

@@ -110,7 +110,7 @@ for name; do
         "$(echo "${release%-*}" | sed 's/./\u&/') ${release#*-}, ${http%,}$(test -z "$force" || echo ' forced')" \
         "$version" "$python" \
         "$(count "$log" 'paper::cases|paper::case_2')" "$(count "$log" 'paper::case_3')" \
-        "$(count "$log" 'outage::long')" "$(count "$log" 'master::hung')" "–" \
+        "$(count "$log" 'outage::long')" "$(count "$log" 'master::hung')" \
         "0 of $(messages "$log")" "$(differences "$log.differential")" "$(date +%F)"
     echo "$name: $(grep '^test result' "$log"); $(($(date +%s) - begin)) s"
 done

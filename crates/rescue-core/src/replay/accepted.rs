@@ -180,17 +180,16 @@ fn executed(method: &Method, reply: &Reply) -> Option<bool> {
 
 /// Whether a fault concerns the encoding of the reply, instead of the decoding of the call.
 pub(super) fn is_write_error(text: &str) -> bool {
-    [
+    // Python 3 and Python 2.
+    let mut prefixes = ["<class '", "<type 'exceptions."].into_iter();
+    let class = prefixes.find_map(|prefix| text.strip_prefix(prefix));
+    let classes = [
         "TypeError",
         "OverflowError",
         "RecursionError",
         "RuntimeError",
-    ]
-    .iter()
-    .any(|class| {
-        text.strip_prefix("<class '")
-            .is_some_and(|text| text.starts_with(class))
-    })
+    ];
+    class.is_some_and(|class| classes.iter().any(|of| class.starts_with(of)))
 }
 
 #[cfg(test)]
@@ -234,6 +233,11 @@ mod tests {
         assert!(of.agrees(&fault("TypeError"), true));
         assert!(!of.agrees(&fault("TypeError"), false));
         assert!(!of.agrees(&fault("Exception"), true));
+        let python_2 = Reply::Fault {
+            code: 1,
+            text: "<type 'exceptions.OverflowError'>:int exceeds XML-RPC limits".to_owned(),
+        };
+        assert!(of.agrees(&python_2, true));
         // A `setParam` that has run and then failed has its own message.
         let failed = |text: &str| answer_with(0, &format!("Internal failure: {text}"));
         let set = set("/a", 1);

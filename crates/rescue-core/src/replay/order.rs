@@ -11,16 +11,28 @@ pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<St
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
-/// Like [`arrange`], including nested structs.
+/// Like [`arrange`], including nested structs, also those in lists.
 pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;
     }
     arrange(found, known);
     for (key, value) in found.iter_mut() {
-        if let (Value::Struct(found), Some(Value::Struct(known))) = (value, known.get(key)) {
-            arrange_params(found, known);
+        if let Some(known) = known.get(key) {
+            arrange_value(value, known);
         }
+    }
+}
+
+fn arrange_value(found: &mut Value, known: &Value) {
+    match (found, known) {
+        (Value::Struct(found), Value::Struct(known)) => arrange_params(found, known),
+        (Value::Array(found), Value::Array(known)) => {
+            for (found, known) in found.iter_mut().zip(known) {
+                arrange_value(found, known);
+            }
+        }
+        _ => {}
     }
 }
 
@@ -83,6 +95,13 @@ mod tests {
         let mut more = tree(&["x", "a", "b", "c"]);
         arrange_params(&mut more, &known);
         assert_eq!(more.keys().collect::<Vec<_>>(), ["c", "a", "b", "x"]);
+        // The controllers of a robot are a list of dictionaries.
+        let list = |tree: Struct| {
+            Struct::from([("list".to_owned(), Value::Array(vec![Value::Struct(tree)]))])
+        };
+        let mut found = list(tree(&["a", "b", "c"]));
+        arrange_params(&mut found, &list(known.clone()));
+        assert_eq!(found, list(known));
     }
 
     #[test]
