@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn sockets_of_others_are_advertised_as_they_are_bound() {
+    fn inherited_sockets_are_advertised_as_they_are_bound() {
         let served = |address: &str, ip: Option<&str>| {
             let cli = Cli::parse_from(["rosrescue", "-p", "12000"]);
             let env = |name: &str| ip.filter(|_| name == "ROS_IP").map(str::to_owned);

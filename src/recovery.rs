@@ -41,7 +41,7 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// Limits the log lines that masters keep dying, and that the present one keeps running.
+/// Limits the log lines about the beginning and the end of a crash loop.
 static CRASH_LOOP: Pair = Pair::new();
 
 /// The result of a step. At most one step runs at a time.

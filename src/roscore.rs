@@ -121,7 +121,7 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     version.map(|version| set(key, &version))
 }
 
-/// Limits the log lines that rosout has ended or cannot be started, and that it was started.
+/// Limits the log lines about the end and the start of rosout.
 static ENDED: Pair = Pair::new();
 
 /// Keeps one rosout running: that of this rosrescue, or one that exists already.

@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn options_that_need_others_say_so() {
+    fn options_that_need_another_option_say_so() {
         let said = |args: &[&str]| {
             let args = [&["rosrescue", "core"], args].concat();
             Cli::try_parse_from(args).expect_err("refused").to_string()

@@ -102,7 +102,7 @@ fn interrupted() -> Failure {
 
 /// Says what will be killed, and asks for consent.
 async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
-    target.refuse_others().await?;
+    target.require_this_computer().await?;
     let kill = if args.hang { Victim::Master } else { args.kill };
     let victims = names(&target.victims(kill).await?);
     let how = if args.hang { "SIGSTOP" } else { "SIGKILL" };

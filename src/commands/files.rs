@@ -23,7 +23,7 @@ use crate::{
     ros_env::DEFAULT_MASTER_PORT,
 };
 
-/// A file of this size takes about a second to read, in bytes.
+/// Size of a file that takes about a second to read, in bytes.
 const LARGE: u64 = 16 << 20;
 
 /// A checkpoint that was read from disk.

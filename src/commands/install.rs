@@ -188,7 +188,7 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
     }
     plan.obstacles
         .extend(misplaced(&program).filter(|_| !place.user));
-    let (disabled, before) = plan.meet_others(place, &service);
+    let (disabled, before) = plan.plan_other_units(place, &service);
     let files = place.files();
     let [unit, socket_unit, dropin, socket_dropin] =
         files.each_ref().map(|path| fs::read_to_string(path).ok());
@@ -336,7 +336,7 @@ impl Plan {
 
     /// Handles other units that start a master or roslaunch. Returns those to disable, and those to start after
     /// rosrescue.
-    fn meet_others(&mut self, place: &Place, service: &Service) -> (Vec<String>, Vec<String>) {
+    fn plan_other_units(&mut self, place: &Place, service: &Service) -> (Vec<String>, Vec<String>) {
         let (mut disabled, mut before) = (Vec::new(), Vec::new());
         let all = place.other_units().into_iter();
         for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {

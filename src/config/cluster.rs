@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_computer_is_known_by_its_host_name_and_the_address_where_others_reach_it() {
+    fn a_computers_default_name_has_its_host_name_and_address() {
         assert_eq!(config(&[], "pc-1").unwrap().cluster, None);
         let one = cluster(&[]).unwrap();
         assert_eq!(one.endpoints, ["http://a:2379", "http://b:2379"]);
@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn others_reach_it_where_it_is_told() {
+    fn other_computers_reach_it_at_the_advertised_address() {
         for (given, uri) in [
             ("pc-1.local", "http://pc-1.local:12000/"),
             ("pc-1:5", "http://pc-1:5/"),

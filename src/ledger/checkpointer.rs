@@ -31,7 +31,7 @@ const QUIET: Duration = Duration::from_secs(2);
 /// Shortest time between two compactions. Each wears out memory cards.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// Limits the log lines that the state is not recorded, and that it is recorded again.
+/// Limits the log lines about a failure to record the state, and about its end.
 static UNPROTECTED: Pair = Pair::new();
 
 pub(crate) struct Checkpointer {

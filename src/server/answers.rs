@@ -16,8 +16,8 @@ use tokio::sync::{Mutex as Turn, Notify, OwnedSemaphorePermit, Semaphore};
 
 use super::{body::SMALL, replies::HttpReply};
 
-/// Slowest reading of a large answer, in bytes per second. A slower client is closed when other answers need its
-/// memory.
+/// Minimum rate at which a client must read a large answer, in bytes per second. A slower client is closed when other
+/// answers need its memory.
 const RATE: u32 = 256 << 10;
 /// Maximum credit that a client gains by reading faster than [`RATE`]. After a pause of this length it counts as slow.
 const AHEAD: Duration = Duration::from_millis(250);

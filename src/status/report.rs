@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::limit::{Pair, all_clear, rarely};
 use crate::{clock, master::Counts};
 
-/// Limits the log lines that the master is away, and that calls pass to the master again.
+/// Limits the log lines about the beginning and the end of an outage.
 pub(crate) static AWAY: Pair = Pair::new();
 
 /// Cause of a recovery at an ordinary start of rosrescue.

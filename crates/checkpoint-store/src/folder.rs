@@ -28,7 +28,7 @@ impl Access {
     }
 
     /// Which other users than `own` may create files in the folder. `None` if none may.
-    fn others(self, own: u32) -> Option<&'static str> {
+    fn other_writers(self, own: u32) -> Option<&'static str> {
         // Many distributions give each user a group with the same number and no other members.
         let is_private = self.group == self.user || self.group == 0;
         if self.mode & 0o002 != 0 {
@@ -61,7 +61,7 @@ pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
         .enumerate()
         // In a sticky folder other users may create a file beside the checkpoint, but not replace a folder below it.
         .filter(|(level, (_, access))| *level == 0 || access.mode & STICKY == 0)
-        .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.others(own)?)))
+        .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.other_writers(own)?)))
 }
 
 #[cfg(test)]
@@ -72,13 +72,17 @@ mod tests {
 
     #[test]
     fn a_folder_is_open_to_others_if_anyone_but_its_user_and_root_may_write() {
-        let others = |mode, user, group| Access { mode, user, group }.others(1000);
-        assert_eq!(others(0o755, 1000, 1000), None);
-        assert_eq!(others(0o755, 0, 0), None);
-        assert_eq!(others(0o775, 1000, 1000), None, "a group of the user's own");
-        assert!(others(0o775, 1000, 100).is_some());
-        assert!(others(0o1777, 0, 0).is_some());
-        assert!(others(0o755, 1001, 1001).is_some());
+        let writers = |mode, user, group| Access { mode, user, group }.other_writers(1000);
+        assert_eq!(writers(0o755, 1000, 1000), None);
+        assert_eq!(writers(0o755, 0, 0), None);
+        assert_eq!(
+            writers(0o775, 1000, 1000),
+            None,
+            "a group of the user's own"
+        );
+        assert!(writers(0o775, 1000, 100).is_some());
+        assert!(writers(0o1777, 0, 0).is_some());
+        assert!(writers(0o755, 1001, 1001).is_some());
     }
 
     #[test]

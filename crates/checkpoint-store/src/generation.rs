@@ -9,7 +9,7 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// Least size of a journal for which a new generation is written.
+/// Minimum size of a journal for which a new generation is written.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
 /// Maximum size of the records that are kept in memory while a new generation is written. Beyond it the new
 /// generation is dropped and the present file stays in use.

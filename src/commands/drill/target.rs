@@ -92,8 +92,10 @@ impl Target {
         }
     }
 
-    /// Refuses a rosrescue on another computer.
-    pub(super) async fn refuse_others(&self) -> Result<(), Failure> {
+    /// # Errors
+    ///
+    /// If this rosrescue runs on another computer.
+    pub(super) async fn require_this_computer(&self) -> Result<(), Failure> {
         let address = &self.running.address;
         if is_here(address).await {
             return Ok(());

@@ -13,7 +13,7 @@ use crate::xmlrpc::Value;
 
 /// Longest time for a publisher to accept a subscriber.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
-/// Least number of messages before the first kill to tell a topic's normal pauses.
+/// Minimum number of messages before the first kill to tell a topic's normal pauses.
 const FEWEST: u64 = 10;
 /// Shorter pauses never count as failures: any computer may be busy for that long.
 const SHORTEST_GAP: Duration = Duration::from_secs(1);

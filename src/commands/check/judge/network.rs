@@ -220,7 +220,7 @@ impl Findings {
             // The finding about the variable covers it.
             return;
         }
-        let others = others(facts);
+        let other_computer = other_computer(facts);
         match &own.addresses {
             Err(why) => self.bad(
                 subject,
@@ -235,7 +235,7 @@ impl Findings {
             Ok(_) if own.is_loopback() => {
                 let what = format!("{}, which other computers cannot reach", leads(own));
                 let todo = "export ROS_IP with this computer's network address before anything starts";
-                match others {
+                match other_computer {
                     Some(other) => {
                         self.bad(subject, format!("{what}, but {other} is part of the robot"), todo);
                     }
@@ -373,7 +373,7 @@ fn leads(host: &Host) -> String {
 }
 
 /// Another computer of the robot, if one is known.
-fn others(facts: &Facts) -> Option<String> {
+fn other_computer(facts: &Facts) -> Option<String> {
     let hosts = facts.node_hosts.iter().map(|(host, _)| host);
     let mut far = hosts.chain(&facts.master_host);
     let far = far.find(|host| host.addresses.is_ok() && !host.is_here)?;

@@ -11,17 +11,17 @@ use super::{
 };
 use crate::{clock, status::software};
 
-/// Least free space, in bytes. A checkpoint and ROS's logs soon use up less.
+/// Minimum free space, in bytes. A checkpoint and ROS's logs soon use up less.
 const LITTLE_SPACE: u64 = 500 << 20;
 const NO_SPACE: u64 = 20 << 20;
-/// Least number of files that can still be created. Each start and each rescue creates some ten files: checkpoint,
+/// Minimum number of files that can still be created. Each start and each rescue creates some ten files: checkpoint,
 /// reports and logs.
 const FEW_INODES: u64 = 1000;
 const NO_INODES: u64 = 10;
-/// Least limit of open files. With fewer, client connections run out.
+/// Minimum limit of open files. With a lower one, client connections run out.
 const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
-/// Least free memory, in bytes. rosmaster and rosrescue need some 40 MB.
+/// Minimum free memory, in bytes. rosmaster and rosrescue need some 40 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
 /// Maximum number of settings in launch files that are listed. More would hide the other findings.
 const SETTINGS_MOST: usize = 10;
