@@ -135,7 +135,7 @@ impl Etcd {
         self.0.try_each(&keys.leader(), limit).await
     }
 
-    /// Names of the robots that have or had a leader in this etcd, up to [`ROBOTS_MOST`].
+    /// Names of the robots that have or had a leader in this etcd, up to `ROBOTS_MOST`.
     ///
     /// # Errors
     ///
