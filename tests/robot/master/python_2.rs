@@ -27,7 +27,7 @@ fn the_order_of_dictionaries_is_no_divergence(mode: Mode) {
         node.publish(&client, &topic, "a/B");
         nodes[0].subscribe(&client, &topic, "a/B");
         node.offer(&client, &format!("{}/service", node.name));
-        let plugins = vec![Value::from(tree! { "type" => "x/Y", "name" => "y" })];
+        let plugins = vec![tree! { "type" => "x/Y", "name" => "y" }];
         let inner = tree! {
             "z" => 1, "a" => 2, "m" => tree! { "y" => 1, "b" => 2, "k" => 3 }, "plugins" => plugins
         };
