@@ -73,7 +73,11 @@ impl<T: Copy + PartialEq> BySubject<T> {
         all.flatten().copied()
     }
 
-    /// Whether `subject` concerns any value.
+    pub fn is_empty(&self) -> bool {
+        self.exact.is_empty() && self.params.is_empty()
+    }
+
+    /// Whether `subject` concerns anything in this collection.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
     }
