@@ -13,9 +13,11 @@ use std::{
 use self::evidence::{BUSY_LIMIT, Evidence, Sample, Verdict};
 
 pub mod evidence;
+mod open_calls;
 mod patience;
 mod types;
 
+pub use open_calls::OpenCalls;
 pub use patience::Patience;
 pub use types::{Action, Cause, Input, Probing, Supervision};
 
