@@ -174,6 +174,7 @@ impl Lifecycle {
             && match input {
                 Input::ProbeMissed | Input::Unreachable => true,
                 Input::Refused => is_old && self.is_slow_to_start(now),
+                Input::ConnectionLost => is_old && self.is_hopeless(now),
                 _ => false,
             }
     }
@@ -231,10 +232,13 @@ impl Lifecycle {
                 self.give_up(now)
             }
             Input::Unreachable => self.unreachable(now),
-            Input::NotAMaster | Input::ConnectionLost
-                if self.phase == Phase::Examining && self.is_hopeless(now) =>
-            {
+            Input::NotAMaster if self.phase == Phase::Examining && self.is_hopeless(now) => {
                 self.give_up(now)
+            }
+            // rosmaster closes connections that carry nothing for a few seconds, so those of a
+            // starved rosmaster or rosrescue end, too.
+            Input::ConnectionLost if self.phase == Phase::Examining && self.is_hopeless(now) => {
+                self.give_up_if_hung(now, BUSY_LIMIT, true)
             }
             Input::NotAMaster => {
                 self.seek(now);
