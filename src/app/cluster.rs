@@ -171,7 +171,7 @@ impl Member {
             tracing::trace!(?input, "cluster");
         }
         let actions = self.machine.on(now, input);
-        self.given.parts.ledger.set_lease(self.machine.lease(now));
+        self.given.context.ledger.set_lease(self.machine.lease(now));
         for action in actions {
             if !matches!(action, Action::Send { .. } | Action::Acknowledge(_)) {
                 tracing::debug!(?action, "cluster");
@@ -188,7 +188,7 @@ impl Member {
             Action::Send { number, op } => self.send(number, op),
             Action::CatchUp(seq) => self.wanted = Some(seq),
             Action::Become(role) => self.become_role(role).await,
-            Action::Acknowledge(seq) => self.given.parts.ledger.agree(seq),
+            Action::Acknowledge(seq) => self.given.context.ledger.agree(seq),
             Action::Yield {
                 committed,
                 acknowledged,
@@ -258,7 +258,7 @@ impl Member {
             () = stop.cancelled(), if !stopping => return self.begin_stop(),
             error = failed(&mut self.duty) => return Some(Some(error.into())),
             Some(done) = self.requests.join_next() => self.inbox.extend(done),
-            () = self.given.parts.ledger.shared.notified() => self.take_changes().await,
+            () = self.given.context.ledger.shared.notified() => self.take_changes().await,
             done = wait::for_some(self.outgoing.preparing.as_mut()) => self.prepared(done),
             changes = next_changes(&mut self.watch) => self.changed(changes),
             loaded = wait::for_some(self.loading.as_mut()) => {

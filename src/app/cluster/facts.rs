@@ -251,7 +251,7 @@ impl Member {
             lost_writes: known.lost_writes,
         };
         self.given
-            .parts
+            .context
             .board
             .update(|board| board.cluster = Some(facts));
     }

@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{Background, CutOff, Known, Member, Outgoing};
 use crate::{
-    app::{duty::Parts, startup},
+    app::{duty::Context, startup},
     checkpoint::session::Restore,
     cluster::{
         etcd::{Access, Etcd, EtcdError, Options, Tls},
@@ -39,7 +39,7 @@ const START_BY: Duration = Duration::from_secs(2);
 /// What a computer among several is given.
 pub(in crate::app) struct Given {
     pub(in crate::app) config: ClusterConfig,
-    pub(in crate::app) parts: Arc<Parts>,
+    pub(in crate::app) context: Arc<Context>,
     pub(in crate::app) rosmaster: Rosmaster,
     pub(in crate::app) rosout: bool,
     /// Identifies this process.
@@ -88,8 +88,8 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
             WhenCutOff::Refuse => WhenAlone::Refuse,
         },
     };
-    let parts = &given.parts;
-    parts.ledger.leave();
+    let context = &given.context;
+    context.ledger.leave();
     // One that an earlier process left may hold what others have changed since.
     block_in_place(|| given.rosmaster.claim_orphan(None));
     let known = given.restored;
@@ -97,14 +97,14 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let (handovers_tx, handovers) = mpsc::channel(1);
     let followed = watch::Sender::new(Place::default());
     let forwarded = Arc::<Forwarded>::default();
-    let peers = Arc::new(Peers::new(given.instance.clone(), parts.probe_timeout));
+    let peers = Arc::new(Peers::new(given.instance.clone(), context.probe_timeout));
     let others = Others {
         way: way_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
         forwarded: forwarded.clone(),
-        served: given.parts.served.clone(),
+        served: given.context.served.clone(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {
@@ -114,7 +114,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
         hold: given.hold.max(2 * config.ttl),
     };
-    let cut_off = CutOff::left(&parts.checkpoint, given.restored).await;
+    let cut_off = CutOff::left(&context.checkpoint, given.restored).await;
     let member = Member {
         machine: Machine::new(settings.clone()),
         replica: Replica {

@@ -157,7 +157,7 @@ impl Member {
         }
         if self.follows() {
             // Only if this computer has the master by now.
-            let _ = self.given.parts.ledger.follow(records);
+            let _ = self.given.context.ledger.follow(records);
         }
     }
 
@@ -188,7 +188,7 @@ impl Member {
             self.look_for_typo();
             let leader = self.view.leader.as_ref();
             // etcd's journal is the truth. Our checkpoint may only hold more of it, written in the same term.
-            let ours = self.given.parts.ledger.session().cluster_seq;
+            let ours = self.given.context.ledger.session().cluster_seq;
             self.ours =
                 leader.is_none_or(|leader| self.was_self(leader) && ours >= self.view.seq());
         }
@@ -260,7 +260,7 @@ impl Member {
 
     /// Whether an earlier process of this computer leads, and nobody has since the ledger was recorded.
     pub(super) fn was_self(&self, leader: &Leader) -> bool {
-        let term = self.given.parts.ledger.session().term;
+        let term = self.given.context.ledger.session().term;
         leader.id != self.settings.id && leader.name == self.settings.name && leader.term == term
     }
 }

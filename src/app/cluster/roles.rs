@@ -37,7 +37,7 @@ static ALONE: Pair = Pair::new();
 impl Member {
     /// Whether this computer records its own calls: it leads, or it is alone and serves.
     pub(super) fn records(&self) -> bool {
-        self.given.parts.ledger.records_here()
+        self.given.context.ledger.records_here()
     }
 
     /// Whether the ledger holds what the journal does.
@@ -52,7 +52,7 @@ impl Member {
 
     /// Brings the ledger to the journal's state, if it follows it.
     pub(super) fn adopt_held(&mut self) {
-        let ledger = &self.given.parts.ledger;
+        let ledger = &self.given.context.ledger;
         if self.follows() && ledger.with_mirror(|mirror| *mirror != self.held) {
             // Only if this computer has the master by now.
             let _ = ledger.follow_state(self.held.clone());
@@ -83,7 +83,7 @@ impl Member {
         let term = self.machine.term().unwrap_or_default();
         if !self.records() {
             if matches!(self.machine.session(), Session::Over(_)) {
-                let _ = self.given.parts.ledger.follow_state(Master::default());
+                let _ = self.given.context.ledger.follow_state(Master::default());
             }
             let cause = match self.known.taken_over(self.before.take(), self.was_released) {
                 true => TAKEN_OVER,
@@ -92,21 +92,21 @@ impl Member {
             self.ours = false;
             let seq = self.machine.committed();
             self.outgoing.start(seq);
-            let ledger = &self.given.parts.ledger;
+            let ledger = &self.given.context.ledger;
             ledger.lead(seq, &self.held);
             let displaced = self.displaced.at(Instant::now());
             ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
             self.begin_duty(Some(self.given.rosout), cause);
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
-            self.given.parts.nodes.set_alone(false);
+            self.given.context.nodes.set_alone(false);
             self.begin_duty(Some(self.given.rosout), CUT_OFF);
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
             if self.cut_off.is_none() {
-                cut_off::remove(&self.given.parts.checkpoint).await;
+                cut_off::remove(&self.given.context.checkpoint).await;
             }
         }
-        let ledger = &self.given.parts.ledger;
+        let ledger = &self.given.context.ledger;
         ledger.update_session(|session| session.term = term);
         self.set_way(Way::Here { term: Some(term) });
     }
@@ -141,7 +141,7 @@ impl Member {
         self.end_duty().await;
         let base = match led {
             true => self.held.clone(),
-            false => self.given.parts.ledger.with_mirror(Clone::clone),
+            false => self.given.context.ledger.with_mirror(Clone::clone),
         };
         // The nodes go on from what they wrote alone before.
         let base = match &self.cut_off {
@@ -149,10 +149,10 @@ impl Member {
             None => base,
         };
         self.cut_off_in(base.clone()).await;
-        self.given.parts.nodes.set_alone(true);
+        self.given.context.nodes.set_alone(true);
         if let Some(cut_off) = &mut self.cut_off {
             if led {
-                let answered = self.given.parts.ledger.last_agreed();
+                let answered = self.given.context.ledger.last_agreed();
                 let changes = self.outgoing.changes();
                 let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
                 cut_off.add(kept, true).await;
@@ -163,10 +163,10 @@ impl Member {
         if !led {
             let seq = self.machine.committed();
             self.outgoing.start(seq);
-            let _ = self.given.parts.ledger.follow_state(base.clone());
-            self.given.parts.ledger.lead(seq, &base);
+            let _ = self.given.context.ledger.follow_state(base.clone());
+            self.given.context.ledger.lead(seq, &base);
         }
-        self.given.parts.gate_tx.set(State::StandingIn);
+        self.given.context.gate_tx.set(State::StandingIn);
         self.set_way(Way::Here { term: None });
         self.outgoing.all_ready();
         self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
@@ -178,14 +178,14 @@ impl Member {
             // It is not known yet what the others have: that is compared with the first time.
             Some(_) if !self.loaded => {}
             Some(cut_off) => cut_off.again(base),
-            None => self.cut_off = Some(CutOff::new(&self.given.parts.checkpoint, base).await),
+            None => self.cut_off = Some(CutOff::new(&self.given.context.checkpoint, base).await),
         }
     }
 
-    /// `rosout`: see [`Parts::begin`](crate::app::duty::Parts::begin).
+    /// `rosout`: see [`Context::begin`](crate::app::duty::Context::begin).
     fn begin_duty(&mut self, rosout: Option<bool>, cause: &'static str) {
         let process = MasterProcess::new(self.given.rosmaster.clone(), None, None);
-        self.duty = Some(self.given.parts.begin(process, rosout, cause));
+        self.duty = Some(self.given.context.begin(process, rosout, cause));
     }
 
     /// Has a master as long as the machine allows it.
@@ -196,7 +196,7 @@ impl Member {
                 "etcd is silent, and another computer may lead by now: this one's master is ended, and its mirror answers"
             );
             self.end_duty().await;
-            self.given.parts.gate_tx.set(State::StandingIn);
+            self.given.context.gate_tx.set(State::StandingIn);
         } else if self.duty.is_none() && may && self.records() {
             self.begin_duty(Some(self.given.rosout), CUT_OFF);
         }
@@ -207,18 +207,18 @@ impl Member {
             let ending = duty.end().await;
             self.endings.spawn(ending);
         }
-        self.given.parts.ledger.end_injection();
+        self.given.context.ledger.end_injection();
     }
 
     /// Whatever is recorded or answered here from now on is not for the others.
     pub(super) async fn give_up_duty(&mut self) {
-        let post = &self.given.parts;
+        let post = &self.given.context;
         post.ledger.leave();
         self.set_way(Way::Nobody {
             known: self.knows(),
         });
         self.end_duty().await;
-        let post = &self.given.parts;
+        let post = &self.given.context;
         post.nodes.set_alone(false);
         post.gate_tx.set(match self.machine.role() {
             Role::Joining => State::Unknown,
@@ -283,7 +283,7 @@ impl Member {
 
     /// The ledger has changed.
     pub(super) async fn take_changes(&mut self) {
-        let changes = self.given.parts.ledger.take_changes();
+        let changes = self.given.context.ledger.take_changes();
         let is_alone = self.machine.role() == Role::Alone;
         if self.keeps()
             && let Some(cut_off) = &mut self.cut_off
@@ -301,7 +301,7 @@ impl Member {
                 // Nobody is given them: the leader gets what is kept.
                 false => self.outgoing.forget(),
                 true if self.outgoing.has_outgrown() => {
-                    let rest = self.given.parts.ledger.take_as_state();
+                    let rest = self.given.context.ledger.take_as_state();
                     self.outgoing.replace_rest(rest);
                     self.outgoing.all_ready();
                 }
@@ -450,7 +450,7 @@ impl Member {
             let route = Route {
                 leads: self.leads.subscribe(),
                 peers: self.peers.clone(),
-                write_queue: self.given.parts.write_queue.clone(),
+                write_queue: self.given.context.write_queue.clone(),
             };
             self.merging = Some(Box::pin(async move {
                 merging::send(time, present, route, &hide).await
@@ -528,7 +528,7 @@ impl Member {
             self.cut_off = cut_off.sent().await;
         }
         if self.cut_off.is_none() {
-            cut_off::remove(&self.given.parts.checkpoint).await;
+            cut_off::remove(&self.given.context.checkpoint).await;
         }
         let leads = self.leads.borrow().clone();
         self.set_way(leads);

@@ -1,4 +1,4 @@
-//! Nodes whose names were taken while another computer led: whoever leads next tells them to shut down, because that one may
+//! Nodes whose names were taken while another computer led: the next leader tells them to shut down, because that one may
 //! have died before it could.
 
 use std::{
