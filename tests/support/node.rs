@@ -65,7 +65,7 @@ impl Node {
         arguments: &[&str],
     ) -> Self {
         let mut node = Self::spawn(scratch, library, port, node, arguments);
-        node.wait_line("`ready`", |line| line.starts_with("ready "));
+        node.wait_ready();
         node
     }
 
@@ -74,8 +74,14 @@ impl Node {
     pub(crate) fn run(command: &mut Command) -> Self {
         let process = Process::start(format!("{command:?}"), command);
         let mut node = Self { process };
-        node.wait_line("`ready`", |line| line.starts_with("ready "));
+        node.wait_ready();
         node
+    }
+
+    #[track_caller]
+    fn wait_ready(&mut self) {
+        self.wait_line("`ready`", |line| line.starts_with("ready "));
+        self.hold_ports();
     }
 
     /// The rest of each line that starts with `word`.

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal};
 
 use super::patience::{eventually, eventually_some};
+use super::scratch::{FIRST_OF_KERNEL, hold_port};
 
 /// Sends `signal` to one process. It is not an error if the process is gone.
 pub(crate) fn signal(pid: u32, signal: Signal) {
@@ -45,6 +46,25 @@ fn state(folder: &Path) -> Option<char> {
     stat.rsplit(')').next()?.trim_start().chars().next()
 }
 
+/// The ports that the kernel chose for the process, and at which it listens.
+fn listening_ports(pid: u32) -> Vec<u16> {
+    let files = std::fs::read_dir(format!("/proc/{pid}/fd"));
+    let files = files.into_iter().flatten().flatten();
+    let files = files.filter_map(|file| std::fs::read_link(file.path()).ok());
+    let open: Vec<_> = files.collect();
+    let table = std::fs::read_to_string(format!("/proc/{pid}/net/tcp")).unwrap_or_default();
+    let sockets = table.lines().filter_map(|line| {
+        let columns: Vec<_> = line.split_whitespace().collect();
+        let [_, local, _, "0A", .., inode] = columns.get(..10)? else {
+            return None;
+        };
+        let port = u16::from_str_radix(local.rsplit(':').next()?, 16).ok()?;
+        let socket = Path::new(&format!("socket:[{inode}]")).to_owned();
+        (port >= FIRST_OF_KERNEL && open.contains(&socket)).then_some(port)
+    });
+    sockets.collect()
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stream {
     Out,
@@ -64,6 +84,8 @@ pub(crate) struct Process {
     name: String,
     child: Child,
     ended: Option<ExitStatus>,
+    /// The ports that nothing else may get for a while after it has ended.
+    ports: Vec<u16>,
     lines: Arc<Mutex<Vec<Line>>>,
     readers: [JoinHandle<()>; 2],
 }
@@ -88,6 +110,7 @@ impl Process {
             name,
             child,
             ended: None,
+            ports: Vec::new(),
             lines,
             readers,
         }
@@ -103,6 +126,12 @@ impl Process {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
         let line = status.lines().find(|line| line.starts_with(name)).unwrap();
         line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    }
+
+    /// Makes the ports at which the process listens now refuse connections for a while after it has ended. Otherwise a
+    /// node of another test could get a dead node's port and be taken for it.
+    pub(crate) fn hold_ports(&mut self) {
+        self.ports = listening_ports(self.pid());
     }
 
     pub(crate) fn signal(&self, which: Signal) {
@@ -128,6 +157,9 @@ impl Process {
     pub(crate) fn exited(&mut self) -> Option<ExitStatus> {
         if self.ended.is_none() {
             self.ended = self.child.try_wait().expect("cannot wait for a child");
+            if self.ended.is_some() {
+                self.ports.drain(..).for_each(hold_port);
+            }
         }
         self.ended
     }

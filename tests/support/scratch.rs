@@ -1,5 +1,6 @@
 //! A folder, a token and ports for one test.
 
+use std::collections::VecDeque;
 use std::ffi::OsString;
 use std::fs;
 use std::io::ErrorKind;
@@ -15,6 +16,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use tempfile::TempDir;
+use tokio::net::TcpSocket;
 
 use super::process::signal;
 
@@ -172,6 +174,26 @@ pub(crate) fn free_port() -> u16 {
         // Some computers have no IPv6.
         if v4.is_ok() && !v6.is_err_and(|error| error.kind() == ErrorKind::AddrInUse) {
             return port;
+        }
+    }
+}
+
+/// The first of the ports that the kernel chooses by itself.
+pub(crate) const FIRST_OF_KERNEL: u16 = 32_768;
+
+/// Makes `port` refuse connections until 200 other ports have been held: nothing gets it by chance.
+pub(crate) fn hold_port(port: u16) {
+    static HELD: Mutex<VecDeque<TcpSocket>> = Mutex::new(VecDeque::new());
+    let Ok(socket) = TcpSocket::new_v4() else {
+        return;
+    };
+    // Closed connections of the dead process must not prevent it.
+    let address = (Ipv4Addr::UNSPECIFIED, port).into();
+    if socket.set_reuseaddr(true).is_ok() && socket.bind(address).is_ok() {
+        let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+        held.push_back(socket);
+        if held.len() > 200 {
+            held.pop_front();
         }
     }
 }

@@ -87,7 +87,7 @@ fn case_1_nodes_leave_in_the_outage(library: Library, mode: Mode) {
 }
 
 fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
-    let mut robot = Robot::start(mode);
+    let mut robot = Robot::start_for_outages(mode);
     let client = robot.client();
     let talker = robot.node(library, "talker", &[]);
     let listener = robot.node(library, "listener", &[]);
@@ -110,7 +110,7 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
     let talker_api = client.ok("lookupNode", params!["/test", "/talker"]);
 
     let dead = robot.master_pid();
-    robot.kill_master_at_once(dead);
+    robot.take_master_away();
     for node in &gone {
         node.signal(how);
     }
