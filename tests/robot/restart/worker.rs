@@ -360,7 +360,8 @@ fn an_empty_master_that_was_left_behind_is_used_or_ended() {
         };
         eventually("there is one rosmaster", || masters() == 1);
         assert_eq!(rescue.terminate().code(), Some(0));
-        assert_eq!(scratch.survivors(), vec![]);
+        // The killed rosrescue may have been asking for the version of ROS.
+        eventually("every process has ended", || scratch.survivors().is_empty());
     }
 }
 

@@ -77,6 +77,16 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     eventually("another master", || pid() != first);
     assert!(is_launched());
 
+    // Before roslaunch has started all nodes, Ctrl-C is an error of roslaunch.
+    let started = "process[rosrescue_of_roslaunch-1]: started with pid [";
+    let line = roslaunch.wait_line("that its node runs", |line| line.contains(started));
+    let node = line.split(started).nth(1).unwrap();
+    let node = node.split(']').next().unwrap();
+    let children = format!("/proc/{node}/task/{node}/children");
+    eventually("the node waits for the end of roslaunch", || {
+        fs::read_to_string(&children).is_ok_and(|children| !children.is_empty())
+    });
+
     let second = pid();
     roslaunch.signal(Signal::INT);
     assert_eq!(roslaunch.wait().code(), Some(0), "{}", roslaunch.log());
