@@ -39,4 +39,8 @@ cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGE
 # Tests with real ROS mostly wait for processes, so twice as many as there are cores run at once. Tests that measure
 # times (tests/timing) always run one at a time.
 threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
-RUST_TEST_THREADS=$threads cargo test --locked --workspace --no-fail-fast
+# Under nohup, SIGHUP is ignored by every child, and tests of an orderly stop would fail.
+if env --default-signal=HUP true 2>/dev/null; then
+    set -- env --default-signal=HUP
+fi
+RUST_TEST_THREADS=$threads "$@" cargo test --locked --workspace --no-fail-fast
