@@ -56,8 +56,8 @@ pub(crate) struct Sample {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Says {
     Alone,
-    /// It leads in this term, and calls pass to its master.
-    Leads(u64),
+    /// It leads, in this term if it says so, and calls pass to its master.
+    Leads(Option<u64>),
     /// Anything else.
     Other,
 }
@@ -285,7 +285,7 @@ fn told(end: &End) -> Vec<String> {
 
 /// Two that lead at the same moment, or one after the other in the same term.
 fn leaders(samples: &[Sample]) -> Vec<String> {
-    let mut spans: Vec<(usize, u64, Time, Time)> = Vec::new();
+    let mut spans: Vec<(usize, Time, Time)> = Vec::new();
     let mut before: BTreeMap<usize, &Sample> = BTreeMap::new();
     let mut terms: BTreeMap<u64, usize> = BTreeMap::new();
     let mut wrong = Vec::new();
@@ -294,30 +294,32 @@ fn leaders(samples: &[Sample]) -> Vec<String> {
         let Says::Leads(term) = sample.says else {
             continue;
         };
-        let first = *terms.entry(term).or_insert(sample.computer);
-        if first != sample.computer {
-            wrong.push(format!("{sample:?} leads in the term of {first}"));
+        if let Some(term) = term {
+            let first = *terms.entry(term).or_insert(sample.computer);
+            if first != sample.computer {
+                wrong.push(format!("{sample:?} leads in the term of {first}"));
+            }
         }
         if let Some(last) = last
-            && last.says == sample.says
+            && matches!(last.says, Says::Leads(_))
             && sample.to - last.from < CLOSE
         {
-            spans.push((sample.computer, term, last.to, sample.from));
+            spans.push((sample.computer, last.to, sample.from));
         }
     }
-    spans.sort_by_key(|span| span.2);
-    let mut latest: Option<(usize, u64, Time, Time)> = None;
+    spans.sort_by_key(|span| span.1);
+    let mut latest: Option<(usize, Time, Time)> = None;
     for span in spans {
         if let Some(latest) = latest
             && latest.0 != span.0
-            && span.2 < latest.3
+            && span.1 < latest.2
         {
             wrong.push(format!(
-                "two lead at once: {} in term {} from {} to {}, {} in term {} from {} to {}",
-                latest.0, latest.1, latest.2, latest.3, span.0, span.1, span.2, span.3
+                "two lead at once: {} from {} to {}, {} from {} to {}",
+                latest.0, latest.1, latest.2, span.0, span.1, span.2
             ));
         }
-        if latest.is_none_or(|latest| latest.3 < span.3) {
+        if latest.is_none_or(|latest| latest.2 < span.2) {
             latest = Some(span);
         }
     }
@@ -526,8 +528,9 @@ mod tests {
     #[test]
     fn no_two_computers_lead_at_once() {
         let ms = 1000;
-        let leads =
-            |computer, term, at: Time| says(computer, at * ms, (at + 10) * ms, Says::Leads(term));
+        let leads = |computer, term, at: Time| {
+            says(computer, at * ms, (at + 10) * ms, Says::Leads(Some(term)))
+        };
         let one_by_one = [
             leads(0, 1, 0),
             leads(0, 1, 50),

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use rosrescue::xmlrpc::Value;
 
 use super::checker::{End, History, Loss, Op, Sample, Says, Time, Told, What};
-use crate::computer::PORT;
+use crate::computer::{NAMES, PORT};
 use crate::fleet::Fleet;
 use crate::network::{COUNT, enter};
 use crate::support::links::Dice;
@@ -340,8 +340,13 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
             let says = match cluster["role"].as_str() {
                 Some("alone") => Says::Alone,
                 Some("leading") if page["open"] == true => {
-                    let term = cluster["leader"]["term"].as_u64().unwrap_or_default();
-                    Says::Leads((shared.etcds.load(Ordering::Relaxed) << 32) + term)
+                    // Its page may name the leader before it for a moment.
+                    let leader = &cluster["leader"];
+                    let term = leader["term"].as_u64();
+                    let term = term.filter(|_| leader["name"] == NAMES[computer]);
+                    Says::Leads(
+                        term.map(|term| (shared.etcds.load(Ordering::Relaxed) << 32) + term),
+                    )
                 }
                 _ => Says::Other,
             };
