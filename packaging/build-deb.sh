@@ -8,7 +8,7 @@ cd "$(dirname "$0")/.."
 target=${CARGO_TARGET_DIR:-target}
 cargo_deb=3.8.0
 
-profile=release
+profile=dist
 version=
 fast=
 while [ $# -gt 0 ]; do
@@ -29,8 +29,8 @@ fi
 if [ "$profile" = dev ]; then
     program=$target/debug/rosrescue
 else
-    cargo build --release --locked
-    program=$target/release/rosrescue
+    cargo build --profile dist --locked
+    program=$target/dist/rosrescue
 fi
 
 # What comes from the definition of the command line.

@@ -15,9 +15,9 @@ newest=GLIBC_2.18
 cargo fetch --locked >&2
 tests/field/release.sh make ubuntu-16.04 "$root"
 # shellcheck disable=SC2016 # in the old system
-tests/field/release.sh run "$root" sh -c 'cd "$1" && cargo build --release --locked --offline --target-dir target/old-glibc' \
+tests/field/release.sh run "$root" sh -c 'cd "$1" && cargo build --profile dist --locked --offline --target-dir target/old-glibc' \
     sh "$checkout" >&2
-program=$checkout/target/old-glibc/release/rosrescue
+program=$checkout/target/old-glibc/dist/rosrescue
 needs=$(objdump -T "$program" | grep -o 'GLIBC_[0-9.]*' | sort -V | tail -n 1)
 if [ "$(printf '%s\n%s\n' "$needs" "$newest" | sort -V | tail -n 1)" != "$newest" ]; then
     echo "build-old-glibc.sh: $program needs $needs, which is later than $newest" >&2

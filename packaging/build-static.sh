@@ -26,8 +26,8 @@ if [ "${target%%-*}" != "$(uname -m)" ]; then
     variable=CARGO_TARGET_$(echo "$target" | tr 'a-z-' 'A-Z_')_LINKER
     export "$variable=rust-lld"
 fi
-cargo build --release --locked --target "$target"
-program=${CARGO_TARGET_DIR:-target}/$target/release/rosrescue
+cargo build --profile dist --locked --target "$target"
+program=${CARGO_TARGET_DIR:-target}/$target/dist/rosrescue
 if readelf -l "$program" 2>/dev/null | grep -q INTERP; then
     echo "build-static.sh: $program needs a dynamic linker: it is not static" >&2
     exit 1

@@ -22,7 +22,9 @@ use rosrescue::{
 };
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::{
+    Layer, filter::Targets, fmt, layer::SubscriberExt, util::SubscriberInitExt,
+};
 
 /// How long threads may still run after all work is done.
 const LAST_JOBS: Duration = Duration::from_millis(500);
@@ -189,24 +191,28 @@ fn colour_is_welcome() -> bool {
 
 fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
     let default = if verbose {
-        "warn,rosrescue=debug"
+        "warn,rosrescue=debug,etcd_kv=debug"
     } else {
         "warn,rosrescue=info"
     };
     let filter = args.log.as_deref().unwrap_or(default);
-    let filter =
-        EnvFilter::try_new(filter).map_err(|error| format!("--log: `{filter}`: {error}"))?;
+    let filter: Targets = filter
+        .parse()
+        .map_err(|error| format!("--log: `{filter}`: {error}"))?;
     let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = fmt::layer()
         .with_writer(Stderr::of(std::env::var("JOURNAL_STREAM").ok().as_deref()))
         .with_target(false)
         // These errors would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)
         .with_ansi(ansi);
     match args.log_format {
-        LogFormat::Text => log.init(),
-        LogFormat::Json => log.json().init(),
+        LogFormat::Text => tracing_subscriber::registry()
+            .with(log.with_filter(filter))
+            .init(),
+        LogFormat::Json => tracing_subscriber::registry()
+            .with(log.json().with_filter(filter))
+            .init(),
     }
     Ok(())
 }

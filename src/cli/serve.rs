@@ -261,7 +261,7 @@ pub struct CommonArgs {
     /// Format of the log on stderr
     #[arg(long, env = "ROSRESCUE_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     pub log_format: LogFormat,
-    /// What to log, in the syntax of tracing's EnvFilter [default: warn,rosrescue=info]
+    /// What to log: a level, or MODULE=LEVEL, separated by commas [default: warn,rosrescue=info]
     #[arg(long, env = "ROSRESCUE_LOG", value_name = "FILTER")]
     pub log: Option<String>,
 }
