@@ -82,7 +82,7 @@ fn a_master_that_other_computers_can_reach_is_reported() {
     assert!(
         checked
             .stdout
-            .contains("takes connections from other computers"),
+            .contains("accepts connections from other computers"),
         "{checked:?}"
     );
 }
