@@ -1,8 +1,10 @@
 //! Compares rosrescue with a bare rosmaster, HAProxy and nginx in one run: `cargo bench --bench compare`.
 //!
-//! Five parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
-//! writes that notify nodes; what grows with the state; and the first again on a stand-in for a small computer. A sixth one, `--parts versions --before FILE`, compares with an
-//! earlier rosrescue. Prints tables as Markdown, draws a picture, and writes every number as JSON. What a number means is said below each table.
+//! There are five parts: single kinds of calls over few and many connections; real clients (many nodes that start at
+//! once, and `roslaunch`); writes that notify nodes; how times grow with the state; and the first part again on a
+//! simulated small computer. A sixth part, `--parts versions --before FILE`, compares with an earlier rosrescue. It
+//! prints tables as Markdown, draws a picture, and writes all numbers as JSON. The text below each table explains its
+//! numbers.
 
 #![allow(
     clippy::unwrap_used,
@@ -57,7 +59,7 @@ enum Part {
     Scale,
     /// The calls on one core at a quarter of its speed
     Small,
-    /// Some of the calls by this version and the one of `--before`; not one of the default.
+    /// Some of the calls with this version and with that of `--before`; not measured by default
     Versions,
 }
 
@@ -91,8 +93,8 @@ struct Options {
     /// An earlier rosrescue, for `--parts versions`
     #[arg(long, value_name = "FILE", required_if_eq("parts", "versions"))]
     before: Option<PathBuf>,
-    /// Where all numbers go as JSON, and the picture beside it as SVG [default: compare.json in Cargo's target
-    /// folder]
+    /// File for all numbers as JSON; the picture is written beside it as SVG [default: compare.json in Cargo's
+    /// target folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Also write the tables of all parts into benches/results.md, and the picture into docs/

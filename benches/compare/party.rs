@@ -13,7 +13,7 @@ use crate::{
     },
 };
 
-/// The earlier rosrescue of [`Kind::CoreBefore`] and [`Kind::ProxyBefore`].
+/// The program of the earlier rosrescue, for [`Kind::CoreBefore`] and [`Kind::ProxyBefore`].
 pub(crate) static BEFORE: OnceLock<PathBuf> = OnceLock::new();
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,7 +42,7 @@ impl Kind {
     ];
     /// The parties that are compared by real clients.
     pub(crate) const OURS: [Self; 3] = [Self::Bare, Self::Core, Self::Proxy];
-    /// This version beside an earlier one.
+    /// The kinds that compare this version with an earlier one.
     pub(crate) const VERSIONS: [Self; 5] = [
         Self::Bare,
         Self::CoreBefore,
@@ -53,7 +53,7 @@ impl Kind {
 }
 
 impl Kind {
-    /// `setup` of the rosrescue that this kind is about.
+    /// Makes `setup` run the rosrescue of this kind.
     fn program(self, setup: Setup) -> Setup {
         if !matches!(self, Self::CoreBefore | Self::ProxyBefore) {
             return setup;
@@ -110,7 +110,7 @@ pub(crate) struct Party {
 }
 
 impl Party {
-    /// One that starts its own master.
+    /// Starts a party that starts its own master.
     fn core(kind: Kind) -> Self {
         let scratch = Scratch::new();
         let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");

@@ -278,7 +278,7 @@ impl Cluster {
         rescue.start_again();
     }
 
-    /// How often this computer has said that it is cut off.
+    /// How often this computer has logged that it is cut off.
     pub(crate) fn times_cut_off(&self, index: usize) -> usize {
         let lines = self.computers[index].rescue.output().into_iter();
         lines.filter(|line| line.contains("ALONE:")).count()

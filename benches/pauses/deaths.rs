@@ -1,4 +1,4 @@
-//! Deaths of rosrescue itself: of the worker alone, and of worker and master at once.
+//! Measures deaths of rosrescue itself: of the worker alone, and of worker and master at once.
 
 use std::{process::Command, time::Duration};
 
@@ -17,17 +17,17 @@ use crate::{
     },
 };
 
-/// Between two deaths, so that each is one of a robot at work.
+/// Pause between two deaths, so that each one happens while the robot works normally.
 const REST: Duration = Duration::from_millis(500);
 
-/// Who is killed.
+/// The processes to kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Victims {
     Worker,
     Both,
 }
 
-/// What a reader and a writer have seen of one death.
+/// What a reader and a writer saw of one death.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Death {
     pub(crate) read: Seen,
@@ -89,7 +89,7 @@ impl Stage {
     }
 }
 
-/// What so many deaths of `victims` cost, with so many nodes registered and `load` busy processes beside them.
+/// Measures deaths of `victims`, with registered nodes and with `load` busy processes beside them.
 pub(crate) fn measure(victims: Victims, count: usize, nodes: usize, load: usize) -> Vec<Death> {
     let busy = |_| {
         let mut command = Command::new("sh");

@@ -57,10 +57,10 @@ struct Options {
     #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Kind::Core, Kind::Proxy, Kind::Bare])]
     kinds: Vec<Kind>,
-    /// Only deaths of rosrescue: of the worker alone, or of worker and master at once, KILLS of each
+    /// Measure only deaths of rosrescue: of the worker alone, or of worker and master at once, KILLS of each
     #[arg(long, value_name = "WHO,…", value_delimiter = ',', value_enum)]
     deaths: Vec<Victims>,
-    /// Busy processes beside those deaths
+    /// Number of busy processes during those deaths
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
     load: usize,
 }
@@ -192,7 +192,7 @@ fn outage(kind: Kind, options: &Options) -> String {
     )
 }
 
-/// The table of the deaths of rosrescue.
+/// Prints the table of deaths of rosrescue.
 fn rosrescue_dies(options: &Options) -> String {
     let mut text = format!(
         "{}, {} nodes, {} deaths each, {} busy processes beside them.\n\n\

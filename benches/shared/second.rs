@@ -40,8 +40,8 @@ impl SecondMaster {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::null());
-        // One that cannot read its logging configuration logs nothing, and is faster than any robot's: rosrescue's
-        // is a file that only its own child inherits.
+        // Without its logging configuration rosmaster would log nothing and be faster than on any robot. The
+        // configuration of rosrescue's own rosmaster is a file that only its child inherits.
         let own = pairs.iter().find(|(name, _)| *name == LOG_CONFIG);
         if let Some(file) = own.and_then(|(_, path)| path.strip_prefix("/proc/self/fd/")) {
             let text = fs::read(format!("/proc/{of}/fd/{file}")).expect("a logging configuration");

@@ -66,7 +66,7 @@ fn main() {
     table::print(&tables);
 }
 
-/// Kills the master of a robot with so many nodes again and again.
+/// Kills the master of a robot with this many nodes again and again.
 fn row(kind: Kind, nodes: usize, kills: usize) -> Row {
     let mut row = Row::new(nodes);
     while row.kills() < kills {

@@ -81,7 +81,7 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// Starts rosrescue and its nodes, and waits until all of it is there.
+    /// Starts rosrescue and its nodes, and waits until everything has registered.
     pub(crate) fn start(kind: Kind, count: usize) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();

@@ -5,8 +5,8 @@
 //! The limit is [`PASS`], or [`NOISE`] times what the same driver takes at the same time with an undisturbed
 //! bare rosmaster if that is longer, because starting rosmasters takes all cores of a small computer.
 //!
-//! `ROSRESCUE_LOOP_SECONDS` is how long a crash loop lasts; 600 is the full size. `ROSRESCUE_HANGS` is how often a master
-//! hangs; of 20 on a computer at rest none should make a pass longer than 150 ms.
+//! `ROSRESCUE_LOOP_SECONDS` sets the length of a crash loop; the full length is 600. `ROSRESCUE_HANGS` sets how often a
+//! master hangs; on a computer without other load none of 20 should make a pass longer than 150 ms.
 
 use std::{
     thread::sleep,
@@ -21,12 +21,12 @@ use rustix::process::Signal;
 /// Maximum time of one pass of a driver's loop, in milliseconds. If drivers had to wait for the master, they
 /// would stall for at least 350. On a computer with little other load no pass takes more than 15.
 const PASS: f64 = 300.0;
-/// The same behind a master that hangs, for drivers that write as well: the mirror answers after 100. Where drivers wait
-/// for the verdict on the master, 1,600 at least.
+/// The same limit with a master that hangs, for drivers that also write: the mirror answers after 100 ms. If drivers had
+/// to wait until the master counts as hung, a pass would take at least 1,600.
 const PASS_HUNG: f64 = 300.0;
-/// Between two hangs, so that rosrescue goes on standing in as soon: more than five a minute make it more patient.
+/// Pause between two hangs, so that rosrescue stands in equally soon each time: after five within a minute it waits longer.
 const BETWEEN_HANGS: Duration = Duration::from_secs(13);
-/// How much longer than an undisturbed driver's longest pass one may take.
+/// How many times longer a pass may take than the longest one of an undisturbed driver.
 const NOISE: f64 = 3.0;
 /// Pause between two kills.
 const PAUSE: Duration = Duration::from_secs(2);
