@@ -19,7 +19,7 @@ pub enum Way {
     },
 }
 
-/// A place in the journal of all computers. One of a later term is further: whoever leads in it holds all that was
+/// A place in the journal of all computers. One of a later term is further: the leader of that term holds all that was
 /// committed before, and nothing else of the earlier terms will ever be in the journal.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Place {

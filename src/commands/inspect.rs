@@ -180,7 +180,7 @@ impl fmt::Display for Inspected {
         }
         let end = match session.closed {
             true => "stopped cleanly",
-            false => "running, or not stopped in order",
+            false => "running, or not stopped cleanly",
         };
         writeln!(
             f,
