@@ -11,7 +11,7 @@ use super::{
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
 
-/// How often reading begins anew, because a snapshot was replaced meanwhile.
+/// How often reading starts over because a snapshot was replaced meanwhile.
 const ATTEMPTS: usize = 5;
 
 #[derive(Debug, Error)]

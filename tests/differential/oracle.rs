@@ -8,7 +8,7 @@
 //! * So may those of unregistrations that are answered while no master is there. Several of them
 //!   are told with the one list that is true in the end.
 //! * While the mirror stands in, what is out of date when it would be sent may be left out.
-//! * Whoever misses a list by that is sent one that is true after it.
+//! * A node that misses a list because of that is sent one that is true after it.
 //! * A subscriber may be told once more what it was told: the full list of a topic's publishers, or the value of a
 //!   parameter. Never a partial list, never a value that was not true since the crash before the last one, never a
 //!   `shutdown`, nothing to a node that does not subscribe.

@@ -36,7 +36,7 @@ pub enum EtcdError {
     Full,
     #[error("etcd refuses a request of this size; its --max-request-bytes is below 1.5 MiB")]
     TooLarge,
-    #[error("etcd has forgotten revision {revision:?}: the state must be read anew")]
+    #[error("etcd has forgotten revision {revision:?}: the state must be read again")]
     Compacted { revision: Option<u64> },
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },

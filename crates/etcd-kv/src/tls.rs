@@ -139,7 +139,7 @@ mod with {
     }
 
     impl TlsSettings {
-        /// Read anew if a file has changed: a certificate that expires is replaced while rosrescue runs.
+        /// Read again if a file has changed, because an expiring certificate is replaced while rosrescue runs.
         fn config(&self) -> Arc<ClientConfig> {
             let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
             let stamps = self.files.stamps();

@@ -31,7 +31,7 @@ pub struct Change {
 /// Why a watch has ended.
 #[derive(Debug)]
 pub enum WatchEnd {
-    /// What was to come next is forgotten: the state must be read anew.
+    /// etcd has forgotten the next revision: the state must be read again.
     Compacted,
     /// It would not help to ask again.
     Failed(EtcdError),
@@ -55,8 +55,8 @@ pub struct Watch {
     next: u64,
     quiet: Duration,
     open: Option<Open>,
-    /// Which endpoint is being opened. Kept here, as [`Open::until`] is: whoever waits for changes may give up at
-    /// any time and wait anew, and a member that is silent must be noticed all the same.
+    /// Which endpoint is being opened. Kept here, as [`Open::until`] is: a task that waits for changes may give up at
+    /// any time and wait again, and a member that is silent must be noticed all the same.
     opening: Option<(usize, Opening)>,
     failures: usize,
 }

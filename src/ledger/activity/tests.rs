@@ -37,7 +37,7 @@ fn a_process_id_is_sure_until_the_node_registers_again() {
 }
 
 #[test]
-fn a_new_node_is_to_be_asked_once_after_its_last_registration() {
+fn a_new_node_is_asked_once_after_its_last_registration() {
     let start = Instant::now();
     let second = Duration::from_secs(1);
     let mut activity = Activity::default();

@@ -52,7 +52,7 @@ fn a_divergence_is_logged_once_per_method_with_both_replies() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let api = "http://127.0.0.1:1/";
-    // Because of an earlier divergence the master's state may be read in between. Then it is tried again.
+    // Because of an earlier divergence the master's state may be read in between. Then it is retried.
     for topic in ["/t1", "/t2"] {
         let before = divergences(&client);
         eventually("an unregistration diverges", || {

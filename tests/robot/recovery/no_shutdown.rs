@@ -135,7 +135,7 @@ fn api_of(robot: &Robot, node: &str) -> Option<String> {
 }
 
 /// During one outage a node dies and comes back at another port, and its old port goes to another node, in
-/// either order. Whoever tells the node at the old port to shut down must notice that it is another one. If
+/// either order. The sender of a shutdown to the node at the old port must notice that it is another one. If
 /// the port was taken first, even a master that never dies shuts down its new owner; rosrescue must not.
 #[test]
 fn a_node_that_has_the_old_port_of_a_moved_node_is_not_shut_down() {

@@ -414,7 +414,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
-            // This is tried again at the end, but listed only once.
+            // This is retried at the end, but listed only once.
             if !self.skipped.contains(&skipped) {
                 self.skipped.push(skipped);
             }
