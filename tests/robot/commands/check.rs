@@ -357,7 +357,7 @@ fn the_hosts_file_and_the_units_of_this_computer() {
     let mut command = check(&scratch, port);
     command.env_remove("ROS_IP");
     let found = Found::by(&mut behind(own, &command));
-    found.assert_problem("systemd", "roscore.service starts a master");
+    found.assert_problem("systemd", "roscore.service starts another master");
     assert!(
         found
             .said("host name")

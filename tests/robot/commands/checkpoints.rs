@@ -183,10 +183,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
         (folder.to_str().unwrap(), "is a folder"),
         (&other, "is not a rosrescue checkpoint"),
         (&empty, "is damaged"),
-        (
-            &newer,
-            "written in checkpoint format 2 by a newer rosrescue",
-        ),
+        (&newer, "has checkpoint format 2 of a newer rosrescue"),
         (&damaged, "is damaged"),
     ] {
         for command in [
