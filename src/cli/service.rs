@@ -47,7 +47,7 @@ pub struct ScopeArgs {
     /// Service of your own, without root
     #[arg(long, conflicts_with = "system")]
     pub user: bool,
-    /// Service of this computer, which needs root [default]
+    /// Service of this computer, which needs root (default)
     #[arg(long)]
     pub system: bool,
     /// Only show the changes

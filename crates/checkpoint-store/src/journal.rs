@@ -39,7 +39,7 @@ impl<S: Storage> Store<S> {
     /// # Errors
     ///
     /// If the entries were not recorded. The store is then unprotected, unless the reason is an
-    /// [`EncodeError`](crate::checkpoint::format::EncodeError).
+    /// [`EncodeError`](rescue_core::checkpoint::format::EncodeError).
     pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
         let first = self.seq.saturating_add(1);
         self.seq = self.seq.saturating_add(entries.len() as u64);
