@@ -29,7 +29,7 @@ use crate::{
         session::{self, Decision, Evidence, Restore},
     },
     cluster::{
-        etcd::{Change, Etcd, Kv, Watch, WatchEnd},
+        etcd::{self, Change, Etcd, Kv, Watch, WatchEnd},
         journal::{self, Keys, Manifest, Put},
         machine::{Answer, Op, Settings, View},
         member::{Action, Entry, Heard, Input, Member, PROBES, Read},
@@ -407,7 +407,7 @@ impl Driver {
         let keys = self.replica.keys.clone();
         let (mut entries, mut heard) = (Vec::new(), Vec::new());
         for change in changes {
-            if let Err(error) = change.absorb(&mut self.watched, &keys) {
+            if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
                 self.trouble.set(&error.into());
             }
             heard.extend(said(
@@ -501,7 +501,7 @@ async fn decide(seq: u64, state: Master, restore: Restore, evidence: Evidence) -
     };
     let goes_on = match session::decide(restore, evidence) {
         Decision::Restore(why) => {
-            tracing::info!(why, "the session in etcd goes on: {}", state.counts());
+            tracing::info!(why, "the session in etcd continues: {}", state.counts());
             true
         }
         Decision::Fresh(why) => {
