@@ -274,12 +274,6 @@ impl Computer {
         etcd.wait();
     }
 
-    /// Its etcd, which does not run, loses its data.
-    #[track_caller]
-    pub(crate) fn wipe_etcd(&mut self) {
-        fs::remove_dir_all(self.path("etcd")).unwrap();
-    }
-
     /// Whether its etcd belongs to a majority.
     pub(crate) fn etcd_is_healthy(&self) -> bool {
         let page = self.within(|| {

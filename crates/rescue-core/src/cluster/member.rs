@@ -275,7 +275,7 @@ impl Member {
     pub fn uncommitted(&self) -> usize {
         match self.keeps() {
             true => self.cut_off.len(),
-            false => self.outgoing.len(),
+            false => self.outgoing.count(),
         }
     }
 

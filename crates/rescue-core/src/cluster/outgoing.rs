@@ -43,7 +43,8 @@ impl Outgoing {
         self.changes.extend(changes);
     }
 
-    pub fn len(&self) -> usize {
+    /// How many changes are not in the journal yet.
+    pub fn count(&self) -> usize {
         self.changes.len()
     }
 
@@ -234,7 +235,7 @@ mod tests {
         assert_eq!(seqs(&outgoing.committed(6)), [5, 6]);
         assert_eq!(added(&outgoing, &keys, 7), [7]);
         assert_eq!(seqs(&outgoing.take_all()), [7]);
-        assert_eq!(outgoing.len(), 0);
+        assert_eq!(outgoing.count(), 0);
     }
 
     #[test]
@@ -304,7 +305,7 @@ mod tests {
         assert!(outgoing.has_outgrown());
         outgoing.replace_rest(Some(state(6 + count)));
         outgoing.all_ready();
-        assert_eq!((outgoing.len(), outgoing.ready()), (FIRST + 1, 6 + count));
+        assert_eq!((outgoing.count(), outgoing.ready()), (FIRST + 1, 6 + count));
         // A beat that is sent again has what it had.
         assert_eq!(added(&outgoing, &keys, 4 + count), before);
         outgoing.committed(4 + FIRST as u64);

@@ -100,6 +100,10 @@ pub struct Read {
 
 /// What happened.
 #[derive(Debug)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "few exist at a time, and none is stored"
+)]
 pub enum Input {
     /// Take part from now on.
     Begin,
@@ -196,6 +200,10 @@ pub enum News {
 
 /// What the shell must do, in order.
 #[derive(Debug)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "few exist at a time, and none is stored"
+)]
 pub enum Action {
     /// Write `parts` if there are any, in `term`, then carry out `op`, with `entry` for the journal. Its answer is
     /// [`Input::Answer`].

@@ -39,6 +39,7 @@ const POLL: u64 = 40 * MS;
 const MASTER_STARTS: u64 = 120 * MS;
 
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "a test")]
 enum Event {
     Wake(usize),
     Poll(usize),
