@@ -14,6 +14,7 @@ mod blocks;
 mod commands;
 mod documents;
 mod lines;
+mod types;
 mod words;
 
 use std::{
