@@ -48,7 +48,6 @@ mod notify;
 mod startup;
 
 use self::{
-    cluster::Member,
     duty::Post,
     notify::Source,
     startup::{Beginning, begin, kernel_id},
@@ -259,8 +258,8 @@ pub async fn run(
                 served,
                 halt: halt.clone(),
             };
-            let (others, member) = cluster::join(given).await?;
-            (Some(others), Runs::Member(Box::new(member)))
+            let (others, driver) = cluster::join(given).await?;
+            (Some(others), Runs::Member(Box::new(driver)))
         }
         _ => {
             if restored {
@@ -407,15 +406,15 @@ pub async fn run(
 enum Runs {
     /// The only computer.
     Single(Box<Post>),
-    /// One of several computers.
-    Member(Box<Member>),
+    /// One of several.
+    Member(Box<cluster::Driver>),
 }
 
 /// The running manager of the master.
 enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
-    Member(Box<Member>),
+    Member(Box<cluster::Driver>),
 }
 
 /// Writes the closing checkpoint if the disk answers within [`DISK_PATIENCE`].

@@ -1,99 +1,29 @@
 //! Replication: the writes that other computers receive from this one, and the ones that it
 //! follows.
 
-use std::{collections::VecDeque, sync::Arc, time::Instant};
+use std::time::Instant;
 
 use tokio::sync::watch;
 
 use super::{Inner, Ledger, Superseded};
 use crate::{
-    checkpoint::format::{self, Entry, Record},
-    cluster::merge::{self, Changes, Subject, Verdict},
+    checkpoint::format::{Entry, Record},
+    cluster::{
+        merge::Verdict,
+        sharing::{Change, Sharing, Source},
+    },
     master::{Master, Request},
 };
 
-/// Most changes that are remembered for computers that were cut off.
-const RECENT_MOST: usize = 4096;
-/// Most bytes of these changes, approximately.
-const RECENT_BYTES_MOST: usize = 4 << 20;
-
-/// Whose writes the ledger holds.
+/// Which computer's writes the ledger holds.
 #[derive(Debug)]
 pub(super) enum Shared {
     /// There are no other computers.
     Nobody,
     /// Another computer has the master: its records are followed, and nothing else is recorded.
     Elsewhere,
-    /// This computer has the master, and the others receive its writes.
-    Here {
-        /// Number of the last write.
-        last: Agreed,
-        changes: Vec<Change>,
-        recent: Recent,
-    },
-}
-
-/// Where a recorded call comes from.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) enum Source {
-    /// A node of this computer, or rosrescue itself.
-    #[default]
-    Here,
-    /// Another computer, which makes the call again elsewhere if it gets no answer.
-    Forwarded,
-    /// A computer that was cut off and sends what it answered meanwhile, all under this name.
-    Merge(Arc<str>),
-}
-
-/// Recent changes, oldest first.
-#[derive(Debug, Default)]
-pub(super) struct Recent {
-    /// All changes after this record are in the list.
-    after: u64,
-    changes: VecDeque<(u64, Source, Vec<Subject>)>,
-    bytes: usize,
-}
-
-impl Recent {
-    /// An empty list that will hold all changes after record `seq`.
-    fn from(seq: u64) -> Self {
-        Self {
-            after: seq,
-            ..Self::default()
-        }
-    }
-
-    fn add(&mut self, seq: u64, source: &Source, call: &Request) {
-        let subjects: Vec<_> = call.calls().into_iter().flat_map(Subject::of).collect();
-        self.bytes += bytes_of(&subjects);
-        self.changes.push_back((seq, source.clone(), subjects));
-        while (self.changes.len() > RECENT_MOST || self.bytes > RECENT_BYTES_MOST)
-            && let Some((seq, _, subjects)) = self.changes.pop_front()
-        {
-            self.after = seq;
-            self.bytes -= bytes_of(&subjects);
-        }
-    }
-
-    /// The changes after record `seq` that were not made by `merge`. None if they are no longer all
-    /// known.
-    fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
-        if seq < self.after {
-            return None;
-        }
-        let later = self.changes.iter().filter(|(of, ..)| *of > seq);
-        let theirs = later
-            .filter(|(_, source, _)| !matches!(source, Source::Merge(name) if **name == *merge));
-        let mut changes = Changes::default();
-        for subject in theirs.flat_map(|(.., subjects)| subjects) {
-            changes.add(subject.clone());
-        }
-        Some(changes)
-    }
-}
-
-fn bytes_of(subjects: &[Subject]) -> usize {
-    subjects.iter().map(Subject::size).sum()
+    /// Ours: the others are given them.
+    Here { times_led: u64, sharing: Sharing },
 }
 
 /// A place in the journal of all computers: the count of this computer's terms, and the number of a
@@ -104,31 +34,13 @@ pub(crate) struct Agreed {
     seq: u64,
 }
 
-/// A change that the other computers must receive.
-#[derive(Clone, Debug)]
-pub(crate) enum Change {
-    Call(Record, Source),
-    /// Record `seq` replaced the state as a whole.
-    State {
-        seq: u64,
-        state: Box<Master>,
-    },
-}
-
-impl Change {
-    /// Number of the change in the journal of all computers.
-    pub(crate) fn seq(&self) -> u64 {
-        match self {
-            Self::Call(record, _) => record.seq,
-            Self::State { seq, .. } => *seq,
-        }
-    }
-}
-
 impl Shared {
     pub(super) fn last(&self) -> Option<Agreed> {
         match self {
-            Self::Here { last, .. } => Some(*last),
+            Self::Here { times_led, sharing } => Some(Agreed {
+                times_led: *times_led,
+                seq: sharing.last(),
+            }),
             _ => None,
         }
     }
@@ -157,11 +69,8 @@ impl Ledger {
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let times_led = self.agreed.borrow().times_led;
-        inner.shared = Shared::Here {
-            last: Agreed { times_led, seq },
-            changes: Vec::new(),
-            recent: Recent::from(seq),
-        };
+        let sharing = Sharing::after(seq);
+        inner.shared = Shared::Here { times_led, sharing };
         if inner.mirror != *held {
             inner.share_state();
         }
@@ -180,7 +89,7 @@ impl Ledger {
     /// Takes the changes that the others have not been given yet.
     pub(crate) fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {
-            Shared::Here { changes, .. } => std::mem::take(changes),
+            Shared::Here { sharing, .. } => sharing.take(),
             _ => Vec::new(),
         }
     }
@@ -188,14 +97,11 @@ impl Ledger {
     /// Takes the same changes as one change: the state that they have led to. None if this computer
     /// does not have the master.
     pub(crate) fn take_as_state(&self) -> Option<Change> {
-        let mut inner = self.lock();
-        let state = Box::new(inner.mirror.clone());
-        let Shared::Here { last, changes, .. } = &mut inner.shared else {
-            return None;
-        };
-        changes.clear();
-        let seq = last.seq;
-        Some(Change::State { seq, state })
+        let inner = &mut *self.lock();
+        match &mut inner.shared {
+            Shared::Here { sharing, .. } => Some(sharing.take_as_state(&inner.mirror)),
+            _ => None,
+        }
     }
 
     /// Tells what would become of `calls`, which a computer answered while it was cut off, if they
@@ -203,13 +109,10 @@ impl Ledger {
     /// up to record `seq`. None if the changes after that are no longer known.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
-        let Shared::Here { recent, .. } = &inner.shared else {
-            return None;
-        };
-        let changes = recent.since(seq, merge)?;
-        let calls = calls.iter();
-        let verdicts = calls.map(|call| merge::judge(&changes, &inner.mirror, call));
-        Some(verdicts.collect())
+        match &inner.shared {
+            Shared::Here { sharing, .. } => sharing.judge(&inner.mirror, seq, merge, calls),
+            _ => None,
+        }
     }
 
     /// The last record of this term that the others have, or need not have.
@@ -325,46 +228,22 @@ impl Inner {
     /// Passes `entries` to the other computers. `sources` tells where each comes from; missing ones
     /// come from here.
     pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
-        let Shared::Here {
-            last,
-            changes,
-            recent,
-        } = &mut self.shared
-        else {
+        let Shared::Here { sharing, .. } = &mut self.shared else {
             return;
         };
         for (index, entry) in entries.iter().enumerate() {
-            let Entry::Call { call, .. } = entry else {
-                continue;
-            };
-            let source = sources.get(index).copied().unwrap_or(&Source::Here);
-            let record = Record {
-                seq: last.seq + 1,
-                entry: Entry::call(call.clone()),
-            };
-            // An entry that cannot be written is in no journal, as on a single computer.
-            if format::push_record(&mut Vec::new(), &record).is_ok() {
-                last.seq += 1;
-                recent.add(last.seq, source, &Request::from(call.clone()));
-                changes.push(Change::Call(record, source.clone()));
+            if let Entry::Call { call, .. } = entry {
+                let source = sources.get(index).copied().unwrap_or(&Source::Here);
+                sharing.record(&Request::from(call.clone()), source);
             }
         }
     }
 
     /// Notes that the state has changed otherwise than by calls.
     pub(super) fn share_state(&mut self) {
-        if let Shared::Here {
-            last,
-            changes,
-            recent,
-        } = &mut self.shared
-        {
-            last.seq += 1;
-            let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
-            // The new state may have changed anything.
-            *recent = Recent::from(seq);
-            changes.push(Change::State { seq, state });
-            // The following calls have other numbers than the session record says.
+        if let Shared::Here { sharing, .. } = &mut self.shared {
+            sharing.record_state(&self.mirror);
+            // The calls that follow have other numbers than the session tells.
             self.session_unwritten = true;
         }
     }
@@ -586,20 +465,6 @@ mod tests {
         ledger.adopt(state_of([set(1)]));
         assert_eq!(judged(&ledger, 11, &["/x"]), None);
         assert_eq!(judged(&ledger, 12, &["/x"]), Some(vec![true]));
-    }
-
-    #[test]
-    fn what_was_changed_long_ago_is_not_known_any_more() {
-        let mut recent = Recent::from(3);
-        for seq in 4..=u64::try_from(RECENT_MOST).unwrap() + 13 {
-            recent.add(seq, &Source::Here, &set_of("/a", 1));
-        }
-        assert!(recent.since(12, "mine").is_none());
-        assert!(recent.since(13, "mine").is_some());
-        let key = "k".repeat(RECENT_BYTES_MOST);
-        recent.add(9_000, &Source::Here, &set_of(&key, 1));
-        assert!(recent.since(8_999, "mine").is_none() && recent.changes.is_empty());
-        assert_eq!(recent.bytes, 0);
     }
 
     #[test]

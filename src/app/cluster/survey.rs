@@ -2,17 +2,17 @@
 
 use std::time::Duration;
 
-use super::{Member, background::Done};
+use super::Driver;
 use crate::cluster::survey::{self, Complaint, LIMIT};
 
 /// An etcd that does not answer is tried again after this time, before a warning: it may be starting, too.
 const SECOND_LOOK: Duration = Duration::from_secs(5);
 
-impl Member {
+impl Driver {
     /// Tries each endpoint on its own.
     pub(super) fn try_endpoints(&mut self) {
         let (client, keys) = (self.replica.client.clone(), self.replica.keys.clone());
-        self.background.tasks.spawn(async move {
+        self.beside.spawn(async move {
             let found = survey::complaints(&client.try_each(&keys, LIMIT).await);
             let (may_pass, certain): (Vec<_>, Vec<_>) =
                 found.into_iter().partition(|of| of.may_pass);
@@ -23,23 +23,18 @@ impl Member {
                 found.retain(|of| !certain.contains(of));
                 found.iter().for_each(warn);
             }
-            Some(Done::Nothing)
         });
     }
 
     /// Compares the robot's name with those of other robots, if etcd does not know it.
     pub(super) fn look_for_typo(&mut self) {
-        if self.view.leader.is_some() {
-            return;
-        }
         let (client, robot) = (self.replica.client.clone(), self.given.config.robot.clone());
-        self.background.tasks.spawn(async move {
+        self.beside.spawn(async move {
             // This robot may be among them by now.
             if let Ok(mut robots) = client.robots(LIMIT).await {
                 robots.retain(|other| *other != robot);
                 survey::typo(&robot, &robots).iter().for_each(warn);
             }
-            Some(Done::Nothing)
         });
     }
 }

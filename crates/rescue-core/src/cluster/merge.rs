@@ -135,6 +135,18 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
             return Verdict::Holds;
         }
     }
+    // Whoever has the name or the service now has ended that registration.
+    let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
+    let unregisters = matches!(
+        call.method(),
+        Method::UnregisterPublisher
+            | Method::UnregisterSubscriber
+            | Method::UnregisterService
+            | Method::UnsubscribeParam
+    );
+    if over && unregisters {
+        return Verdict::Holds;
+    }
     let call = call.clone();
     Verdict::Lost(Lost { call, why, present })
 }

@@ -1,0 +1,268 @@
+//! Sends what was answered alone to the leader, as far as it still holds.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{Action, Member, News};
+use crate::{
+    cluster::{
+        machine::Role,
+        merge::{
+            self, Changes, weight,
+            wire::{self, Ask, Outcome},
+        },
+        mutant::Mutant,
+    },
+    master::{Method, Request},
+};
+
+/// Pause before calls that were not answered are sent again.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Most calls, and about most bytes, of one portion. Other writes pass in between.
+const CALLS_MOST: usize = 100;
+const BYTES_MOST: usize = 512 << 10;
+
+#[derive(Debug, Default)]
+enum Step {
+    #[default]
+    Idle,
+    /// Until the journal has been read as it is now.
+    Reading,
+    /// Until the leader has answered for the first of what is left.
+    Asked(Ask),
+    /// Until then, the same is asked again; or all is judged anew.
+    Pause(Instant, Option<Ask>),
+}
+
+/// The writes of the oldest time alone are being sent.
+#[derive(Debug)]
+pub(super) struct Merging {
+    /// The name under which all portions of a time alone are sent.
+    id: String,
+    /// How many times alone were sent before.
+    times: u64,
+    step: Step,
+    /// What still has to be sent; none before it was judged.
+    left: Option<Vec<Request>>,
+    /// It conflicts with nothing that was changed up to this record.
+    judged: u64,
+    sent: u64,
+    lost: u64,
+}
+
+impl Merging {
+    pub(super) fn new(id: String) -> Self {
+        Self {
+            id,
+            times: 0,
+            step: Step::Idle,
+            left: None,
+            judged: 0,
+            sent: 0,
+            lost: 0,
+        }
+    }
+
+    pub(super) fn due(&self) -> Option<Instant> {
+        match self.step {
+            Step::Pause(until, _) => Some(until),
+            _ => None,
+        }
+    }
+
+    fn id(&self) -> Arc<str> {
+        format!("{} {}", self.id, self.times).into()
+    }
+}
+
+impl Member {
+    /// Whether there is a leader to whom what was answered alone can be sent, or this is one.
+    fn can_merge(&self) -> bool {
+        match self.machine.role() {
+            Role::Following => {
+                self.reading.wanted.is_none() && self.reading.loaded && self.leader().is_some()
+            }
+            Role::Leading => self.records(),
+            _ => false,
+        }
+    }
+
+    pub(super) fn tend_merge(&mut self, now: Instant) {
+        match &mut self.merging.step {
+            Step::Idle => {
+                if self.can_merge() && !self.cut_off.is_empty() {
+                    self.judge_anew(now);
+                }
+            }
+            Step::Reading => {
+                if self.reading.is_fresh() {
+                    self.judge(now);
+                }
+            }
+            Step::Asked(_) => {}
+            Step::Pause(until, ask) => {
+                if *until <= now {
+                    match ask.take() {
+                        Some(ask) => self.ask(now, ask),
+                        None => self.judge_anew(now),
+                    }
+                }
+            }
+        }
+    }
+
+    fn judge_anew(&mut self, now: Instant) {
+        self.merging.step = Step::Reading;
+        self.reading.refresh(now);
+    }
+
+    /// Judges what is left by what others have changed, up to the journal's last record.
+    fn judge(&mut self, now: Instant) {
+        let Some(time) = self.cut_off.first_mut() else {
+            self.merging.step = Step::Idle;
+            return;
+        };
+        let left = self.merging.left.take();
+        let left = left.unwrap_or_else(|| time.pending.calls().cloned().collect());
+        if Mutant::MergesByState.lives() {
+            time.changes = Changes::default();
+            time.changes
+                .note_difference(&time.base, &self.journal.state);
+        }
+        let merged = merge::merge(&time.changes, &self.journal.state, &left);
+        let lost = merged.lost.iter();
+        let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
+        self.merging.left = Some(merged.send);
+        self.merging.judged = self.journal.progress.seq;
+        self.report(lost);
+        self.next_portion(now);
+    }
+
+    fn next_portion(&mut self, now: Instant) {
+        let left = self.merging.left.as_deref().unwrap_or_default();
+        let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
+        if calls.is_empty() {
+            return self.merged();
+        }
+        // If there is no answer, the journal may have them all the same.
+        if let Some(time) = self.cut_off.first_mut() {
+            time.changes.expect(calls.iter().cloned());
+        }
+        let ask = Ask {
+            id: self.merging.id(),
+            seq: self.merging.judged,
+            calls,
+        };
+        match self.can_merge() {
+            true => self.send_portion(ask),
+            false => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
+        }
+    }
+
+    fn send_portion(&mut self, ask: Ask) {
+        self.merging.step = Step::Asked(ask.clone());
+        let leads = self.machine.role() == Role::Leading;
+        let to = self.leader().filter(|_| !leads);
+        let to = to.map(|(uri, term)| (uri.to_owned(), term));
+        self.act(Action::Merge { ask, to });
+    }
+
+    fn ask(&mut self, now: Instant, ask: Ask) {
+        if self.can_merge() {
+            self.send_portion(ask);
+        } else {
+            self.merging.step = Step::Pause(now + AGAIN, Some(ask));
+        }
+    }
+
+    /// The leader has answered a portion, or not.
+    pub(super) fn portion_answered(&mut self, now: Instant, answer: Option<wire::Answer>) {
+        let Step::Asked(ask) = std::mem::take(&mut self.merging.step) else {
+            return;
+        };
+        match answer {
+            None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
+            Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
+            Some(wire::Answer::Done(outcomes)) => {
+                if let Some(left) = &mut self.merging.left {
+                    left.drain(..ask.calls.len().min(left.len()));
+                }
+                self.report(ask.calls.into_iter().zip(outcomes).collect());
+                self.next_portion(now);
+            }
+        }
+    }
+
+    fn report(&mut self, outcomes: Vec<(Request, Outcome)>) {
+        for (call, outcome) in &outcomes {
+            match outcome {
+                Outcome::Holds => self.merging.sent += 1,
+                // It is not there any more: others have deleted it, too.
+                Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+                Outcome::Refused(_) | Outcome::Lost { .. } => self.merging.lost += 1,
+            }
+        }
+        if !outcomes.is_empty() {
+            self.act(Action::Report(outcomes));
+        }
+    }
+
+    /// The writes of the oldest time have been sent.
+    fn merged(&mut self) {
+        let (sent, lost) = (self.merging.sent, self.merging.lost);
+        self.tell(News::Merged { sent, lost });
+        self.merging = Merging {
+            times: self.merging.times + 1,
+            ..Merging::new(std::mem::take(&mut self.merging.id))
+        };
+        self.cut_off.sent();
+        self.keep_all();
+        self.adopt();
+        if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {
+            self.stand_leading(term);
+        }
+        self.tend_standing();
+    }
+}
+
+/// How many of the calls are the next portion.
+fn portion(calls: &[Request]) -> usize {
+    let (mut count, mut bytes) = (0, 0);
+    for call in calls.iter().take(CALLS_MOST) {
+        // Its answer holds a value that the master may not be able to write.
+        let is_alone = *call.method() == Method::SubscribeParam;
+        bytes += weight(call);
+        if count > 0 && (is_alone || bytes > BYTES_MOST) {
+            break;
+        }
+        count += 1;
+        if is_alone {
+            break;
+        }
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calls_go_in_portions_and_none_is_left_out() {
+        let set = |value: &str| Request::new(Method::SetParam, ["/n", "/k", value]);
+        let subscribe = Request::new(Method::SubscribeParam, ["/n", "http://n:1/", "/k"]);
+        let large = "x".repeat(BYTES_MOST);
+        let mut calls = vec![set("1"); CALLS_MOST + 1];
+        calls.extend([set(&large), set(&large), set("2"), subscribe, set("3")]);
+        let mut lengths = Vec::new();
+        let mut left = calls.as_slice();
+        while !left.is_empty() {
+            let count = portion(left);
+            lengths.push(count);
+            left = &left[count..];
+        }
+        assert_eq!(lengths, [CALLS_MOST, 1, 1, 1, 1, 1, 1]);
+    }
+}
