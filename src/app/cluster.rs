@@ -63,7 +63,7 @@ const AGAIN: Duration = Duration::from_millis(200);
 type Work = JoinSet<Input>;
 
 /// See the [module](self).
-pub(super) struct Driver {
+pub(super) struct ClusterDriver {
     given: Given,
     member: Member,
     replica: Replica,
@@ -92,7 +92,7 @@ pub(super) struct Driver {
     known: Known,
 }
 
-impl Driver {
+impl ClusterDriver {
     /// Takes part until `stop`.
     ///
     /// # Errors

@@ -86,8 +86,8 @@ impl Ledger {
         (!refused).then_some((reply, mark, delivery))
     }
 
-    /// The answer to a parameter subscription that is there already, whoever has the master. Only the node itself takes
-    /// it away, so that it changes nothing there either.
+    /// The answer to a parameter subscription that exists already, on any computer. Only the node itself ends it, so
+    /// the call changes nothing for the leader either.
     pub(crate) fn answer_if_subscribed(&self, call: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let there = *call.method() == Method::SubscribeParam

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::Driver;
+use super::ClusterDriver;
 use crate::{
     cluster::{
         machine::{Role, Settings, View},
@@ -138,7 +138,7 @@ impl Known {
     }
 }
 
-impl Driver {
+impl ClusterDriver {
     /// Since when nobody leads, as far as is known.
     fn leaderless(&self) -> Option<Instant> {
         let (role, since) = self.known.role;

@@ -14,7 +14,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::{Driver, facts::Known, kept::Kept};
+use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
     app::{duty::Post, startup},
     checkpoint::session::Restore,
@@ -56,7 +56,7 @@ pub(in crate::app) struct Given {
 }
 
 /// Where the other computers are asked, and the task to run.
-pub(in crate::app) async fn join(given: Given) -> Result<(Others, Driver), EtcdError> {
+pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver), EtcdError> {
     let config = &given.config;
     let client = Etcd::new(&Options {
         endpoints: config.endpoints.clone(),
@@ -124,7 +124,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Driver), EtcdE
     };
     let keys = Keys::new(&config.robot);
     let id = settings.id.clone();
-    let driver = Driver {
+    let driver = ClusterDriver {
         known: Known::new(&settings),
         member: Member::new(settings, keys.clone(), own, left, id),
         replica: Replica {

@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, time::Instant};
 
-use super::Driver;
+use super::ClusterDriver;
 use crate::{
     checkpoint::format::shown,
     cluster::{
@@ -19,7 +19,7 @@ use crate::{
 /// That this computer is cut off, and that it is not any more.
 static ALONE: Pair = Pair::new();
 
-impl Driver {
+impl ClusterDriver {
     /// Tells people.
     pub(super) fn tell(&mut self, news: News) {
         match news {

@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use super::Driver;
+use super::ClusterDriver;
 use crate::cluster::survey::{self, Complaint, LIMIT};
 
 /// An etcd that does not answer is tried again after this time, before a warning: it may be starting, too.
 const SECOND_LOOK: Duration = Duration::from_secs(5);
 
-impl Driver {
+impl ClusterDriver {
     /// Tries each endpoint on its own.
     pub(super) fn try_endpoints(&mut self) {
         let (client, keys) = (self.replica.client.clone(), self.replica.keys.clone());
