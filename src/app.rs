@@ -407,14 +407,14 @@ enum Runs {
     /// The only computer.
     Single(Box<Post>),
     /// One of several.
-    Member(Box<cluster::Driver>),
+    Member(Box<cluster::ClusterDriver>),
 }
 
 /// The running manager of the master.
 enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
-    Member(Box<cluster::Driver>),
+    Member(Box<cluster::ClusterDriver>),
 }
 
 /// Writes the closing checkpoint if the disk answers within [`DISK_PATIENCE`].

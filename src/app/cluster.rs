@@ -62,7 +62,7 @@ const AGAIN: Duration = Duration::from_millis(200);
 /// Work that ends with an input.
 type Work = JoinSet<Input>;
 
-/// See the [module](self).
+/// Feeds this computer's [`Member`] with what happens, and carries out what it decides.
 pub(super) struct ClusterDriver {
     given: Given,
     member: Member,
@@ -102,7 +102,8 @@ impl ClusterDriver {
         mut self: Box<Self>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, RunError> {
-        self.try_endpoints();
+        self.beside
+            .spawn(survey::try_endpoints(self.replica.clone()));
         let mut stopped = false;
         let mut input = Input::Begin;
         let result = loop {
@@ -179,7 +180,10 @@ impl ClusterDriver {
             }
             Action::Watch(view) => {
                 if view.leader.is_none() {
-                    self.look_for_typo();
+                    self.beside.spawn(survey::look_for_typo(
+                        self.replica.clone(),
+                        self.given.config.robot.clone(),
+                    ));
                 }
                 let range = self.replica.keys.small();
                 let ttl = self.member.settings().ttl;

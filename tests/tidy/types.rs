@@ -33,7 +33,7 @@ const SPREAD: [(&str, usize); 6] = [
     // To be split by responsibility.
     ("Inner", 4),
     ("Ledger", 7),
-    ("Member", 7),
+    ("Member", 8),
     ("Store", 5),
 ];
 
