@@ -10,7 +10,8 @@ pub mod wire;
 
 use std::fmt;
 
-use self::changes::{param_of, value_at};
+use self::changes::param_of;
+pub(super) use self::changes::value_at;
 pub use self::{
     changes::{Changes, Subject},
     pending::{Pending, weight},

@@ -1,6 +1,7 @@
 //! Sends what was answered alone to the leader, as far as it still holds.
 
 use std::{
+    collections::BTreeSet,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -10,16 +11,19 @@ use crate::{
     cluster::{
         machine::Role,
         merge::{
-            self, Changes, weight,
+            self, Changes, Lost, weight,
             wire::{self, Ask, Outcome},
         },
         mutant::Mutant,
     },
-    master::{Method, Request},
+    master::{Master, Method, Request, names},
+    xmlrpc::Value,
 };
 
 /// Pause before calls that were not answered are sent again.
 const AGAIN: Duration = Duration::from_millis(100);
+/// Who sets a parameter that nodes have to be told of. No node has this name.
+const TELLER: &str = "/rosrescue";
 /// Most calls, and about most bytes, of one portion. Other writes pass in between.
 const CALLS_MOST: usize = 100;
 const BYTES_MOST: usize = 512 << 10;
@@ -46,6 +50,10 @@ pub(super) struct Merging {
     step: Step,
     /// What still has to be sent; none before it was judged.
     left: Option<Vec<Request>>,
+    /// Parameters of which nodes here heard a value that was lost: they are told the present value.
+    untold: BTreeSet<String>,
+    /// The leader is asked to tell the nodes of [`Self::untold`].
+    telling: bool,
     /// It conflicts with nothing that was changed up to this record.
     judged: u64,
     sent: u64,
@@ -59,6 +67,8 @@ impl Merging {
             times: 0,
             step: Step::Idle,
             left: None,
+            untold: BTreeSet::new(),
+            telling: false,
             judged: 0,
             sent: 0,
             lost: 0,
@@ -132,6 +142,9 @@ impl Member {
                 .note_difference(&time.base, &self.journal.state);
         }
         let merged = merge::merge(&time.changes, &self.journal.state, &left);
+        self.merging
+            .untold
+            .extend(merged.lost.iter().filter_map(parameter));
         let lost = merged.lost.iter();
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
         self.merging.left = Some(merged.send);
@@ -141,13 +154,16 @@ impl Member {
     }
 
     fn next_portion(&mut self, now: Instant) {
+        let untold = set_again(&self.journal.state, &self.merging.untold);
         let left = self.merging.left.as_deref().unwrap_or_default();
+        self.merging.telling = left.is_empty();
+        let left = if self.merging.telling { &untold } else { left };
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
         if calls.is_empty() {
             return self.merged();
         }
-        // If there is no answer, the journal may have them all the same.
-        if let Some(time) = self.cut_off.first_mut() {
+        // If there is no answer, the journal may have them all the same. What is set again changes nothing.
+        if let Some(time) = self.cut_off.first_mut().filter(|_| !self.merging.telling) {
             time.changes.expect(calls.iter().cloned());
         }
         let ask = Ask {
@@ -186,9 +202,21 @@ impl Member {
             None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
             Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
             Some(wire::Answer::Done(outcomes)) => {
+                if self.merging.telling {
+                    // Who has changed one of them meanwhile has also told the nodes.
+                    let told = ask.calls.iter().filter_map(|call| call.text(1));
+                    for key in told {
+                        self.merging.untold.remove(key);
+                    }
+                    return self.next_portion(now);
+                }
                 if let Some(left) = &mut self.merging.left {
                     left.drain(..ask.calls.len().min(left.len()));
                 }
+                let lost_there = ask.calls.iter().zip(&outcomes);
+                let lost_there = lost_there.filter(|(_, of)| matches!(of, Outcome::Lost { .. }));
+                let lost_there = lost_there.filter_map(|(call, _)| parameter_of(call));
+                self.merging.untold.extend(lost_there);
                 self.report(ask.calls.into_iter().zip(outcomes).collect());
                 self.next_portion(now);
             }
@@ -225,6 +253,29 @@ impl Member {
         }
         self.tend_standing();
     }
+}
+
+/// The resolved name of the parameter that a lost write was about.
+fn parameter(lost: &Lost) -> Option<String> {
+    parameter_of(&lost.call)
+}
+
+fn parameter_of(call: &Request) -> Option<String> {
+    let sets = matches!(call.method(), Method::SetParam | Method::DeleteParam);
+    sets.then(|| Some(names::resolve(call.text(1)?, call.caller()?)))?
+}
+
+/// Sets each of the parameters that `state` has to the value that it has: all that subscribe it are told.
+fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
+    let values = keys.iter().filter_map(|key| {
+        let parts: Vec<_> = names::parts(key).collect();
+        Some((key, merge::value_at(state.params(), &parts)?))
+    });
+    let calls = values.map(|(key, value)| {
+        let arguments = [Value::from(TELLER), key.as_str().into(), value.clone()];
+        Request::new(Method::SetParam, arguments)
+    });
+    calls.collect()
 }
 
 /// How many of the calls are the next portion.

@@ -272,7 +272,7 @@ impl Own {
 }
 
 /// The value at the path of these parts; none at the root.
-pub(super) fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
+pub(in crate::cluster) fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
     let (first, rest) = path.split_first()?;
     match (tree.get(*first)?, rest) {
         (value, []) => Some(value),

@@ -180,7 +180,10 @@ impl History {
     }
 
     pub(super) fn merged(&mut self, call: &Request, now: u64, log: usize) {
-        self.of(call).merged.get_or_insert((now, log));
+        // A value that is set again, so that nodes are told of it, is no call of a node.
+        if let Some(call) = self.find(call.params()) {
+            self.calls[call].merged.get_or_insert((now, log));
+        }
     }
 
     pub(super) fn answered(
@@ -348,7 +351,12 @@ impl History {
             .filter(of)
             .filter(|read| read.done.is_some());
         let reads: Vec<_> = reads.collect();
-        for read in &reads {
+        // A value that was lost and reported may come back when its node calls again.
+        let lost = |value: Option<i32>| {
+            let mut calls = self.calls.iter();
+            calls.any(|call| call.key == key && Some(call.value) == value && call.reported)
+        };
+        for read in reads.iter().filter(|read| !lost(read.value)) {
             if let Some((first, _)) = places.of_value(self, key, read.value) {
                 floors.push((read.done.unwrap(), first, format!("{read:?}")));
             }
