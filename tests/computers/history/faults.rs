@@ -16,7 +16,7 @@ use crate::support::{Process, alive, eventually, signal, stop};
 pub(super) enum Fault {
     /// SIGKILL for the process that answers.
     Worker(usize),
-    /// SIGKILL for the process that starts it; somebody starts rosrescue again.
+    /// SIGKILL for it and for the process that starts it; somebody starts rosrescue again.
     Guardian(usize),
     /// SIGKILL for everything, of which the kernel tells the others.
     Killed(usize),
@@ -42,6 +42,28 @@ pub(super) enum Fault {
 }
 
 impl Fault {
+    /// One that needs no more than a few seconds to be over, for a run of everything.
+    pub(super) fn roll_short(chance: &mut Chance) -> Self {
+        loop {
+            let fault = Self::roll(chance);
+            let is_short = matches!(
+                fault,
+                Self::Worker(_)
+                    | Self::Killed(_)
+                    | Self::Power(_)
+                    | Self::OlderDisk(_)
+                    | Self::Paused(_)
+                    | Self::OneWay(..)
+                    | Self::Cable(_)
+                    | Self::Etcd(_)
+                    | Self::Handover(_)
+            );
+            if is_short {
+                return fault;
+            }
+        }
+    }
+
     pub(super) fn roll(chance: &mut Chance) -> Self {
         let one = chance.below(COUNT);
         let other = (one + 1 + chance.below(COUNT - 1)) % COUNT;
@@ -115,7 +137,8 @@ impl Fault {
                 let computer = &mut fleet.computers[one];
                 let worker = computer.worker();
                 signal(computer.guardian(), Signal::KILL);
-                eventually("the worker ends with its guardian", || !alive(worker));
+                signal(worker, Signal::KILL);
+                eventually("the worker has ended", || !alive(worker));
                 computer.restart_rescue();
                 return None;
             }
