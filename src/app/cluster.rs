@@ -195,7 +195,7 @@ impl ClusterDriver {
                 self.spawn(Input::Prepared(None), async move {
                     let prepared = replica.prepare(term, &parts).await;
                     if let Err(error) = &prepared {
-                        rarely!(warn, %error, "a large write is not in etcd yet, and is tried again");
+                        rarely!(warn, %error, "a large write is not in etcd yet; retrying");
                         tokio::time::sleep(AGAIN).await;
                     }
                     Input::Prepared(prepared.ok())
@@ -303,7 +303,7 @@ impl ClusterDriver {
                 self.spawn(Input::SnapshotWritten(None), async move {
                     let written = replica.write_snapshot(term, &checkpoint).await;
                     if let Err(error) = &written {
-                        rarely!(warn, %error, "the snapshot in etcd could not be written; it is tried again");
+                        rarely!(warn, %error, "the snapshot in etcd could not be written; retrying");
                     }
                     let bytes = written.ok().flatten();
                     Input::SnapshotWritten(bytes.map(|bytes| (progress, bytes)))

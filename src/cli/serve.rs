@@ -87,7 +87,7 @@ pub struct CommonArgs {
     /// ~/.ros/log; latest-chkpt-PORT.yaml for a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
-    /// When to restore the state of the checkpoint as rosrescue starts
+    /// Whether a start restores the checkpoint
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
     pub restore: RestoreChoice,
     /// Most space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
@@ -100,7 +100,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(..=1 << 20))]
     pub history: u64,
-    /// When to force the journal to the disk. It survives kill -9 in any case
+    /// When to force recorded changes to the disk. They survive kill -9 in any case
     #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = SyncPolicy::Interval)]
     pub sync: SyncPolicy,
     /// How often `--sync interval` forces the journal to the disk, in milliseconds
@@ -113,8 +113,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=60_000))]
     pub sync_interval: u64,
-    /// How long a call that only a master can answer waits for one to come back, in seconds. Then its
-    /// connection is closed
+    /// Longest wait, in seconds, for a call that only a master can answer. Then its connection is closed
     #[arg(
         long,
         env = "ROSRESCUE_HOLD",
@@ -177,7 +176,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
-    /// Unregister dead nodes: check every node at this interval, in seconds. With 0, only after a rescue, as in ROS
+    /// Unregister dead nodes: check every node at this interval, in seconds. With 0, only after a
+    /// rescue
     #[arg(
         long,
         env = "ROSRESCUE_REAP_DEAD_NODES",
@@ -196,8 +196,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = network)]
     pub allow: Vec<IpNet>,
-    /// Networks and addresses that may make changes; others that may call can only read. Every node makes
-    /// changes when it starts [default: all that may call]
+    /// Networks and addresses that may make changes; all others can only read. Include every computer with nodes
+    /// [default: all that may call]
     #[arg(
         long,
         env = "ROSRESCUE_ALLOW_WRITE",
@@ -253,8 +253,8 @@ pub struct CommonArgs {
     /// The values that the page does not show.
     #[command(flatten)]
     pub hide: HideArgs,
-    /// Run without the guardian process, which keeps the port open and restarts rosrescue. A systemd socket
-    /// unit replaces the guardian by itself
+    /// Run without the guardian process, which keeps the port open and restarts rosrescue. With a systemd socket
+    /// unit there is none anyway
     #[arg(long, env = "ROSRESCUE_NO_GUARDIAN")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub no_guardian: bool,
@@ -287,7 +287,7 @@ fn network(text: &str) -> Result<IpNet, &'static str> {
 /// When a checkpoint is restored at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum RestoreChoice {
-    /// If the session continues: since the same boot and without an orderly stop, or with a node still alive
+    /// If rosrescue has not stopped cleanly since boot, or a registered node still answers
     Auto,
     /// Always
     Always,

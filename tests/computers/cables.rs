@@ -6,7 +6,7 @@ use rustix::process::Signal;
 
 use crate::chance::Chance;
 use crate::computer::{NAMES, send};
-use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
+use crate::fleet::{Fleet, TAKEOVER, TTL, victim};
 use crate::support::{Library, PATIENCE, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
 use crate::{alone, rounds};
@@ -76,7 +76,13 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
             NAMES[cut], NAMES[leader], NAMES[next],
         );
         // TCP itself takes a while to go on after a cable was mended.
-        assert!(led < TTL + TAKEOVER && write < TTL + TAKEOVER && read < READ);
+        // A read waits for the next leader if this mirror lacks the last record that the dead one had told of. The
+        // members of etcd learn that a record is committed from etcd's leader, which may have died as well.
+        let limit = TTL + TAKEOVER;
+        assert!(
+            led < limit && write < limit && read < limit,
+            "longest read {read:?}, write {write:?}"
+        );
         await_param(&fleet, &contested, 3);
         // Mostly by the one that was cut off. If etcd chooses a leader meanwhile, another one can have been alone.
         // It says so once the others have its writes.
@@ -120,7 +126,7 @@ fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
         await_param(&fleet, &format!("/written_{value}"), value);
     }
     let lonely = &fleet.computers[cut];
-    assert!(lonely.logged("does not hold").is_empty());
+    assert!(lonely.logged("cut off was lost").is_empty());
     assert!(lonely.logged("cannot be kept").is_empty());
     fleet.await_same_state();
     fleet.assert_nodes_live();

@@ -23,7 +23,7 @@ fn key(number: usize) -> String {
 fn await_merged(computer: &Computer) {
     eventually("its writes have been sent", || {
         !computer
-            .logged("writes of a time alone were sent")
+            .logged("sent the writes made while cut off")
             .is_empty()
     });
 }
@@ -78,7 +78,7 @@ fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
     eventually("the lost writes are counted", || {
         lost_writes(lonely) == Some(3)
     });
-    let lines = lonely.logged("does not hold");
+    let lines = lonely.logged("cut off was lost");
     assert_eq!(lines.len(), 3, "{lines:#?}");
     for (key, alone, others) in [
         ("`/estop`", "alone=0", "others=1"),

@@ -52,7 +52,7 @@ pub(crate) use kinds::{kinds, sorted, unordered};
 pub(crate) use name_server::NameServer;
 pub(crate) use netns::{Netns, ip};
 pub(crate) use node::{Library, Node};
-pub(crate) use patience::{Finish, PATIENCE, eventually, eventually_some, holds};
+pub(crate) use patience::{Finish, PATIENCE, comes_true, eventually, eventually_some, holds};
 pub(crate) use process::{Process, alive, behind, signal, stop};
 pub(crate) use relay::Relay;
 pub(crate) use rescue::{PROGRAM, Rescue, Setup};

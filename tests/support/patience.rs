@@ -9,6 +9,11 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 const STEP: Duration = Duration::from_millis(10);
 
+/// Waits until `condition` holds. Returns false after [`PATIENCE`].
+pub(crate) fn comes_true(condition: impl Fn() -> bool) -> bool {
+    !holds(PATIENCE, || !condition())
+}
+
 /// Waits until `condition` holds. Panics with `what` after [`PATIENCE`].
 #[track_caller]
 pub(crate) fn eventually(what: &str, mut condition: impl FnMut() -> bool) {

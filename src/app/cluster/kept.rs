@@ -49,7 +49,7 @@ impl Kept {
             }
             Some(opened)
         });
-        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "the writes of a time alone cannot be read, and are not sent");
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent");
         let (store, loaded) = match opened.await {
             Some(Some(Ok((store, Some(loaded))))) => (store, loaded),
             Some(None | Some(Ok((_, None)))) => return Default::default(),
@@ -72,7 +72,7 @@ impl Kept {
         let left = CutOff::left(base.clone(), calls);
         tracing::info!(
             calls = left.len(),
-            "an earlier process was alone; its writes are sent when a computer leads"
+            "an earlier process was cut off; its writes are sent once there is a leader"
         );
         let mut this = Self::default();
         let calls = left.calls().cloned().collect();
@@ -165,7 +165,7 @@ fn remove_files(path: PathBuf) {
             tracing::warn!(
                 path = %path.display(),
                 %error,
-                "writes that were sent cannot be removed and would be sent again; remove the file"
+                "cannot delete the file of writes that were sent; delete it, or they are sent again"
             );
         }
     }
@@ -176,10 +176,12 @@ fn keep_of_session(store: &mut Store) {
     match store.set_aside("session") {
         Ok(Some(kept)) => tracing::warn!(
             kept = %kept.display(),
-            "writes of a time alone belong to a session that is over; they are kept, and not sent"
+            "writes made while cut off belong to an ended session; they are kept in a file, not sent"
         ),
         Ok(None) => {}
-        Err(error) => tracing::error!(%error, "the writes of a time alone cannot be kept"),
+        Err(error) => {
+            tracing::error!(%error, "cannot store the writes of an ended session under another name")
+        }
     }
 }
 

@@ -61,7 +61,7 @@ impl ClusterDriver {
                 tracing::info!(
                     sent,
                     lost,
-                    "the writes of a time alone were sent to the leader"
+                    "sent the writes made while cut off to the leader"
                 );
             }
         }
@@ -118,7 +118,7 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
                     method,
                     node,
                     text,
-                    "a write that was answered while this computer was alone is refused by the leader"
+                    "the leader refused a write made while this computer was cut off"
                 );
             }
             Outcome::Lost { why, present } => match parameter(call) {
@@ -130,7 +130,7 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
                         node,
                         %alone,
                         %others,
-                        "what was written while this computer was alone does not hold: {why}"
+                        "a write made while this computer was cut off was lost: {why}"
                     );
                 }
                 None => {
@@ -146,7 +146,7 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
             method,
             node,
             count,
-            "what was written while this computer was alone does not hold: {why}"
+            "a write made while this computer was cut off was lost: {why}"
         );
     }
 }

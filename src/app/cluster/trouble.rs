@@ -37,12 +37,7 @@ impl Trouble {
         match trouble {
             Some((_, said)) => *said = text,
             None => {
-                alarm!(
-                    warn,
-                    TROUBLE,
-                    error = text,
-                    "etcd does not give what is asked; it is asked again"
-                );
+                alarm!(warn, TROUBLE, error = text, "etcd request failed; retrying");
                 *trouble = Some((Instant::now(), text));
             }
         }

@@ -60,6 +60,13 @@ impl Robot<'_> {
         if let Some(user) = self.run_as {
             lines.extend(["DynamicUser=no".to_owned(), "StateDirectory=".to_owned()]);
             lines.push(format!("User={user}"));
+            // ROS_HOME is the user's own again, and the unit's other variables stay.
+            lines.push("Environment=".to_owned());
+            let [unit, _] = units(false);
+            let variables = unit.lines().filter(|line| {
+                line.starts_with("Environment=") && !line.starts_with("Environment=ROS_HOME=")
+            });
+            lines.extend(variables.map(str::to_owned));
         }
         lines.extend(self.settings.iter().map(|(name, value)| {
             format!("Environment={}", quoted(&format!("{name}={value}"), false))
@@ -142,11 +149,14 @@ mod tests {
         for line in [
             "Before=robot.service",
             "User=robot",
+            "Environment=",
+            "Environment=GLIBC_TUNABLES=glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=131072:glibc.malloc.trim_threshold=131072",
             "Environment=ROS_IP=10.0.0.7",
             "ExecStart=/usr/local/bin/rosrescue core --checkpoint \"/a b/100%%$$\"",
         ] {
             assert!(service.lines().any(|it| it == line), "{line}: {service}");
         }
+        assert!(!service.contains("ROS_HOME"), "{service}");
         assert_eq!(disabled(&service), ["roscore.service"]);
         assert!(
             robot

@@ -365,7 +365,7 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
 fn losses(fleet: &Fleet, keys: &[String]) -> Vec<Loss> {
     let mut losses = Vec::new();
     for computer in &fleet.computers {
-        for line in computer.ever_logged("while this computer was alone") {
+        for line in computer.ever_logged("while this computer was cut off") {
             let key = keys.iter().find(|key| line.contains(&format!("`{key}`")));
             let value = line.split("alone=").nth(1);
             let value = value.and_then(|rest| rest.split_whitespace().next()?.parse().ok());

@@ -275,7 +275,7 @@ fn nothing_is_killed_without_consent_or_understanding() {
     refused(
         &["--no-kill", "--topic", "/nothere"],
         2,
-        "nobody publishes /nothere",
+        "no node publishes /nothere",
     );
     refused(&["--yes", "--times", "0"], 2, "--times");
     assert_eq!(robot.master_pid(), master);

@@ -64,7 +64,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     let rescue = run(&robot, &["inspect", "rescue-1"]);
     assert!(rescue.contains("  /dead at http"), "{rescue}");
     eventually("the dead node is unregistered", || {
-        !robot.state().knows("/dead")
+        !robot.settled_state().knows("/dead")
     });
     robot.client().set_param("/before", 2);
     let text = Tool::rosrescue(

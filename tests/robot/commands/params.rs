@@ -19,13 +19,8 @@ fn rosparam_loads_what_params_prints() {
     client.set_param("/secret", "geheim");
     let run = |arguments: &[&str]| Tool::rosrescue(&robot.scratch, robot.port(), arguments);
     let printed = run(&["params", "present"]);
-    for name in [
-        "/kinds/no time ",
-        "/kinds/ ",
-        "/kinds/with/slash ",
-        "/run_id ",
-    ] {
-        let said = format!("rosrescue: {name}is left out: ");
+    for name in ["/kinds/no time", "/kinds/", "/kinds/with/slash", "/run_id"] {
+        let said = format!("rosrescue: left out {name}: ");
         assert!(printed.stderr.contains(&said), "{said}\n{}", printed.stderr);
     }
     assert_eq!(printed.stderr.lines().count(), 4, "{}", printed.stderr);

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
-use crate::support::{Scratch, eventually};
+use crate::support::{Scratch, comes_true, eventually};
 
 const BOOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/boot_systemd.sh");
 const PROGRAM: &str = "/opt/rosrescue/rosrescue";
@@ -134,9 +134,14 @@ impl Booted {
 
     #[track_caller]
     pub(super) fn wait_protected(&self) {
-        eventually("STATUS=protected", || {
-            self.property("StatusText").starts_with("protected")
-        });
+        let protected = || self.property("StatusText").starts_with("protected");
+        if !comes_true(protected) {
+            let units = "rosrescue.service rosrescue.socket";
+            let look = format!(
+                "systemctl cat {units}; systemctl status -l {units}; journalctl -u rosrescue -n 60"
+            );
+            panic!("the service is not protected: {:?}", self.output(&look));
+        }
     }
 
     /// Every file in folders where an installation could leave something.
