@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use self::world::{Counts, Plan, World};
 use super::{
     machine::{Commit, WhenAlone},
+    member::PROBES,
     mutant::Mutant,
 };
 
@@ -60,11 +61,16 @@ fn play(seed: u64) -> World {
 fn no_schedule_of_failures_breaks_a_promise() {
     let mut totals = Counts::default();
     let began = Instant::now();
+    let mut broken = 0;
     for seed in first()..first() + schedules() {
         let world = play(seed);
-        world.check();
         totals.add(&world.counts);
+        if let Err(why) = world.verdict() {
+            println!("seed {seed}: {why}");
+            broken += 1;
+        }
     }
+    assert_eq!(broken, 0, "schedules that break a promise");
     let rate = schedules() as f64 / began.elapsed().as_secs_f64() * 60.0;
     println!("{} schedules, {rate:.0} a minute: {totals:?}", schedules());
     // Else the schedules test nothing.
@@ -119,16 +125,23 @@ fn a_dead_leader_is_succeeded_within_its_time_to_live_and_300_ms() {
 }
 
 #[test]
-fn one_failure_makes_no_call_wait_longer_than_the_time_to_live_and_1500_ms() {
+fn one_failure_makes_no_call_wait_longer_than_five_quarters_of_the_time_to_live_and_1500_ms() {
     let mut longest = Duration::ZERO;
     for seed in first()..first() + schedules() {
         let mut world = calm(seed);
         world.counts.waited = Duration::ZERO;
         let failure = world.fail_once();
         world.run(Duration::from_secs(10));
-        let waited = world.counts.waited.saturating_sub(plan(seed).ttl);
-        // Until the failure is noticed, 40 ms; the answer's way, 60 ms; what was on its way before.
-        let most = Duration::from_millis(1500 + 250);
+        let ttl = plan(seed).ttl;
+        let waited = world.counts.waited.saturating_sub(ttl);
+        let patience = Duration::from_millis(1500);
+        // A follower that is cut off from the leader alone notices it with its next question to the leader.
+        let unnoticed = ttl / PROBES;
+        // Clocks are up to a twentieth too slow.
+        let slow = (ttl + patience) / 20;
+        // A computer looks after its calls every 40 ms; the answer's way takes 60 ms; some is on its way before.
+        let rest = Duration::from_millis(250);
+        let most = patience + unnoticed + slow + rest;
         assert!(waited < most, "seed {seed}: {failure}: {waited:?} more");
         longest = longest.max(waited);
         world.heal();

@@ -77,7 +77,7 @@ impl Member {
         self.tell_machine(machine::Input::HandOver(to));
     }
 
-    /// Another computer may lead now.
+    /// Another computer may lead now, or leads.
     pub(super) fn released(&mut self) {
         if self.release.why == Why::Asked {
             self.release = Release::default();
@@ -89,8 +89,8 @@ impl Member {
         if self.release.by.is_some_and(|by| by <= now) {
             self.release.by = None;
             match self.release.why {
+                // Its request may be on its way to etcd: calls wait on.
                 Why::Asked => {
-                    self.release.why = Why::No;
                     let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
                     self.act(Action::HandedOver(Err(why)));
                 }

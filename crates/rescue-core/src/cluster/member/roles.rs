@@ -36,6 +36,7 @@ impl Member {
                 if self.records() {
                     self.tell(News::Deposed);
                 }
+                self.released();
                 self.give_up();
             }
         }

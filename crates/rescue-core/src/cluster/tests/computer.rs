@@ -114,6 +114,7 @@ pub(super) struct Computer {
     pub(super) disk: Disk,
     /// As the disk was synced last.
     pub(super) synced: Disk,
+    pub(super) synced_at: u64,
     /// The number of its master's process.
     pub(super) master: Option<u64>,
     pub(super) own_only: bool,
@@ -176,6 +177,7 @@ impl Computer {
             wake: 0,
             ledger: Ledger::default(),
             synced: disk.clone(),
+            synced_at: 0,
             disk,
             master: None,
             own_only: false,

@@ -59,6 +59,8 @@ pub(super) struct Call {
     alone: Option<usize>,
     /// Others have been told that it does not hold.
     reported: bool,
+    /// It was answered alone, and the power failed before the disk had it.
+    unsynced: bool,
     /// It is what others have set, too.
     held: bool,
     /// It was run where it changed nothing, and is in no journal.
@@ -135,6 +137,7 @@ impl History {
             heard: None,
             alone: None,
             reported: false,
+            unsynced: false,
             held: false,
             unchanged: false,
             merged: None,
@@ -219,6 +222,15 @@ impl History {
 
     pub(super) fn gives_up(&mut self, _call: usize) {}
 
+    /// The power of a computer has failed. Its disk holds what it had answered when it was `synced`.
+    pub(super) fn loses_power(&mut self, computer: usize, synced: u64, now: u64) {
+        let unsynced = |call: &Call| call.alone.is_some() && call.heard >= Some(synced);
+        for call in &mut self.calls {
+            call.unsynced |= call.computer == computer && unsynced(call);
+        }
+        self.forgets(computer, now);
+    }
+
     /// The nodes of a computer have died. What they were told counts no more.
     pub(super) fn forgets(&mut self, computer: usize, now: u64) {
         self.died.push((computer, now));
@@ -273,7 +285,7 @@ impl History {
                 || places.of_value(self, key, Some(call.value)).is_some();
             let may_be_lost = commit == Commit::Interval && !in_log;
             let alone = call.alone.is_some();
-            let excused = call.reported || superseded || call.unchanged;
+            let excused = call.reported || call.unsynced || superseded || call.unchanged;
             if may_be_lost && !alone || alone && excused {
                 continue;
             }

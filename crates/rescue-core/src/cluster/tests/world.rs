@@ -312,7 +312,9 @@ impl World {
             Event::Sync(at) => {
                 let pause = (50 + self.dice.below(400)) * MS;
                 self.after(pause, Event::Sync(at));
-                self.computers[at].synced = self.computers[at].disk.clone();
+                let computer = &mut self.computers[at];
+                computer.synced = computer.disk.clone();
+                computer.synced_at = self.now;
             }
             Event::Fault => self.fault(),
             Event::End(fault) => self.end(fault),

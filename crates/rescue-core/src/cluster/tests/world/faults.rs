@@ -193,7 +193,7 @@ impl World {
         let computer = &mut self.computers[at];
         computer.disk = computer.synced.clone();
         // Its nodes have died, too.
-        self.history.forgets(at, self.now);
+        self.history.loses_power(at, computer.synced_at, self.now);
     }
 
     /// One failure of some seconds.
