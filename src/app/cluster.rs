@@ -264,9 +264,14 @@ impl ClusterDriver {
                 }
             }
             Action::KeepNothing => self.kept.remove(&post.checkpoint).await,
-            Action::Merge { ask, to } => {
+            Action::Merge { number, ask, to } => {
                 let (peers, queue) = (self.peers.clone(), post.write_queue.clone());
-                self.spawn(Input::Merged(None), merge(ask, to, peers, queue));
+                let answer = None;
+                let otherwise = Input::Merged { number, answer };
+                self.spawn(otherwise, async move {
+                    let answer = merge(ask, to, peers, queue).await;
+                    Input::Merged { number, answer }
+                });
             }
             Action::Report(outcomes) => report::report(&self.given.hide, outcomes),
             Action::Probe { number, uri, term } => {
@@ -517,32 +522,32 @@ async fn decide(seq: u64, state: Master, restore: Restore, evidence: Evidence) -
 }
 
 /// Has the leader make writes that were answered alone: the one at an address, or this computer.
-async fn merge(ask: Ask, to: Option<(String, u64)>, peers: Arc<Peers>, queue: WriteQueue) -> Input {
+async fn merge(
+    ask: Ask,
+    to: Option<(String, u64)>,
+    peers: Arc<Peers>,
+    queue: WriteQueue,
+) -> Option<wire::Answer> {
     let Some((uri, term)) = to else {
-        return Input::Merged(queue.merge(ask).await);
+        return queue.merge(ask).await;
     };
-    let Ok(uri) = MasterUri::parse(&uri) else {
-        return Input::Merged(None);
-    };
+    let uri = MasterUri::parse(&uri).ok()?;
     let leader = peers.at(&uri);
     let send = async |call: Request| {
         let body = Bytes::from(xmlrpc::encode_call(&call.into()));
         let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
         xmlrpc::decode_reply(&raw.body).ok()
     };
-    let Some(reply) = send(ask.to_request()).await else {
-        return Input::Merged(None);
-    };
+    let reply = send(ask.to_request()).await?;
     let count = ask.calls.len();
-    let answer = match wire::Answer::read(&reply, count) {
+    match wire::Answer::read(&reply, count) {
         Some(answer) => Some(answer),
         // An earlier version, which does not know what it is asked.
         None => {
             let reply = send(Request::multicall(ask.calls)).await;
             reply.map(|reply| wire::Answer::of(&vec![Verdict::Runs; count], &reply))
         }
-    };
-    Input::Merged(answer)
+    }
 }
 
 /// Writes this computer's entry among the members.

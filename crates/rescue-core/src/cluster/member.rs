@@ -186,7 +186,7 @@ impl Member {
                 self.tell_machine(machine::Input::Decided { seq, goes_on });
             }
             Input::Probed { number, leads } => self.probed(number, leads),
-            Input::Merged(answer) => self.portion_answered(now, answer),
+            Input::Merged { number, answer } => self.portion_answered(now, number, answer),
             Input::SnapshotWritten(written) => self.snapshot_written(now, written),
             Input::HandOver { to, refused } => self.hand_over(now, to, refused),
             Input::Stop => self.stop(now),

@@ -1,6 +1,6 @@
 //! Changes of this computer that are not known to be in the journal. Pure.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, ops::RangeInclusive};
 
 use crate::{
     checkpoint::format::{self, Checkpoint, Entry, Record},
@@ -8,7 +8,7 @@ use crate::{
         journal::{self, JournalError, Keys, Put},
         sharing::{Change, Source},
     },
-    master,
+    master::{self, Master},
     xmlrpc::Value,
 };
 
@@ -50,6 +50,20 @@ impl Outgoing {
 
     pub fn changes(&self) -> impl Iterator<Item = &Change> {
         self.changes.iter()
+    }
+
+    /// Makes the changes with these numbers in `state`.
+    pub fn apply(&self, seqs: RangeInclusive<u64>, state: &mut Master) {
+        for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
+            match change {
+                Change::Call(record, _) => {
+                    if let Entry::Call { call, .. } = &record.entry {
+                        state.apply_telling(&call.clone().into(), &mut ());
+                    }
+                }
+                Change::State { state: whole, .. } => *state = (**whole).clone(),
+            }
+        }
     }
 
     /// Drops all: nobody is given them.
@@ -190,7 +204,7 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cluster::journal::Manifest, master::Master, xmlrpc::Call};
+    use crate::{cluster::journal::Manifest, xmlrpc::Call};
 
     fn call(seq: u64, bytes: usize) -> Change {
         let value = "x".repeat(bytes).as_str().into();

@@ -165,10 +165,10 @@ impl Member {
         }
         self.journal.go_on(now, records);
         self.cut_off.note(records);
-        match self.cut_off.is_empty() {
-            false => self.adopt(),
-            true if self.follows() => self.act(Action::Follow(records.to_vec())),
-            true => {}
+        if !self.cut_off.is_empty() || self.outgoing.count() > 0 {
+            self.adopt();
+        } else if self.follows() {
+            self.act(Action::Follow(records.to_vec()));
         }
     }
 
@@ -176,7 +176,10 @@ impl Member {
     /// who wrote that is to see it.
     pub(super) fn adopt(&mut self) {
         if self.follows() {
-            let state = self.cut_off.on(&self.journal.state);
+            let mut state = self.cut_off.on(&self.journal.state);
+            // As a leader that may answer nothing more, and does not know yet whether another one leads.
+            let (held, answered) = (self.journal.progress.seq, self.acknowledged);
+            self.outgoing.apply(held + 1..=answered, &mut state);
             self.act(Action::FollowState(state));
         }
     }
@@ -274,6 +277,10 @@ impl Member {
     /// How far the mirror holds the journal.
     pub(super) fn look_at_place(&mut self) {
         let seq = self.journal.progress.seq;
+        // What only the checkpoint holds is lost if another computer leads next.
+        if self.own_wins && self.own.seq > seq && !self.records() {
+            return;
+        }
         let view = self.view();
         // The whole journal up to this leader's first record, at least.
         let whole = self.reading.loaded && seq >= view.seq();

@@ -34,8 +34,9 @@ enum Step {
     Idle,
     /// Until the journal has been read as it is now.
     Reading,
-    /// Until the leader has answered for the first of what is left.
-    Asked(Ask),
+    /// Until the leader at this address and of this term, or this computer, has answered for the first of what is
+    /// left.
+    Asked(Ask, Option<(String, u64)>),
     /// Until then, the same is asked again; or all is judged anew.
     Pause(Instant, Option<Ask>),
 }
@@ -48,6 +49,8 @@ pub(super) struct Merging {
     /// How many times alone were sent before.
     times: u64,
     step: Step,
+    /// How many portions were sent: an answer to an earlier one is too late.
+    asked: u64,
     /// What still has to be sent; none before it was judged.
     left: Option<Vec<Request>>,
     /// Parameters of which nodes here heard a value that was lost: they are told the present value.
@@ -66,6 +69,7 @@ impl Merging {
             id,
             times: 0,
             step: Step::Idle,
+            asked: 0,
             left: None,
             untold: BTreeSet::new(),
             telling: false,
@@ -88,21 +92,23 @@ impl Merging {
 }
 
 impl Member {
-    /// Whether there is a leader to whom what was answered alone can be sent, or this is one.
-    fn can_merge(&self) -> bool {
+    /// The leader to whom what was answered alone can be sent: its address and term, or none if it is this computer.
+    fn merges_to(&self) -> Option<Option<(String, u64)>> {
         match self.machine.role() {
-            Role::Following => {
-                self.reading.wanted.is_none() && self.reading.loaded && self.leader().is_some()
+            Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
+                let (uri, term) = self.leader()?;
+                Some(Some((uri.to_owned(), term)))
             }
-            Role::Leading => self.records(),
-            _ => false,
+            Role::Leading if self.records() => Some(None),
+            _ => None,
         }
     }
 
     pub(super) fn tend_merge(&mut self, now: Instant) {
+        let to = self.merges_to();
         match &mut self.merging.step {
             Step::Idle => {
-                if self.can_merge() && !self.cut_off.is_empty() {
+                if to.is_some() && !self.cut_off.is_empty() {
                     self.judge_anew(now);
                 }
             }
@@ -111,7 +117,12 @@ impl Member {
                     self.judge(now);
                 }
             }
-            Step::Asked(_) => {}
+            Step::Asked(ask, asked) => {
+                // A leader that is gone may never answer.
+                if to.is_some_and(|to| to != *asked) {
+                    self.merging.step = Step::Pause(now + AGAIN, Some(ask.clone()));
+                }
+            }
             Step::Pause(until, ask) => {
                 if *until <= now {
                     match ask.take() {
@@ -171,44 +182,40 @@ impl Member {
             seq: self.merging.judged,
             calls,
         };
-        match self.can_merge() {
-            true => self.send_portion(ask),
-            false => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
-        }
-    }
-
-    fn send_portion(&mut self, ask: Ask) {
-        self.merging.step = Step::Asked(ask.clone());
-        let leads = self.machine.role() == Role::Leading;
-        let to = self.leader().filter(|_| !leads);
-        let to = to.map(|(uri, term)| (uri.to_owned(), term));
-        self.act(Action::Merge { ask, to });
+        self.ask(now, ask);
     }
 
     fn ask(&mut self, now: Instant, ask: Ask) {
-        if self.can_merge() {
-            self.send_portion(ask);
-        } else {
+        let Some(to) = self.merges_to() else {
             self.merging.step = Step::Pause(now + AGAIN, Some(ask));
-        }
+            return;
+        };
+        self.merging.step = Step::Asked(ask.clone(), to.clone());
+        self.merging.asked += 1;
+        let number = self.merging.asked;
+        self.act(Action::Merge { number, ask, to });
     }
 
     /// The leader has answered a portion, or not.
-    pub(super) fn portion_answered(&mut self, now: Instant, answer: Option<wire::Answer>) {
-        let Step::Asked(ask) = std::mem::take(&mut self.merging.step) else {
+    pub(super) fn portion_answered(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: Option<wire::Answer>,
+    ) {
+        let Step::Asked(ask, _) = &mut self.merging.step else {
             return;
         };
+        if number != self.merging.asked {
+            return;
+        }
+        let ask = ask.clone();
         match answer {
             None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
             Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
             Some(wire::Answer::Done(outcomes)) => {
                 if self.merging.telling {
-                    // Who has changed one of them meanwhile has also told the nodes.
-                    let told = ask.calls.iter().filter_map(|call| call.text(1));
-                    for key in told {
-                        self.merging.untold.remove(key);
-                    }
-                    return self.next_portion(now);
+                    return self.told(now, &ask, &outcomes);
                 }
                 if let Some(left) = &mut self.merging.left {
                     left.drain(..ask.calls.len().min(left.len()));
@@ -220,6 +227,22 @@ impl Member {
                 self.report(ask.calls.into_iter().zip(outcomes).collect());
                 self.next_portion(now);
             }
+        }
+    }
+
+    /// The leader has told nodes values that they lack.
+    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[Outcome]) {
+        let untold = &mut self.merging.untold;
+        let before = untold.len();
+        for (call, outcome) in ask.calls.iter().zip(outcomes) {
+            // It was changed since, and nodes may have heard of that before they heard of what was lost.
+            if !matches!(outcome, Outcome::Lost { .. }) {
+                call.text(1).map(|key| untold.remove(key));
+            }
+        }
+        match untold.len() == before - ask.calls.len() {
+            true => self.next_portion(now),
+            false => self.merging.step = Step::Pause(now + AGAIN, None),
         }
     }
 
@@ -243,6 +266,7 @@ impl Member {
         self.tell(News::Merged { sent, lost });
         self.merging = Merging {
             times: self.merging.times + 1,
+            asked: self.merging.asked,
             ..Merging::new(std::mem::take(&mut self.merging.id))
         };
         self.cut_off.sent();

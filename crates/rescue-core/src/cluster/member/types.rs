@@ -131,8 +131,11 @@ pub enum Input {
     Decided { seq: u64, goes_on: bool },
     /// To [`Action::Probe`] `number`: whether the leader's rosrescue answers, and says that it leads.
     Probed { number: u64, leads: bool },
-    /// To [`Action::Merge`]; none if the leader has not answered.
-    Merged(Option<wire::Answer>),
+    /// To [`Action::Merge`] `number`; none if the leader has not answered.
+    Merged {
+        number: u64,
+        answer: Option<wire::Answer>,
+    },
     /// To [`Action::WriteSnapshot`]: what it was of, and its bytes; none if it was not written.
     SnapshotWritten(Option<(Progress, usize)>),
     /// Give up leading in favour of this computer, or of any if it is empty. `refused`: why that computer cannot
@@ -274,6 +277,7 @@ pub enum Action {
     KeepNothing,
     /// Ask the leader to make these writes: its address and term, or none for this computer.
     Merge {
+        number: u64,
         ask: Ask,
         to: Option<(String, u64)>,
     },

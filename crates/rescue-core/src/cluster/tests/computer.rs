@@ -27,14 +27,17 @@ pub(super) struct Unanswered {
     pub(super) origin: usize,
 }
 
+/// A computer, its process, and the number of what it asks.
+pub(super) type Asker = (usize, u64, u64);
+
 /// The mirror, and what of it is given to the others.
 #[derive(Debug, Default)]
 pub(super) struct Ledger {
     pub(super) mirror: Master,
     pub(super) sharing: Option<Sharing>,
     pub(super) unanswered: Vec<Unanswered>,
-    /// Merged portions that wait for the journal: for a record, from which process of which computer.
-    pub(super) merges: Vec<(u64, usize, u64, wire::Answer)>,
+    /// Merged portions that wait for the journal up to a record: who has asked, and the answer.
+    pub(super) merges: Vec<(u64, Asker, wire::Answer)>,
     /// Counts the times that calls are recorded here.
     pub(super) reign: u64,
     pub(super) agreed: u64,
@@ -64,7 +67,7 @@ impl Ledger {
     }
 
     /// Nothing is recorded any more. Returns the portions that are not answered.
-    pub(super) fn leave(&mut self) -> Vec<(u64, usize, u64, wire::Answer)> {
+    pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::Answer)> {
         self.sharing = None;
         self.reign += 1;
         self.agreed = 0;

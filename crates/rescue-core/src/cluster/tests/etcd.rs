@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use super::history::value_of;
 use crate::{
     checkpoint::format::{self, Entry as JournalEntry, Record},
     cluster::{
@@ -81,6 +82,26 @@ impl Etcd {
             }),
             Held::State(_) => false,
         })
+    }
+
+    /// The value of a parameter before this place in the log, which counts a thousand places for each entry.
+    pub(super) fn value_at(&self, number: usize, place: usize) -> Option<i32> {
+        let mut state = Master::default();
+        for (index, (_, held)) in self.log.iter().enumerate() {
+            match held {
+                Held::State(of) if index * 1000 < place => state = (**of).clone(),
+                Held::State(_) => {}
+                Held::Records(records) => {
+                    let first = records.iter().take(place.saturating_sub(index * 1000));
+                    for record in first {
+                        if let JournalEntry::Call { call, .. } = &record.entry {
+                            state.apply_telling(&Request::from(call.clone()), &mut ());
+                        }
+                    }
+                }
+            }
+        }
+        value_of(&state, number)
     }
 
     pub(super) fn view(&self) -> &View {

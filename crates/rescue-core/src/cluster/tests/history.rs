@@ -103,6 +103,8 @@ pub(super) struct History {
     pub(super) told: [[Option<i32>; KEYS]; COMPUTERS],
     /// Nodes of a computer have died at these moments.
     died: Vec<(usize, u64)>,
+    /// A computer did not read each change of others at these moments: it has started, or was given a whole state.
+    skipped: Vec<(usize, u64)>,
     pub(super) broken: Option<String>,
 }
 
@@ -236,6 +238,11 @@ impl History {
         self.died.push((computer, now));
     }
 
+    /// A computer has not read each change of the others.
+    pub(super) fn skips(&mut self, computer: usize, now: u64) {
+        self.skipped.push((computer, now));
+    }
+
     /// Checks all, against the journal.
     pub(super) fn check(&self, etcd: &Etcd, commit: Commit) -> Result<(), String> {
         let places = Places::of(self, etcd);
@@ -251,7 +258,7 @@ impl History {
                 }
             }
         }
-        self.check_merged(&places)?;
+        self.check_merged(&places, etcd)?;
         self.check_reads(&places, etcd, commit)
     }
 
@@ -278,7 +285,7 @@ impl History {
             };
             let superseded = self.calls.iter().enumerate().any(|(of, later)| {
                 let own = (later.computer, later.key) == (call.computer, call.key);
-                own && of > number && later.alone.is_some() && later.heard.is_some()
+                own && of > number && later.heard.is_some()
             });
             // Or what others have set is the same.
             let in_log = !places.of[number].is_empty()
@@ -305,13 +312,23 @@ impl History {
     }
 
     /// What was answered alone has replaced nothing that others have written meanwhile.
-    fn check_merged(&self, places: &Places) -> Result<(), String> {
+    fn check_merged(&self, places: &Places, etcd: &Etcd) -> Result<(), String> {
         for (number, call) in self.calls.iter().enumerate() {
-            let (Some(cut), Some((_, log))) = (call.alone, call.merged) else {
+            let (Some(cut), Some((moment, log))) = (call.alone, call.merged) else {
                 continue;
             };
+            // What others have set and set back does not show where states are compared.
+            let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
+            let mut skipped = self.skipped.iter();
+            let compared =
+                skipped.any(|(of, at)| *of == call.computer && (since..=moment).contains(at));
             let merged = places.changed[number].iter().find(|at| **at >= log * 1000);
             let Some(merged) = merged else { continue };
+            let before = etcd.value_at(call.key, *merged);
+            let first = places.of_value(self, call.key, before);
+            if compared && first.is_some_and(|(first, _)| first < cut * 1000) {
+                continue;
+            }
             for (of, other) in self.calls.iter().enumerate() {
                 let theirs = other.computer != call.computer && other.key == call.key;
                 let counts = other.heard.is_some() && other.alone.is_none();
@@ -352,7 +369,15 @@ impl History {
                 continue;
             }
             let Some(heard) = call.heard else { continue };
-            if let Some(first) = places.of[number].first() {
+            // A later write may stand for it, and be lost.
+            if call.alone.is_some() && !call.held {
+                continue;
+            }
+            // In a state the value may be another call's.
+            let same = self.calls.iter();
+            let same = same.filter(|of| (of.key, of.value) == (key, call.value));
+            let in_state = places.of[number].first().filter(|_| same.count() == 1);
+            if let Some(first) = places.changed[number].first().or(in_state) {
                 floors.push((heard, *first, format!("{call:?}")));
             }
         }
@@ -373,13 +398,23 @@ impl History {
                 floors.push((read.done.unwrap(), first, format!("{read:?}")));
             }
         }
-        for read in reads {
+        // The same value may have been written in vain, or alone: it is not known which write a read shows.
+        let in_vain = |read: &&Read| {
+            let mut calls = self.calls.iter().zip(&places.of);
+            calls.any(|(call, places)| {
+                let same = call.key == key && Some(call.value) == read.value;
+                let in_vain = places.is_empty() || call.alone.is_some();
+                same && in_vain && Some(call.made) <= read.done
+            })
+        };
+        for read in reads.into_iter().filter(|read| !in_vain(read)) {
             let Some((_, last)) = places.of_value(self, key, read.value) else {
                 continue;
             };
             for (moment, floor, why) in &floors {
-                // It was answered before the journal had it.
-                let early = etcd.log[floor / 1000].0 >= read.began;
+                // It was answered before the journal had it, or is back with a leader that has started again.
+                let (added, held) = &etcd.log[floor / 1000];
+                let early = *added >= read.began || matches!(held, Held::State(_));
                 if commit == Commit::Interval && early {
                     continue;
                 }

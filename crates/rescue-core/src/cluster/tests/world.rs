@@ -8,7 +8,7 @@ use std::{
 };
 
 use super::{
-    computer::{Computer, Unanswered, uri},
+    computer::{Asker, Computer, Unanswered, uri},
     etcd::{Etcd, Sent},
     history::{History, KEYS, Read, key, subscriptions, value_of},
 };
@@ -61,7 +61,7 @@ enum Event {
     Told(usize, u64, usize, (Option<i32>, bool), Place),
     /// The leader has not answered a read in time.
     Late(usize, u64, usize),
-    Merge(usize, u64, Option<usize>, u64, Ask),
+    Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
     Probe(usize, u64, usize, u64, u64),
     Put(usize, u64, u64, Vec<crate::cluster::journal::Put>),
     /// A node is told a parameter's value, by a computer or by its master.
@@ -72,6 +72,8 @@ enum Event {
         key: usize,
         value: Option<i32>,
     },
+    /// A master tries again to tell a node there what it could not.
+    Retry(usize, u64, usize),
     /// All nodes are told the state, by a computer in this time that it records calls.
     TellAll(usize, u64, Option<u64>),
     Sync(usize),
@@ -91,6 +93,8 @@ pub(super) struct World {
     pub(super) computers: Vec<Computer>,
     pub(super) history: History,
     masters: u64,
+    /// What a master has not been able to tell a node, in order: it tells each node one thing at a time.
+    stuck: HashMap<(usize, u64, usize), VecDeque<(usize, Option<i32>)>>,
     /// When the last notification from one to another arrives.
     channels: [[u64; COMPUTERS]; COMPUTERS],
     /// A node there must be told the state when it answers again.
@@ -119,6 +123,7 @@ impl World {
             network: Network::default(),
             history: History::default(),
             masters: 0,
+            stuck: HashMap::new(),
             channels: Default::default(),
             owed: Default::default(),
             term: 0,
@@ -274,7 +279,9 @@ impl World {
                     self.read_late(at, life, read);
                 }
             }
-            Event::Merge(from, life, to, term, ask) => self.merge(from, life, to, term, ask),
+            Event::Merge(from, life, to, term, (number, ask)) => {
+                self.merge((from, life, number), to, term, ask);
+            }
             Event::Probe(from, life, to, term, number) => {
                 let there = &self.computers[to];
                 let leads = there.up
@@ -302,6 +309,7 @@ impl World {
                 key,
                 value,
             } => self.notify(from, master, to, key, value),
+            Event::Retry(from, master, to) => self.retry(from, master, to),
             Event::TellAll(at, reign, master) => {
                 let computer = &self.computers[at];
                 let present = computer.up && computer.ledger.reign == reign;
@@ -417,7 +425,13 @@ impl World {
             return;
         }
         let read = match self.network.reaches_etcd(at) {
-            true => Some(self.etcd.read(known)),
+            true => {
+                let read = self.etcd.read(known);
+                if read.state.is_some() {
+                    self.history.skips(at, self.now);
+                }
+                Some(read)
+            }
             false if self.now < until => {
                 return self.after(100 * MS, Event::Load(at, life, known, until));
             }
@@ -527,8 +541,8 @@ impl World {
             }
             Action::Stand(standing) => self.stand(at, standing),
             Action::Leave => {
-                for (_, from, life, _) in self.computers[at].ledger.leave() {
-                    self.merge_answered(from, life, at, None);
+                for (_, asker, _) in self.computers[at].ledger.leave() {
+                    self.merge_answered(asker, at, None);
                 }
                 self.owed[at] = Default::default();
             }
@@ -586,13 +600,13 @@ impl World {
                 }
             }
             Action::KeepNothing => self.computers[at].disk.kept = None,
-            Action::Merge { ask, to } => {
+            Action::Merge { number, ask, to } => {
                 let delay = self.delay();
                 let (to, term) = match to {
                     None => (None, 0),
                     Some((to, term)) => ((0..COMPUTERS).find(|of| uri(*of) == to), term),
                 };
-                self.after(delay, Event::Merge(at, life, to, term, ask));
+                self.after(delay, Event::Merge(at, life, to, term, (number, ask)));
             }
             Action::Report(outcomes) => {
                 for (call, outcome) in outcomes {

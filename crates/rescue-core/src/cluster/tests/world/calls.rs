@@ -95,8 +95,8 @@ impl World {
         let merges = std::mem::take(&mut ledger.merges).into_iter();
         let (merged, left): (Vec<_>, Vec<_>) = merges.partition(|(seq, ..)| *seq <= agreed);
         ledger.merges = left;
-        for (_, from, life, answer) in merged {
-            self.merge_answered(from, life, at, Some(answer));
+        for (_, asker, answer) in merged {
+            self.merge_answered(asker, at, Some(answer));
         }
         for Unanswered {
             recorded,
@@ -111,7 +111,7 @@ impl World {
             if let Some(term) = term.filter(|_| !alone) {
                 // What is in the journal is safe, whoever says so.
                 let committed = self.etcd.holds(&self.history.request(call));
-                if !committed && term < self.term {
+                if recorded && !committed && term < self.term {
                     self.history.breaks("two leaders answer");
                 }
                 let always = self.plan.commit == Commit::Always;
@@ -153,7 +153,8 @@ impl World {
     }
 
     /// The leader makes writes that were answered alone.
-    pub(super) fn merge(&mut self, from: usize, life: u64, to: Option<usize>, term: u64, ask: Ask) {
+    pub(super) fn merge(&mut self, asker: Asker, to: Option<usize>, term: u64, ask: Ask) {
+        let (from, ..) = asker;
         let at = to.unwrap_or(from);
         let there = &self.computers[at];
         let standing_fits = match to {
@@ -192,27 +193,27 @@ impl World {
             });
         }
         let Some(answer) = answer else {
-            return self.merge_answered(from, life, at, None);
+            return self.merge_answered(asker, at, None);
         };
         // It waits until the journal has them.
         let ledger = &mut self.computers[at].ledger;
         let seq = ledger.sharing.as_ref().map_or(0, |of| of.last());
         let agreed = ledger.agreed;
-        ledger.merges.push((seq, from, life, answer));
+        ledger.merges.push((seq, asker, answer));
         self.input_changes(at);
         self.agree(at, agreed);
     }
 
     pub(super) fn merge_answered(
         &mut self,
-        to: usize,
-        life: u64,
+        (to, life, number): Asker,
         at: usize,
         answer: Option<wire::Answer>,
     ) {
         let delay = self.delay();
         let answer = answer.filter(|_| to == at || self.network.joins(at, to));
-        self.after(delay, Event::Input(to, life, Input::Merged(answer)));
+        let merged = Input::Merged { number, answer };
+        self.after(delay, Event::Input(to, life, merged));
     }
 
     pub(super) fn client(&mut self, at: usize) {
@@ -351,25 +352,40 @@ impl World {
             // It has ended.
             return;
         }
-        if self.network.joins(from, to) {
-            self.trace(|| format!("{from} tells {to} that {key} is {value:?}"));
-            self.history.told[to][key] = value;
+        if let Some(master) = master
+            && let Some(stuck) = self.stuck.get_mut(&(from, master, to))
+        {
+            stuck.push_back((key, value));
             return;
+        }
+        if self.network.joins(from, to) {
+            return self.told(from, to, key, value);
         }
         if self.computers[from].ledger.sharing.is_some() {
             self.owed[from][to] = true;
         }
-        if master.is_some() {
-            // rosmaster tries again and again.
-            let notify = Event::Notify {
-                from,
-                master,
-                to,
-                key,
-                value,
-            };
-            self.after(150 * MS, notify);
+        if let Some(master) = master {
+            let stuck = VecDeque::from([(key, value)]);
+            self.stuck.insert((from, master, to), stuck);
+            self.after(150 * MS, Event::Retry(from, master, to));
         }
+    }
+
+    /// rosmaster tries again and again.
+    pub(super) fn retry(&mut self, from: usize, master: u64, to: usize) {
+        let lives = self.computers[from].master == Some(master);
+        if lives && !self.network.joins(from, to) {
+            return self.after(150 * MS, Event::Retry(from, master, to));
+        }
+        let stuck = self.stuck.remove(&(from, master, to)).unwrap_or_default();
+        for (key, value) in stuck.into_iter().filter(|_| lives) {
+            self.told(from, to, key, value);
+        }
+    }
+
+    fn told(&mut self, from: usize, to: usize, key: usize, value: Option<i32>) {
+        self.trace(|| format!("{from} tells {to} that {key} is {value:?}"));
+        self.history.told[to][key] = value;
     }
 
     /// The one delay of the network.

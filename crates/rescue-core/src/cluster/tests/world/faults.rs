@@ -244,6 +244,7 @@ impl World {
     fn start(&mut self, at: usize) {
         if !self.computers[at].up && !self.computers[at].refused {
             let plan = self.plan.clone();
+            self.history.skips(at, self.now);
             self.computers[at].start(at, &plan);
             self.input(at, Input::Begin);
         }
