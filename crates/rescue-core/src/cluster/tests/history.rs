@@ -317,7 +317,8 @@ impl History {
             let (Some(cut), Some((moment, log))) = (call.alone, call.merged) else {
                 continue;
             };
-            // What others have set and set back does not show where states are compared.
+            // Where states are compared, it does not show that others have set a value and set it back, or what this
+            // computer's nodes have set as well.
             let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
             let mut skipped = self.skipped.iter();
             let compared =
@@ -326,7 +327,12 @@ impl History {
             let Some(merged) = merged else { continue };
             let before = etcd.value_at(call.key, *merged);
             let first = places.of_value(self, call.key, before);
-            if compared && first.is_some_and(|(first, _)| first < cut * 1000) {
+            let back = first.is_some_and(|(first, _)| first < cut * 1000);
+            let mut own = self.calls.iter();
+            let own = own.any(|of| {
+                (of.computer, of.key) == (call.computer, call.key) && Some(of.value) == before
+            });
+            if compared && (back || own) {
                 continue;
             }
             for (of, other) in self.calls.iter().enumerate() {
