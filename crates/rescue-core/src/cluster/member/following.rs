@@ -277,8 +277,9 @@ impl Member {
     /// How far the mirror holds the journal.
     pub(super) fn look_at_place(&mut self) {
         let seq = self.journal.progress.seq;
-        // What only the checkpoint holds is lost if another computer leads next.
-        if self.own_wins && self.own.seq > seq && !self.records() {
+        // What only the checkpoint holds is lost if another computer leads next, and what is owed is not in it.
+        let differs = self.own.seq > seq || !self.cut_off.is_empty();
+        if self.own_wins && differs && !self.records() {
             return;
         }
         let view = self.view();

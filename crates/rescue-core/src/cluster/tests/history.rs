@@ -51,8 +51,9 @@ pub(super) struct Call {
     pub(super) key: usize,
     pub(super) value: i32,
     pub(super) made: u64,
-    /// When it was answered, by whomever,
+    /// When it was answered, and by which computer,
     ran: Option<u64>,
+    by: Option<usize>,
     /// and when its node had the answer.
     heard: Option<u64>,
     /// It was answered alone, by a computer that held so much of the log.
@@ -136,6 +137,7 @@ impl History {
             value,
             made: now,
             ran: None,
+            by: None,
             heard: None,
             alone: None,
             reported: false,
@@ -184,15 +186,19 @@ impl History {
         self.of(call).held = true;
     }
 
-    pub(super) fn merged(&mut self, call: &Request, now: u64, log: usize) {
+    /// A leader has made `call` for the computer `from`.
+    pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
         // A value that is set again, so that nodes are told of it, is no call of a node.
-        if let Some(call) = self.find(call.params()) {
+        let call = self.find(call.params());
+        // Another computer that has led has judged by what it had answered itself.
+        if let Some(call) = call.filter(|call| self.calls[*call].computer == from) {
             self.calls[call].merged.get_or_insert((now, log));
         }
     }
 
     pub(super) fn answered(
         &mut self,
+        by: usize,
         call: usize,
         now: u64,
         alone: Option<(u64, usize)>,
@@ -200,6 +206,7 @@ impl History {
     ) {
         let call = &mut self.calls[call];
         call.unchanged = !changed;
+        call.by.get_or_insert(by);
         call.ran.get_or_insert(now);
         if call.heard.is_none() {
             call.alone = alone.map(|(_, log)| log);
@@ -250,7 +257,14 @@ impl History {
             self.check_last(key, &places, etcd, commit)?;
             let last = value_of(&etcd.state, key);
             for (computer, told) in self.told.iter().enumerate() {
-                if told[key] != last {
+                // A write that was answered alone and changed nothing there is kept nowhere, and cannot be corrected.
+                let mut calls = self.calls.iter();
+                let in_vain = calls.any(|call| {
+                    (call.computer, call.key, Some(call.value)) == (computer, key, told[key])
+                        && call.unchanged
+                        && call.alone.is_some()
+                });
+                if told[key] != last && !in_vain {
                     let told = told[key];
                     return Err(format!(
                         "the node of {computer} was told last that {key} is {told:?}, and it is {last:?}"
@@ -337,7 +351,10 @@ impl History {
             }
             for (of, other) in self.calls.iter().enumerate() {
                 let theirs = other.computer != call.computer && other.key == call.key;
-                let counts = other.heard.is_some() && other.alone.is_none();
+                // What this computer itself has answered was before.
+                let counts = other.heard.is_some()
+                    && other.alone.is_none()
+                    && other.by != Some(call.computer);
                 if !theirs || !counts || other.value == call.value {
                     continue;
                 }
@@ -421,7 +438,10 @@ impl History {
                 // It was answered before the journal had it, or is back with a leader that has started again.
                 let (added, held) = &etcd.log[floor / 1000];
                 let early = *added >= read.began || matches!(held, Held::State(_));
-                if commit == Commit::Interval && early {
+                let mut restarts = self.skipped.iter();
+                let restarted = restarts
+                    .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
+                if commit == Commit::Interval && (early || restarted) {
                     continue;
                 }
                 let died = self

@@ -81,6 +81,9 @@ enum Event {
     End(Fault),
 }
 
+/// Parameters and the values that a node is told.
+type Told = VecDeque<(usize, Option<i32>)>;
+
 pub(super) struct World {
     pub(super) plan: Plan,
     pub(super) dice: Dice,
@@ -94,7 +97,7 @@ pub(super) struct World {
     pub(super) history: History,
     masters: u64,
     /// What a master has not been able to tell a node, in order: it tells each node one thing at a time.
-    stuck: HashMap<(usize, u64, usize), VecDeque<(usize, Option<i32>)>>,
+    stuck: HashMap<(usize, u64, usize), Told>,
     /// When the last notification from one to another arrives.
     channels: [[u64; COMPUTERS]; COMPUTERS],
     /// A node there must be told the state when it answers again.

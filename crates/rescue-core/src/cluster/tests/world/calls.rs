@@ -123,7 +123,7 @@ impl World {
             }
             let cut = self.computers[at].cut;
             self.history
-                .answered(call, self.now, alone.then_some(cut), recorded);
+                .answered(at, call, self.now, alone.then_some(cut), recorded);
             let place = place(term.unwrap_or(0), agreed);
             let life = self.computers[origin].life;
             if origin == at {
@@ -182,7 +182,8 @@ impl World {
                             results.push(Value::Array(vec![
                                 vec![Value::from(1), "".into(), 0.into()].into(),
                             ]));
-                            self.history.merged(call, self.now, self.etcd.log.len());
+                            let log = self.etcd.log.len();
+                            self.history.merged(from, call, self.now, log);
                             if let Some((_, _, notices)) = ran {
                                 self.tell_notices(at, notices);
                             }
