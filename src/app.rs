@@ -32,7 +32,7 @@ mod startup;
 
 use self::{
     assemble::{Identity, assemble, last_master, server},
-    cluster::Member,
+    cluster::ClusterDriver,
     duty::Parts,
     startup::{begin, kernel_id},
 };
@@ -215,7 +215,7 @@ enum Runs {
     /// The only computer. `None` for an external master.
     Single(Option<Supervised>),
     /// One of several computers.
-    Member(Box<Member>),
+    Member(Box<ClusterDriver>),
 }
 
 impl Runs {
@@ -280,7 +280,7 @@ impl Runs {
 enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
-    Member(Box<Member>),
+    Member(Box<ClusterDriver>),
 }
 
 impl Begun {

@@ -26,10 +26,7 @@ use std::{
 use tokio::sync::{Notify, watch};
 
 use self::activity::{Activity, Noticed};
-pub(crate) use self::{
-    durability::Mark,
-    shared::{Change, Source},
-};
+pub(crate) use self::durability::Mark;
 use self::{
     durability::Whole,
     journal::Journal,
@@ -43,6 +40,7 @@ use crate::{
         store::Store,
     },
     cli::SyncPolicy,
+    cluster::sharing::Source,
     health::port_of,
     master::{Master, Method, Request},
     order::Order,

@@ -23,8 +23,9 @@ use super::{
 };
 use crate::{
     cli::Reads,
+    cluster::sharing::Source,
     gate::{self, State},
-    ledger::{Ledger, Source, delivery::Delivery},
+    ledger::{Ledger, delivery::Delivery},
     limit::rarely,
     master::{Kind, Master, Method, Request},
     status::stats::Stats,
@@ -221,7 +222,16 @@ impl Calls {
         Some(reply)
     }
 
-    /// Encodes the result of `answer`. `None` if a master could not encode it.
+    /// The mirror's answer to a parameter subscription that is there already, while another computer has the master.
+    pub(super) async fn stand_in_for_subscribed(&self, call: &Request) -> Option<HttpReply> {
+        let reply = self
+            .encode(|| self.ledger.answer_if_subscribed(call))
+            .await?;
+        self.stats.calls_without_master.count();
+        Some(reply)
+    }
+
+    /// Encodes what `answer` gives. None if a master cannot marshal it.
     ///
     /// An answer that takes milliseconds is encoded outside of the runtime, one at a time. Equal answers in a row are
     /// encoded once. Values share memory, so comparing them is quick.

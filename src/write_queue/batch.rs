@@ -7,7 +7,8 @@ use tokio::sync::oneshot;
 
 use super::merge::Merge;
 use crate::{
-    ledger::{Source, activity::LastCalls, delivery::Delivery},
+    cluster::sharing::Source,
+    ledger::{activity::LastCalls, delivery::Delivery},
     master::{Entry, Kind, Method, Request, entry_reply},
     order::{BySubject, Concern, Order},
     upstream::{Head, RawReply},

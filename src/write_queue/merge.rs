@@ -7,11 +7,14 @@ use tokio::sync::oneshot;
 
 use super::batch::{self, Answered, Item};
 use crate::{
-    cluster::merge::{
-        Verdict,
-        wire::{self, Ask},
+    cluster::{
+        merge::{
+            Verdict,
+            wire::{self, Ask},
+        },
+        sharing::Source,
     },
-    ledger::{Ledger, Source},
+    ledger::Ledger,
     master::Request,
     upstream::Head,
     xmlrpc::{self, Reply, Value},

@@ -9,14 +9,22 @@
 //!
 //! * [`displaced`]: who is to be told to shut down by the next leader.
 //! * [`machine`]: who leads, and what may be acknowledged.
+//! * [`member`]: what one computer follows, adopts, answers, gives and merges, and when it has a master.
+//! * [`outgoing`], [`cut_off`], [`sharing`], [`standing`]: parts of that.
 //! * [`journal`]: records and snapshots to and from keys and values.
 //! * [`merge`]: what of the writes of a computer that was alone still holds.
 //! * [`namesake`]: another computer with this one's name.
 
+pub mod cut_off;
 pub mod displaced;
 pub mod journal;
 pub mod machine;
+pub mod member;
 pub mod merge;
+mod mutant;
 pub mod namesake;
+pub mod outgoing;
+pub mod sharing;
+pub mod standing;
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,7 @@ use std::{
     collections::VecDeque,
     net::IpAddr,
     sync::{Arc, Mutex},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use hyper::header::HeaderValue;
@@ -14,27 +14,24 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::{Background, CutOff, Known, Member, Outgoing};
+use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
     app::{duty::Parts, startup},
     checkpoint::session::Restore,
     cluster::{
         etcd::{Access, Etcd, EtcdError, Options, Tls},
-        journal::{Keys, Progress},
-        machine::{ANSWER_LIMIT, Commit, Machine, Settings, View, WhenAlone},
+        journal::Keys,
+        machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
+        member::{Member, Own},
         replica::Replica,
-        way::{Place, Way},
+        standing::{Place, Standing},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     hide::Hide,
-    master::Master,
     process::Rosmaster,
     server::others::{Forwarded, Others},
     upstream::peer::Peers,
 };
-
-/// It is best to know what was before one claims; but not for longer.
-const START_BY: Duration = Duration::from_secs(2);
 
 /// What a computer among several is given.
 pub(in crate::app) struct Given {
@@ -56,7 +53,7 @@ pub(in crate::app) struct Given {
 }
 
 /// Where the other computers are asked, and the task to run.
-pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdError> {
+pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver), EtcdError> {
     let config = &given.config;
     let client = Etcd::new(&Options {
         endpoints: config.endpoints.clone(),
@@ -93,76 +90,61 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     // One that an earlier process left may hold what others have changed since.
     block_in_place(|| given.rosmaster.claim_orphan(None));
     let known = given.restored;
-    let (way, way_rx) = watch::channel(Way::Nobody { known });
+    let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
-    let followed = watch::Sender::new(Place::default());
+    let place = watch::Sender::new(Place::default());
     let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(given.instance.clone(), parts.probe_timeout));
     let others = Others {
-        way: way_rx,
+        standing: standing_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
         forwarded: forwarded.clone(),
         served: given.parts.served.clone(),
-        followed: followed.subscribe(),
+        followed: place.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {
-            term: 0,
             seq: given.restored.into(),
+            ..Place::default()
         })),
         // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
         hold: given.hold.max(2 * config.ttl),
     };
-    let cut_off = CutOff::left(&parts.checkpoint, given.restored).await;
-    let member = Member {
-        machine: Machine::new(settings.clone()),
+    let (kept, left) = Kept::left(&parts.checkpoint, given.restored).await;
+    let session = parts.ledger.session();
+    let own = Own {
+        state: parts.ledger.with_mirror(Clone::clone),
+        restored: given.restored,
+        term: session.term,
+        seq: session.cluster_seq,
+    };
+    let keys = Keys::new(&config.robot);
+    let id = settings.id.clone();
+    let driver = ClusterDriver {
+        known: Known::new(&settings),
+        member: Member::new(settings, keys.clone(), own, left, id),
         replica: Replica {
             client,
-            keys: Keys::new(&config.robot),
+            keys,
             limit: ANSWER_LIMIT,
         },
-        known: Known::new(&settings),
-        trouble: Arc::default(),
-        background: Background::default(),
-        settings,
         given,
-        leads: watch::Sender::new(Way::Nobody { known }),
-        way,
+        standing,
+        place,
         peers,
         forwarded,
-        followed,
         handovers,
+        handover: None,
         inbox: VecDeque::new(),
-        start_by: Some(Instant::now() + START_BY),
-        requests: JoinSet::new(),
-        view: View::default(),
+        work: JoinSet::new(),
+        beside: JoinSet::new(),
         watch: None,
-        loading: None,
-        load_at: Some(Instant::now()),
-        loaded: false,
-        wanted: None,
-        reported: 0,
-        held: Master::default(),
-        displaced: Default::default(),
-        progress: Progress::default(),
-        outgoing: Outgoing::default(),
+        watched: View::default(),
         duty: None,
         endings: JoinSet::new(),
-        cut_off,
-        merging: None,
-        ours: false,
-        before: None,
-        was_released: false,
-        led: false,
-        namesake: None,
-        namesakes: None,
-        deciding: None,
-        probe: None,
-        probe_at: None,
-        released: None,
-        release_by: None,
-        ending_roscore: None,
+        kept,
+        trouble: Arc::default(),
     };
-    Ok((others, member))
+    Ok((others, driver))
 }

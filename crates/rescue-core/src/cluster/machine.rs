@@ -6,6 +6,8 @@
 
 use std::time::{Duration, Instant};
 
+use crate::cluster::mutant::Mutant;
+
 mod due;
 mod flight;
 mod session;
@@ -62,6 +64,7 @@ pub struct Machine {
     /// Whether the leader's rosrescue answers, and since when that is so.
     peer: Option<(bool, Instant)>,
     releasing: Option<String>,
+    claim_not_before: Option<Instant>,
 }
 
 impl Machine {
@@ -88,11 +91,26 @@ impl Machine {
             acknowledged: 0,
             peer: None,
             releasing: None,
+            claim_not_before: None,
         }
     }
 
     pub fn role(&self) -> Role {
         self.role
+    }
+
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// When the leader's keys were seen in their present state for the first time.
+    pub fn observed(&self) -> Option<Instant> {
+        self.observed
+    }
+
+    /// When etcd was heard of last.
+    pub fn heard(&self) -> Option<Instant> {
+        self.heard
     }
 
     /// What is known of the leader.
@@ -115,15 +133,6 @@ impl Machine {
         self.committed
     }
 
-    /// Whether calls that write are to be recorded here. If not, they are for the leader, or wait.
-    pub fn takes_writes(&self) -> bool {
-        match self.role {
-            Role::Leading => self.releasing.is_none(),
-            Role::Alone => self.settings.alone == WhenAlone::Serve,
-            _ => false,
-        }
-    }
-
     /// Whether nobody else can lead at `now`.
     pub fn is_sole(&self, now: Instant) -> bool {
         self.sole_until().is_some_and(|until| now < until)
@@ -133,6 +142,7 @@ impl Machine {
     /// while it is alone and serves: it does not claim to lead then.
     pub fn lease(&self, now: Instant) -> Option<Instant> {
         match self.role {
+            _ if Mutant::ActsWithoutLease.lives() => None,
             Role::Alone if self.settings.alone == WhenAlone::Serve => None,
             Role::Leading => Some(self.sole_until().unwrap_or(now)),
             _ => Some(now),
@@ -143,7 +153,12 @@ impl Machine {
     /// that is alone has none. Its mirror answers, because a master would tell its nodes' state to nodes of the
     /// others as soon as the network lets it.
     pub fn may_have_master(&self) -> bool {
-        self.role == Role::Leading && self.lapses_at().is_some()
+        let unsafely = match self.role {
+            Role::Leading => Mutant::ActsWithoutLease.lives(),
+            Role::Alone => Mutant::MasterWhileAlone.lives(),
+            _ => false,
+        };
+        unsafely || self.role == Role::Leading && self.lapses_at().is_some()
     }
 
     /// When another computer can lead at the earliest; none if one can.
@@ -163,6 +178,7 @@ impl Machine {
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
             return actions;
         }
+        self.give_up_request(now);
         if self
             .deadline()
             .is_some_and(|due| due + self.settings.ttl / BEATS < now)
@@ -183,6 +199,7 @@ impl Machine {
                 self.acknowledge_early(now, &mut actions);
             }
             Input::Peer(leads) => self.peer(now, leads, &mut actions),
+            Input::Lost { view, until } => self.begin_anew(now, view, until, &mut actions),
             Input::HandOver(to) => {
                 self.releasing = Some(to).filter(|_| self.role == Role::Leading);
             }
@@ -190,6 +207,17 @@ impl Machine {
         }
         self.review(now, &mut actions);
         actions
+    }
+
+    /// A request that never ends is one without an answer.
+    fn give_up_request(&mut self, now: Instant) {
+        let lost = self.flight.as_ref().filter(|flight| !flight.silent);
+        let lost = lost.filter(|flight| flight.sent + ANSWER_LIMIT + RETRY <= now);
+        if let Some(number) = lost.map(|flight| flight.number)
+            && !Mutant::WaitsForEver.lives()
+        {
+            self.answered(now, number, Answer::Silence, &mut Vec::new());
+        }
     }
 
     fn answered(&mut self, now: Instant, number: u64, answer: Answer, actions: &mut Vec<Action>) {
@@ -261,6 +289,27 @@ impl Machine {
             leader,
             alive: Some(alive),
         }
+    }
+
+    /// etcd has lost its data, and shows `view`. Nothing of what was there counts.
+    fn begin_anew(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
+        self.flight = None;
+        self.deposed(actions);
+        // What an old snapshot shows is no claim of this process.
+        self.settings.id.push('+');
+        (self.observed, self.heard) = (Some(now), Some(now));
+        (self.peer, self.retry_at) = (None, None);
+        self.session = Session::GoesOn;
+        self.claim_not_before = Some(until);
+        self.view = view;
+        self.follow_to(0);
+        self.stale = false;
+        actions.push(Action::CatchUp(self.view.seq()));
+    }
+
+    /// Claims nothing before `until`.
+    pub fn hold_claims(&mut self, until: Instant) {
+        self.claim_not_before = Some(until);
     }
 
     /// etcd shows the keys.

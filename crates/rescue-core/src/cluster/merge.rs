@@ -10,7 +10,8 @@ pub mod wire;
 
 use std::fmt;
 
-use self::changes::{param_of, value_at};
+use self::changes::param_of;
+pub(super) use self::changes::value_at;
 pub use self::{
     changes::{Changes, Subject},
     pending::{Pending, weight},
@@ -134,6 +135,18 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
         if wanted == present.as_ref() {
             return Verdict::Holds;
         }
+    }
+    // Whoever has the name or the service now has ended that registration.
+    let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
+    let unregisters = matches!(
+        call.method(),
+        Method::UnregisterPublisher
+            | Method::UnregisterSubscriber
+            | Method::UnregisterService
+            | Method::UnsubscribeParam
+    );
+    if over && unregisters {
+        return Verdict::Holds;
     }
     let call = call.clone();
     Verdict::Lost(Lost { call, why, present })

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::{
-    Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, Reign, Role, Session,
-    Settings,
+    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, RETRY,
+    Reign, Role, Session, Settings,
 };
 
 impl Machine {
@@ -12,7 +12,9 @@ impl Machine {
     pub fn deadline(&self) -> Option<Instant> {
         let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
         let send = self.send_at().filter(|_| !under_way);
-        [send, self.alone_at(), self.lapses_at()]
+        let flight = self.flight.as_ref().filter(|_| under_way);
+        let given_up = flight.map(|flight| flight.sent + ANSWER_LIMIT + RETRY);
+        [send, given_up, self.alone_at(), self.lapses_at()]
             .into_iter()
             .flatten()
             .min()
@@ -50,6 +52,7 @@ impl Machine {
             let (number, op) = (self.numbers, flight.op.clone());
             self.flight = Some(Flight {
                 number,
+                sent: now,
                 silent: false,
                 ..flight
             });
@@ -90,6 +93,7 @@ impl Machine {
             number: 0,
             op,
             first: now,
+            sent: now,
             silent: false,
         }
     }
@@ -99,7 +103,10 @@ impl Machine {
         let due = match self.reign {
             Some(reign) => self.beat_at(reign)?,
             None => match self.observed {
-                Some(observed) => observed + self.vacant_after(),
+                Some(observed) => {
+                    let vacant = observed + self.vacant_after();
+                    self.claim_not_before.map_or(vacant, |at| at.max(vacant))
+                }
                 None => self.started?,
             },
         };

@@ -26,6 +26,8 @@ pub(super) struct Flight {
     pub(super) op: Op,
     /// When it was sent for the first time.
     pub(super) first: Instant,
+    /// And for the last time.
+    pub(super) sent: Instant,
     /// It got no answer, and is not under way now.
     pub(super) silent: bool,
 }

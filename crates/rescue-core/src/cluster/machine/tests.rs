@@ -235,7 +235,6 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
         let actions = machine.on(lapses, Input::Wake);
         assert_eq!(actions[0], Action::Become(Role::Alone));
         assert_eq!(actions.contains(&Action::Acknowledge(1)), answers);
-        assert_eq!(machine.takes_writes(), answers);
         // Another one leads: what was answered is handed back.
         let actions = machine.on(lapses, Input::View(led("b", 5, 6)));
         let hands_back = Action::Yield {
@@ -329,7 +328,6 @@ fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
     assert_eq!(machine.role(), Role::Following);
     let actions = machine.on(long, Input::Peer(false));
     assert_eq!(actions[0], Action::Become(Role::Alone));
-    assert!(machine.takes_writes());
     machine.on(long, Input::Recorded(11));
     let actions = machine.on(long + TTL, Input::Peer(true));
     let hands_back = Action::Yield {
@@ -359,7 +357,6 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
     machine.on(now, Input::HandOver(String::new()));
-    assert!(!machine.takes_writes());
     let (revision, seq) = (2, 1);
     let answer = Answer::Applied { revision, seq };
     let (number, op) = sent(&machine.on(now, Input::Answer { number, answer }));

@@ -1,6 +1,6 @@
 //! Inputs and actions of the machine.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -160,6 +160,8 @@ pub enum Input {
     Recorded(u64),
     /// Whether the rosrescue of the leader answers this one, and says that it leads.
     Peer(bool),
+    /// etcd has lost its data, and shows this. Nothing is claimed before a moment.
+    Lost { view: View, until: Instant },
     /// Give up leading, in favour of this computer, or of any if it is empty.
     HandOver(String),
     /// The time of [`Machine::deadline`](super::Machine::deadline) has come.

@@ -1,0 +1,86 @@
+//! Work beside the calls: this computer's own entry among the members, snapshots, and etcd's compaction.
+
+use std::time::{Duration, Instant};
+
+use super::{Action, Member};
+use crate::cluster::{journal::Progress, machine::Role};
+
+/// How often a computer says how it is.
+pub const SAYS_EVERY: Duration = Duration::from_secs(5);
+/// How often the leader has etcd forget what is older than this.
+const FORGET: Duration = Duration::from_secs(300);
+/// Pause after a snapshot that could not be written.
+const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
+
+#[derive(Debug, Default)]
+pub(super) struct Chores {
+    /// When to write this computer's entry among the members.
+    say_at: Option<Instant>,
+    /// A snapshot is being written.
+    snapshot: bool,
+    /// One has failed: none before this moment.
+    snapshot_at: Option<Instant>,
+    /// The revision of etcd at the last look, and when to have it forget what is older.
+    forget: Option<(Instant, u64)>,
+}
+
+impl Chores {
+    pub(super) fn due(&self) -> Option<Instant> {
+        let forget = self.forget.map(|(at, _)| at);
+        [self.say_at, forget].into_iter().flatten().min()
+    }
+
+    /// Brings this computer's entry among the members up to date at `now`.
+    pub(super) fn say_at(&mut self, now: Instant) {
+        self.say_at = Some(now);
+    }
+}
+
+impl Member {
+    /// Begins what is due.
+    pub(super) fn tend_chores(&mut self, now: Instant) {
+        // It would hide the entry of another computer with this name.
+        let watch = self.namesake.watch.as_ref();
+        let may_say = watch.is_some_and(|of| of.is_over(now));
+        if self.chores.say_at.is_none_or(|at| at <= now) {
+            self.chores.say_at = Some(now + SAYS_EVERY);
+            if may_say {
+                self.act(Action::Say);
+            }
+        }
+        let term = self.machine.term();
+        let Some(term) = term.filter(|_| self.machine.role() == Role::Leading) else {
+            self.chores.forget = None;
+            return;
+        };
+        let is_early = self.chores.snapshot_at.is_some_and(|at| now < at);
+        let progress = self.journal.progress;
+        if !self.chores.snapshot && !is_early && progress.wants_snapshot() {
+            self.chores.snapshot = true;
+            self.act(Action::WriteSnapshot {
+                term,
+                progress,
+                state: self.journal.state.clone(),
+                displaced: self.journal.displaced.at(now),
+            });
+        }
+        let revision = self.view().revision;
+        match self.chores.forget {
+            Some((at, before)) if at <= now => {
+                self.chores.forget = Some((now + FORGET, revision));
+                self.act(Action::Forget(before));
+            }
+            None => self.chores.forget = Some((now + FORGET, revision)),
+            Some(_) => {}
+        }
+    }
+
+    pub(super) fn snapshot_written(&mut self, now: Instant, written: Option<(Progress, usize)>) {
+        self.chores.snapshot = false;
+        match written {
+            Some((then, bytes)) => self.journal.progress.snapshot_written(then, bytes),
+            // An etcd that is full refuses at once.
+            None => self.chores.snapshot_at = Some(now + SNAPSHOT_PAUSE),
+        }
+    }
+}

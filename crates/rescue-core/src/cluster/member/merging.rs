@@ -1,0 +1,343 @@
+//! Sends what was answered alone to the leader, as far as it still holds.
+
+use std::{
+    collections::BTreeSet,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{Action, Member, News};
+use crate::{
+    cluster::{
+        machine::Role,
+        merge::{
+            self, Changes, Lost, weight,
+            wire::{self, Ask, Outcome},
+        },
+        mutant::Mutant,
+    },
+    master::{Master, Method, Request, names},
+    xmlrpc::Value,
+};
+
+/// Pause before calls that were not answered are sent again.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Who sets a parameter that nodes have to be told of. No node has this name.
+const TELLER: &str = "/rosrescue";
+/// Most calls, and about most bytes, of one portion. Other writes pass in between.
+const CALLS_MOST: usize = 100;
+const BYTES_MOST: usize = 512 << 10;
+
+#[derive(Debug, Default)]
+enum Step {
+    #[default]
+    Idle,
+    /// Until the journal has been read as it is now.
+    Reading,
+    /// Until the leader at this address and of this term, or this computer, has answered for the first of what is
+    /// left.
+    Asked(Ask, Option<(String, u64)>),
+    /// Until then, the same is asked again; or all is judged anew.
+    Pause(Instant, Option<Ask>),
+}
+
+/// The writes of the oldest time alone are being sent.
+#[derive(Debug)]
+pub(super) struct Merging {
+    /// The name under which all portions of a time alone are sent.
+    id: String,
+    /// How many times alone were sent before.
+    times: u64,
+    step: Step,
+    /// How many portions were sent: an answer to an earlier one is too late.
+    asked: u64,
+    /// What still has to be sent; none before it was judged.
+    left: Option<Vec<Request>>,
+    /// Parameters of which nodes here heard a value that was lost: they are told the present value.
+    untold: BTreeSet<String>,
+    /// The leader is asked to tell the nodes of [`Self::untold`].
+    telling: bool,
+    /// It conflicts with nothing that was changed up to this record.
+    judged: u64,
+    sent: u64,
+    lost: u64,
+}
+
+impl Merging {
+    pub(super) fn new(id: String) -> Self {
+        Self {
+            id,
+            times: 0,
+            step: Step::Idle,
+            asked: 0,
+            left: None,
+            untold: BTreeSet::new(),
+            telling: false,
+            judged: 0,
+            sent: 0,
+            lost: 0,
+        }
+    }
+
+    pub(super) fn due(&self) -> Option<Instant> {
+        match self.step {
+            Step::Pause(until, _) => Some(until),
+            _ => None,
+        }
+    }
+
+    fn id(&self) -> Arc<str> {
+        format!("{} {}", self.id, self.times).into()
+    }
+}
+
+impl Member {
+    /// The leader to whom what was answered alone can be sent: its address and term, or none if it is this computer.
+    fn merges_to(&self) -> Option<Option<(String, u64)>> {
+        match self.machine.role() {
+            Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
+                let (uri, term) = self.leader()?;
+                Some(Some((uri.to_owned(), term)))
+            }
+            Role::Leading if self.records() => Some(None),
+            _ => None,
+        }
+    }
+
+    pub(super) fn tend_merge(&mut self, now: Instant) {
+        let to = self.merges_to();
+        match &mut self.merging.step {
+            Step::Idle => {
+                if to.is_some() && !self.cut_off.is_empty() {
+                    self.judge_anew(now);
+                }
+            }
+            Step::Reading => {
+                if self.reading.is_fresh() {
+                    self.judge(now);
+                }
+            }
+            Step::Asked(ask, asked) => {
+                // A leader that is gone may never answer.
+                if to.is_some_and(|to| to != *asked) {
+                    self.merging.step = Step::Pause(now + AGAIN, Some(ask.clone()));
+                }
+            }
+            Step::Pause(until, ask) => {
+                if *until <= now {
+                    match ask.take() {
+                        Some(ask) => self.ask(now, ask),
+                        None => self.judge_anew(now),
+                    }
+                }
+            }
+        }
+    }
+
+    fn judge_anew(&mut self, now: Instant) {
+        self.merging.step = Step::Reading;
+        self.reading.refresh(now);
+    }
+
+    /// Judges what is left by what others have changed, up to the journal's last record.
+    fn judge(&mut self, now: Instant) {
+        let Some(time) = self.cut_off.first_mut() else {
+            self.merging.step = Step::Idle;
+            return;
+        };
+        let left = self.merging.left.take();
+        let left = left.unwrap_or_else(|| time.pending.calls().cloned().collect());
+        if Mutant::MergesByState.lives() {
+            time.changes = Changes::default();
+            time.changes
+                .note_difference(&time.base, &self.journal.state);
+        }
+        let merged = merge::merge(&time.changes, &self.journal.state, &left);
+        self.merging
+            .untold
+            .extend(merged.lost.iter().filter_map(parameter));
+        let lost = merged.lost.iter();
+        let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
+        self.merging.left = Some(merged.send);
+        self.merging.judged = self.journal.progress.seq;
+        self.report(lost);
+        self.next_portion(now);
+    }
+
+    fn next_portion(&mut self, now: Instant) {
+        let untold = set_again(&self.journal.state, &self.merging.untold);
+        let left = self.merging.left.as_deref().unwrap_or_default();
+        self.merging.telling = left.is_empty();
+        let left = if self.merging.telling { &untold } else { left };
+        let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
+        if calls.is_empty() {
+            return self.merged();
+        }
+        // If there is no answer, the journal may have them all the same. What is set again changes nothing.
+        if let Some(time) = self.cut_off.first_mut().filter(|_| !self.merging.telling) {
+            time.changes.expect(calls.iter().cloned());
+        }
+        let ask = Ask {
+            id: self.merging.id(),
+            seq: self.merging.judged,
+            calls,
+        };
+        self.ask(now, ask);
+    }
+
+    fn ask(&mut self, now: Instant, ask: Ask) {
+        let Some(to) = self.merges_to() else {
+            self.merging.step = Step::Pause(now + AGAIN, Some(ask));
+            return;
+        };
+        self.merging.step = Step::Asked(ask.clone(), to.clone());
+        self.merging.asked += 1;
+        let number = self.merging.asked;
+        self.act(Action::Merge { number, ask, to });
+    }
+
+    /// The leader has answered a portion, or not.
+    pub(super) fn portion_answered(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: Option<wire::Answer>,
+    ) {
+        let Step::Asked(ask, _) = &mut self.merging.step else {
+            return;
+        };
+        if number != self.merging.asked {
+            return;
+        }
+        let ask = ask.clone();
+        match answer {
+            None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
+            Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
+            Some(wire::Answer::Done(outcomes)) => {
+                if self.merging.telling {
+                    return self.told(now, &ask, &outcomes);
+                }
+                if let Some(left) = &mut self.merging.left {
+                    left.drain(..ask.calls.len().min(left.len()));
+                }
+                let lost_there = ask.calls.iter().zip(&outcomes);
+                let lost_there = lost_there.filter(|(_, of)| matches!(of, Outcome::Lost { .. }));
+                let lost_there = lost_there.filter_map(|(call, _)| parameter_of(call));
+                self.merging.untold.extend(lost_there);
+                self.report(ask.calls.into_iter().zip(outcomes).collect());
+                self.next_portion(now);
+            }
+        }
+    }
+
+    /// The leader has told nodes values that they lack.
+    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[Outcome]) {
+        let untold = &mut self.merging.untold;
+        let before = untold.len();
+        for (call, outcome) in ask.calls.iter().zip(outcomes) {
+            // It was changed since, and nodes may have heard of that before they heard of what was lost.
+            if !matches!(outcome, Outcome::Lost { .. }) {
+                call.text(1).map(|key| untold.remove(key));
+            }
+        }
+        match untold.len() == before - ask.calls.len() {
+            true => self.next_portion(now),
+            false => self.merging.step = Step::Pause(now + AGAIN, None),
+        }
+    }
+
+    fn report(&mut self, outcomes: Vec<(Request, Outcome)>) {
+        for (call, outcome) in &outcomes {
+            match outcome {
+                Outcome::Holds => self.merging.sent += 1,
+                // It is not there any more: others have deleted it, too.
+                Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+                Outcome::Refused(_) | Outcome::Lost { .. } => self.merging.lost += 1,
+            }
+        }
+        if !outcomes.is_empty() {
+            self.act(Action::Report(outcomes));
+        }
+    }
+
+    /// The writes of the oldest time have been sent.
+    fn merged(&mut self) {
+        let (sent, lost) = (self.merging.sent, self.merging.lost);
+        self.tell(News::Merged { sent, lost });
+        self.merging = Merging {
+            times: self.merging.times + 1,
+            asked: self.merging.asked,
+            ..Merging::new(std::mem::take(&mut self.merging.id))
+        };
+        self.cut_off.sent();
+        self.keep_all();
+        self.adopt();
+        if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {
+            self.stand_leading(term);
+        }
+        self.tend_standing();
+    }
+}
+
+/// The resolved name of the parameter that a lost write was about.
+fn parameter(lost: &Lost) -> Option<String> {
+    parameter_of(&lost.call)
+}
+
+fn parameter_of(call: &Request) -> Option<String> {
+    let sets = matches!(call.method(), Method::SetParam | Method::DeleteParam);
+    sets.then(|| Some(names::resolve(call.text(1)?, call.caller()?)))?
+}
+
+/// Sets each of the parameters that `state` has to the value that it has: all that subscribe it are told.
+fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
+    let values = keys.iter().filter_map(|key| {
+        let parts: Vec<_> = names::parts(key).collect();
+        Some((key, merge::value_at(state.params(), &parts)?))
+    });
+    let calls = values.map(|(key, value)| {
+        let arguments = [Value::from(TELLER), key.as_str().into(), value.clone()];
+        Request::new(Method::SetParam, arguments)
+    });
+    calls.collect()
+}
+
+/// How many of the calls are the next portion.
+fn portion(calls: &[Request]) -> usize {
+    let (mut count, mut bytes) = (0, 0);
+    for call in calls.iter().take(CALLS_MOST) {
+        // Its answer holds a value that the master may not be able to write.
+        let is_alone = *call.method() == Method::SubscribeParam;
+        bytes += weight(call);
+        if count > 0 && (is_alone || bytes > BYTES_MOST) {
+            break;
+        }
+        count += 1;
+        if is_alone {
+            break;
+        }
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calls_go_in_portions_and_none_is_left_out() {
+        let set = |value: &str| Request::new(Method::SetParam, ["/n", "/k", value]);
+        let subscribe = Request::new(Method::SubscribeParam, ["/n", "http://n:1/", "/k"]);
+        let large = "x".repeat(BYTES_MOST);
+        let mut calls = vec![set("1"); CALLS_MOST + 1];
+        calls.extend([set(&large), set(&large), set("2"), subscribe, set("3")]);
+        let mut lengths = Vec::new();
+        let mut left = calls.as_slice();
+        while !left.is_empty() {
+            let count = portion(left);
+            lengths.push(count);
+            left = &left[count..];
+        }
+        assert_eq!(lengths, [CALLS_MOST, 1, 1, 1, 1, 1, 1]);
+    }
+}
