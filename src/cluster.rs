@@ -1,4 +1,4 @@
-//! Several computers: one leads, the others follow, and one of them takes over. The decisions are in
+//! Several computers: one leads, the others follow, and one of them takes over when it fails. The decisions are in
 //! [`rescue_core::cluster`].
 //!
 //! * [`etcd`]: etcd's JSON gateway.

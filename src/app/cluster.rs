@@ -1,4 +1,4 @@
-//! This computer as one of several: feeds [`Member`], which decides, and carries out its actions.
+//! Runs this computer as one of several: passes events to [`Member`], which decides, and carries out its actions.
 
 mod facts;
 mod join;
@@ -54,38 +54,38 @@ use crate::{
     xmlrpc,
 };
 
-/// How long etcd may take for what nobody waits for.
+/// Time limit for work in the background.
 const LIMIT: Duration = Duration::from_secs(5);
-/// Pause before a large write is tried again.
+/// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
 
-/// Work that ends with an input.
+/// Work whose result is an input.
 type Work = JoinSet<Input>;
 
-/// Feeds this computer's [`Member`] with what happens, and carries out what it decides.
+/// Passes events to this computer's [`Member`], and carries out its actions.
 pub(super) struct ClusterDriver {
     given: Given,
     member: Member,
     replica: Replica,
     standing: watch::Sender<Standing>,
-    /// How far the mirror holds the journal.
+    /// The place in the journal up to which the mirror is current.
     place: watch::Sender<Place>,
     peers: Arc<Peers>,
     /// Writes of this computer that a leader has not answered yet.
     forwarded: Arc<Forwarded>,
     handovers: mpsc::Receiver<Handover>,
-    /// Who waits for this computer to give up leading.
+    /// The caller that waits for a handover.
     handover: Option<oneshot::Sender<Result<String, String>>>,
-    /// Inputs that are to be taken next.
+    /// The next inputs.
     inbox: VecDeque<Input>,
     work: Work,
-    /// What nobody waits for.
+    /// Background work.
     beside: JoinSet<()>,
     watch: Option<Watch>,
-    /// Both keys, as the watch has shown them.
+    /// The leader's keys as the watch delivered them.
     watched: View,
     duty: Option<Duty>,
-    /// Processes that are being ended.
+    /// Processes that are being stopped.
     endings: JoinSet<()>,
     kept: Kept,
     trouble: Arc<Trouble>,
@@ -93,7 +93,7 @@ pub(super) struct ClusterDriver {
 }
 
 impl ClusterDriver {
-    /// Takes part until `stop`.
+    /// Runs until `stop`.
     ///
     /// # Errors
     ///
@@ -133,7 +133,7 @@ impl ClusterDriver {
         result.map(|()| None)
     }
 
-    /// Passes an input to the member, and does what it decides. Returns the end, if that is it.
+    /// Passes an input to the member, and carries out its actions. Returns the result when the member ends.
     async fn take(&mut self, input: Input) -> Option<Result<(), RunError>> {
         let now = Instant::now();
         if !matches!(input, Input::Wake | Input::Watched { .. }) {
@@ -218,7 +218,7 @@ impl ClusterDriver {
             Action::Leave => ledger.leave(),
             Action::Lead { seq, held, state } => {
                 if let Some(state) = state {
-                    // Only if this computer has the master by now.
+                    // Only if this computer still has the master.
                     let _ = ledger.follow_state(state);
                 }
                 ledger.lead(seq, &held);
@@ -342,7 +342,7 @@ impl ClusterDriver {
         }
     }
 
-    /// Has `work` done. A panic there is answered by `otherwise`: the member waits for each answer.
+    /// Starts `work`. If it panics, its result is `otherwise`, because the member waits for every result.
     fn spawn(&mut self, otherwise: Input, work: impl Future<Output = Input> + Send + 'static) {
         self.work.spawn(answered(otherwise, work));
     }
@@ -377,8 +377,8 @@ impl ClusterDriver {
                 }
                 changes = next_changes(&mut self.watch) => return Ok(self.changed(changes)),
                 Some((to, tell)) = self.handovers.recv() => match self.handover {
-                    // One at a time.
-                    Some(_) => drop(tell.send(Err("it is being done already".to_owned()))),
+                    // Only one handover runs at a time.
+                    Some(_) => drop(tell.send(Err("a handover is already under way".to_owned()))),
                     None => {
                         self.handover = Some(tell);
                         let refused = self.known.successor(&to).err();
@@ -400,7 +400,7 @@ impl ClusterDriver {
         self.given.parts.ledger.end_injection();
     }
 
-    /// The watch has shown changes, or has ended.
+    /// Turns the watch's changes, or its end, into an input.
     fn changed(&mut self, changes: Result<Vec<Change>, WatchEnd>) -> Input {
         let changes = match changes {
             Ok(changes) => changes,
@@ -438,7 +438,7 @@ impl ClusterDriver {
         }
     }
 
-    /// Why this computer does not take part.
+    /// The error of a computer whose name is taken.
     fn namesake_at(&self, uri: String) -> RunError {
         let Settings { name, uri: own, .. } = self.member.settings();
         let name = name.clone();
@@ -453,7 +453,7 @@ impl ClusterDriver {
     }
 }
 
-/// What was read of etcd.
+/// Converts what was read from etcd.
 fn read(keys: &Keys, loaded: Loaded) -> Option<Read> {
     let members = loaded.members.iter();
     let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));
@@ -463,7 +463,7 @@ fn read(keys: &Keys, loaded: Loaded) -> Option<Read> {
         Some(checkpoint) => match Master::from_snapshot(checkpoint.snapshot) {
             Ok(state) => Some((state, checkpoint.displaced)),
             Err(error) => {
-                tracing::error!(%error, "the state in etcd is no state of a master; please report this");
+                tracing::error!(%error, "the state in etcd is invalid; please report this");
                 return None;
             }
         },
@@ -477,7 +477,7 @@ fn read(keys: &Keys, loaded: Loaded) -> Option<Read> {
     })
 }
 
-/// What a computer says, if `key` is that of one.
+/// A member entry, if `key` is one.
 fn said(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
     let name = key.strip_prefix(&keys.member(""))?.to_owned();
     let said = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
@@ -488,7 +488,7 @@ fn said(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard>
     })
 }
 
-/// The entry of the journal that ends with record `seq`.
+/// The journal entry that ends with record `seq`.
 fn entry(seq: u64, kv: &Kv) -> Entry {
     let bytes = kv.value.len();
     match (
@@ -500,7 +500,7 @@ fn entry(seq: u64, kv: &Kv) -> Entry {
     }
 }
 
-/// Finds out whether the session in etcd goes on.
+/// Finds out whether the session in etcd continues.
 async fn decide(seq: u64, state: Master, restore: Restore, evidence: Evidence) -> Input {
     let node_alive = session::depends_on_nodes(restore, evidence)
         && life::any_alive(&state, evidence.same_boot).await;
@@ -521,7 +521,7 @@ async fn decide(seq: u64, state: Master, restore: Restore, evidence: Evidence) -
     Input::Decided { seq, goes_on }
 }
 
-/// Has the leader make writes that were answered alone: the one at an address, or this computer.
+/// Sends writes that were answered while cut off to the leader at an address, or to this computer.
 async fn merge(
     ask: Ask,
     to: Option<(String, u64)>,
@@ -542,7 +542,7 @@ async fn merge(
     let count = ask.calls.len();
     match wire::Answer::read(&reply, count) {
         Some(answer) => Some(answer),
-        // An earlier version, which does not know what it is asked.
+        // An earlier version, which does not know this method.
         None => {
             let reply = send(Request::multicall(ask.calls)).await;
             reply.map(|reply| wire::Answer::of(&vec![Verdict::Runs; count], &reply))
@@ -561,11 +561,11 @@ async fn say(client: Etcd, put: Put) {
     }
 }
 
-/// The input that `work` ends with, or `otherwise` if it panics: the member waits for each answer.
+/// The result of `work`, or `otherwise` if it panics, because the member waits for every result.
 async fn answered(otherwise: Input, work: impl Future<Output = Input> + Send + 'static) -> Input {
     let work = AbortOnDropHandle::new(tokio::spawn(work));
     work.await.unwrap_or_else(|error| {
-        tracing::error!(%error, "work for the cluster was not finished; please report this line");
+        tracing::error!(%error, "a task for the cluster panicked; please report this line");
         otherwise
     })
 }

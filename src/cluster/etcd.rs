@@ -39,7 +39,7 @@ impl Etcd {
     ///
     /// # Errors
     ///
-    /// As [`Client::new`].
+    /// The errors of [`Client::new`].
     pub fn new(options: &Options) -> Result<Self, EtcdError> {
         Client::new(options).map(Self)
     }
@@ -168,7 +168,7 @@ impl Etcd {
 ///
 /// # Errors
 ///
-/// If they are not what rosrescue writes there.
+/// If rosrescue did not write them.
 pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
     view(keys, found.revision, found.kvs.iter())
 }
@@ -177,7 +177,7 @@ pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
 ///
 /// # Errors
 ///
-/// If the key is not what rosrescue writes there.
+/// If rosrescue did not write the key.
 pub fn absorb(change: &Change, view: &mut View, keys: &Keys) -> Result<(), EtcdError> {
     view.revision = view.revision.max(change.revision);
     absorb_key(view, keys, &change.key, change.kv.as_ref())

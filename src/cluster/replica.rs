@@ -121,7 +121,7 @@ impl Replica {
     ///
     /// # Errors
     ///
-    /// Why they cannot be read.
+    /// If they could not be read.
     pub async fn records(&self, entry: &Kv) -> Result<Vec<Record>, ReplicaError> {
         let Some(manifest) = Manifest::read(&entry.value) else {
             return Ok(journal::records(&entry.key, &entry.value)?);

@@ -41,9 +41,9 @@ use crate::{
 
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// What etcd says of the leader is no address.
+/// The error if the leader's address in etcd is unusable.
 const NO_ADDRESS: &str = "the leader's address cannot be used";
-/// The method by which `rosrescue handover` has the leader give up leading.
+/// The method by which `rosrescue handover` asks the leader to give up leadership.
 pub(crate) const HANDOVER: &str = "rosrescue/handover";
 
 /// A handover request: the computer that should lead, and a channel for the result. The result is the previous leader's
@@ -244,8 +244,8 @@ impl Others {
                     };
                     let answered = tokio::select! {
                         biased;
-                        // What is answered alone holds only if nobody else changes it: the computer that has
-                        // asked need not be cut off, and may be about to lead itself.
+                        // A cut-off computer answers only its own nodes. The computer that forwarded this call may
+                        // not be cut off, and may be about to lead.
                         _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, source) => answered,
                     };
@@ -284,11 +284,11 @@ impl Others {
                             Some(reply) => return Ok(reply),
                             None => Some(Instant::now() + RETRY_PAUSE),
                         },
-                        // Its answer would never come, or does not count any more.
+                        // Its answer would never come, or no longer counts.
                         _ = standing.changed(), if call.kind != Kind::Read => continue,
                     }
                 }
-                // Until the next leader has taken over, or what was answered alone is with this one.
+                // Waits until the next leader has taken over, or the merge is done.
                 Standing::Leads { pass, .. } => {
                     by_mirror = pass == Pass::Reads;
                     None
@@ -453,15 +453,15 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// Whether this is a parameter subscription that is there already. Nodes make it each time that they log, and must
-    /// not stop for the time that a takeover takes.
+    /// Whether this is a parameter subscription that exists already. Nodes repeat it each time they log, and must not
+    /// wait for a takeover.
     fn is_subscribed(&self) -> bool {
         let call = self.call.as_ref();
         call.is_some_and(|call| self.calls.ledger.answer_if_subscribed(call).is_some())
     }
 
-    /// The mirror's answer to a read, or to a subscription that is there already; none to any other call, and none if
-    /// the mirror does not show yet what the leader's answers have shown before: on one computer no read goes back.
+    /// The mirror's answer to a read or to an existing subscription. `None` for any other call, and `None` as long as
+    /// the mirror is behind the leader's earlier answers, so that no read goes back in time on one computer.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let call = self.call.as_ref()?;
         let (followed, told) = (*self.others.followed.borrow(), *self.others.told());

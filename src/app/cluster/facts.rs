@@ -1,4 +1,4 @@
-//! What is known of the other computers, for people.
+//! Facts about the other computers, for the status and the log.
 
 use std::{
     collections::BTreeMap,
@@ -14,12 +14,12 @@ use crate::{
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };
 
-/// What is known of the other computers.
+/// Facts about the other computers.
 pub(super) struct Known {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
     leader: Option<LeaderFacts>,
-    /// The revision of the last sign of a leader, and when it was seen.
+    /// The revision of the leader's last sign of life, and when it was seen.
     sign: Option<(u64, Instant)>,
     role: (Role, Instant),
     takeovers: u64,
@@ -41,7 +41,7 @@ impl Known {
         }
     }
 
-    /// Looks at the keys.
+    /// Notes the leader's keys.
     pub(super) fn look(&mut self, view: &View) {
         let now = Instant::now();
         if let Some(leader) = &view.leader
@@ -59,7 +59,7 @@ impl Known {
                     leader = leader.name,
                     version = leader.version,
                     own = self.settings.version,
-                    "the leader has another version of rosrescue"
+                    "the leader runs another version of rosrescue"
                 );
             }
         }
@@ -69,7 +69,7 @@ impl Known {
         }
     }
 
-    /// A computer has said how it is.
+    /// Notes a member entry.
     pub(super) fn heard(&mut self, heard: &Heard) {
         let Some(said) = &heard.said else { return };
         let mut roles = Role::ALL.into_iter();
@@ -85,7 +85,7 @@ impl Known {
         self.members.insert(heard.name.clone(), member);
     }
 
-    /// Whether `name`, or any other computer if it is empty, can take over; if not, why.
+    /// Checks whether the computer `name`, or any if it is empty, can take over. Returns the reason if not.
     pub(super) fn successor(&self, name: &str) -> Result<(), String> {
         let others = self
             .members
@@ -97,19 +97,19 @@ impl Known {
         });
         let names: Vec<&str> = there.map(|of| of.name.as_str()).collect();
         if name == self.settings.name {
-            return Err(format!("`{name}` leads already"));
+            return Err(format!("`{name}` already leads"));
         }
         match names.as_slice() {
-            [] => Err("no other computer is there".to_owned()),
+            [] => Err("no other computer is connected".to_owned()),
             names if name.is_empty() || names.contains(&name) => Ok(()),
             names => Err(format!(
-                "`{name}` is not there; there are {}",
+                "`{name}` is not connected; connected are {}",
                 names.join(", ")
             )),
         }
     }
 
-    /// This computer leads now. `released`: the one before has given up leading by itself.
+    /// Notes that this computer leads now. `released` says whether the previous leader gave up leadership by itself.
     pub(super) fn taken_over(&mut self, before: Option<(String, Instant)>, released: bool) {
         let now = Instant::now();
         let took = before
@@ -139,7 +139,7 @@ impl Known {
 }
 
 impl ClusterDriver {
-    /// Since when nobody leads, as far as is known.
+    /// Since when no computer leads, as far as is known.
     fn leaderless(&self) -> Option<Instant> {
         let (role, since) = self.known.role;
         let gone = match role {
@@ -151,7 +151,7 @@ impl ClusterDriver {
         gone.then_some(sign)
     }
 
-    /// Shows on the board how it is.
+    /// Updates the status.
     pub(super) fn show(&mut self) {
         self.known.look(self.member.view());
         if self.known.role.0 != self.member.role() {
@@ -186,7 +186,7 @@ impl ClusterDriver {
                 let lost = self.member.etcd_lost()?;
                 Some((
                     lost,
-                    "it has lost its data; a computer is about to bring it back".to_owned(),
+                    "it has lost its data; a computer is restoring it".to_owned(),
                 ))
             }),
             members,

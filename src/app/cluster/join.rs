@@ -1,4 +1,4 @@
-//! A computer begins to take part.
+//! Creates the parts of a computer among several.
 
 use std::{
     collections::VecDeque,
@@ -33,7 +33,7 @@ use crate::{
     upstream::peer::Peers,
 };
 
-/// What a computer among several is given.
+/// What a computer among several needs.
 pub(in crate::app) struct Given {
     pub(in crate::app) config: ClusterConfig,
     pub(in crate::app) parts: Arc<Parts>,
@@ -42,17 +42,17 @@ pub(in crate::app) struct Given {
     /// Identifies this process.
     pub(in crate::app) instance: HeaderValue,
     pub(in crate::app) restore: Restore,
-    /// How long a call waits that nobody can answer.
+    /// How long a call waits that no component can answer.
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
-    /// Which values of parameters the log does not show.
+    /// The parameters whose values are hidden.
     pub(in crate::app) hide: Hide,
     /// Cancelled when calls are no longer taken.
     pub(in crate::app) halt: CancellationToken,
 }
 
-/// Where the other computers are asked, and the task to run.
+/// Returns the way to the other computers, and the driver to run.
 pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver), EtcdError> {
     let config = &given.config;
     let client = Etcd::new(&Options {
@@ -87,7 +87,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
     };
     let parts = &given.parts;
     parts.ledger.leave();
-    // One that an earlier process left may hold what others have changed since.
+    // A master left by an earlier process may have outdated state.
     block_in_place(|| given.rosmaster.claim_orphan(None));
     let known = given.restored;
     let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
@@ -103,12 +103,12 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
         forwarded: forwarded.clone(),
         served: given.parts.served.clone(),
         followed: place.subscribe(),
-        // A restored mirror may be old: it shows nothing before etcd's journal has been read.
+        // A restored mirror may be outdated, so it answers nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {
             seq: given.restored.into(),
             ..Place::default()
         })),
-        // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
+        // The next leader needs the time to live, and etcd may have to elect its own leader first.
         hold: given.hold.max(2 * config.ttl),
     };
     let (kept, left) = Kept::left(&parts.checkpoint, given.restored).await;

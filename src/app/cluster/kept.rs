@@ -1,4 +1,5 @@
-//! Writes that were answered while this computer was alone, beside the checkpoint, until the leader has them.
+//! Stores the writes that were answered while this computer was cut off beside the checkpoint, until the leader has
+//! them.
 
 use std::path::{Path, PathBuf};
 
@@ -15,15 +16,15 @@ use crate::{
     wait,
 };
 
-/// The file is written anew when it has outgrown what is needed, and this many bytes.
+/// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
 const FILE_BYTES: u64 = 64 << 10;
 
 /// The file `CHECKPOINT.alone`.
 #[derive(Default)]
 pub(super) struct Kept {
-    /// None while there is nothing to keep, or on a disk that is silent.
+    /// `None` while there is nothing to keep, or while the disk hangs.
     store: Option<Store>,
-    /// The bytes of the file's journal when it was written anew.
+    /// The size of the file's journal when it was last rewritten, in bytes.
     written: u64,
 }
 
@@ -34,8 +35,8 @@ fn path_of(checkpoint: &Path) -> PathBuf {
 }
 
 impl Kept {
-    /// What an earlier process has left, and the file. `goes_on`: whether its session does; if not, the file is kept
-    /// under another name.
+    /// Opens the file, and returns the writes that an earlier process left. If its session does not continue
+    /// (`goes_on`), the file is kept under another name.
     pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
         let path = path_of(checkpoint);
         let opened = wait::within(DISK_PATIENCE, move || {
@@ -72,7 +73,7 @@ impl Kept {
         let left = CutOff::left(base.clone(), calls);
         tracing::info!(
             calls = left.len(),
-            "an earlier process was cut off; its writes are sent once there is a leader"
+            "an earlier process was cut off; its writes are sent to the next leader"
         );
         let mut this = Self::default();
         let calls = left.calls().cloned().collect();
@@ -80,7 +81,7 @@ impl Kept {
         (this, left)
     }
 
-    /// Keeps `calls`, answered since the state was `base`, in place of what is kept.
+    /// Stores exactly `calls`, answered since the state was `base`.
     pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
         let path = path_of(checkpoint);
         let store = match self.store.take() {
@@ -110,7 +111,7 @@ impl Kept {
         self.written = self.store.as_ref().map_or(0, Store::journal_bytes);
     }
 
-    /// Keeps these as well.
+    /// Stores these calls as well.
     pub(super) async fn add(&mut self, calls: Vec<Request>) {
         if let Some(mut store) = self.store.take() {
             let entries = entries(calls);
@@ -119,7 +120,7 @@ impl Kept {
         }
     }
 
-    /// Whether the file has grown to twice what is needed.
+    /// Whether the file is twice as large as necessary.
     pub(super) fn has_outgrown(&self) -> bool {
         let Some(store) = &self.store else {
             return false;
@@ -128,7 +129,7 @@ impl Kept {
         store.journal_bytes() > self.written.saturating_add(needed)
     }
 
-    /// Has `work` done, and takes the store back.
+    /// Runs `work` with the store on another thread.
     async fn have(
         &mut self,
         work: impl FnOnce() -> (Result<(), StoreError>, Store) + Send + 'static,
@@ -142,11 +143,11 @@ impl Kept {
         self.store = Some(store);
     }
 
-    /// Removes the file: all has been sent.
+    /// Removes the file, because all writes have been sent.
     pub(super) async fn remove(&mut self, checkpoint: &Path) {
         self.store = None;
         let path = path_of(checkpoint);
-        // Late is in time for the next start.
+        // It only has to be done before the next start.
         wait::within(DISK_PATIENCE, move || remove_files(path)).await;
     }
 }
@@ -165,13 +166,13 @@ fn remove_files(path: PathBuf) {
             tracing::warn!(
                 path = %path.display(),
                 %error,
-                "cannot delete the file of writes that were sent; delete it, or they are sent again"
+                "cannot delete the file of writes that have been sent; delete it, or they will be sent again"
             );
         }
     }
 }
 
-/// Keeps the writes of a session that is over under another name.
+/// Keeps the writes of an ended session under another name.
 fn keep_of_session(store: &mut Store) {
     match store.set_aside("session") {
         Ok(Some(kept)) => tracing::warn!(
@@ -189,8 +190,8 @@ fn say_unkept(error: &dyn std::fmt::Display) {
     rarely!(
         error,
         %error,
-        "writes that are answered alone cannot be kept on the disk; a crash of rosrescue itself would lose \
-         them. Free or repair the disk"
+        "cannot store the writes made while cut off; a crash of rosrescue itself would lose them. Free space on \
+         the disk or repair it"
     );
 }
 

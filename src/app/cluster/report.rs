@@ -1,4 +1,4 @@
-//! What people are told.
+//! Logs what the member reports.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -16,30 +16,30 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// That this computer is cut off, and that it is not any more.
+/// The alarm that this computer is cut off, and its all-clear.
 static ALONE: Pair = Pair::new();
 
 impl ClusterDriver {
-    /// Tells people.
+    /// Logs an event.
     pub(super) fn tell(&mut self, news: News) {
         match news {
             News::Alone { serves } => self.tell_alone(serves),
             News::NotAlone => {
                 let role = self.member.role().as_str();
-                all_clear!(info, ALONE, role, "not alone any more");
+                all_clear!(info, ALONE, role, "no longer cut off");
             }
             News::Leads { before, released } => self.known.taken_over(before, released),
             News::LeadsAgain => {
-                tracing::warn!("this computer leads again: etcd has answered");
+                tracing::warn!("this computer leads again, because etcd has answered");
             }
             News::Deposed => {
-                tracing::warn!("this computer does not lead any more; another one does, or may");
+                tracing::warn!("this computer no longer leads; another computer does, or may");
             }
             News::EtcdLost => tracing::error!(
-                "etcd has lost its data: the most recent state of a computer that lives takes its place"
+                "etcd has lost its data; the most recent state of a living computer will replace it"
             ),
             News::Lapsed => tracing::warn!(
-                "etcd is silent, and another computer may lead by now: this one's master is ended, and its mirror answers"
+                "etcd does not answer, and another computer may lead by now; killed the master, and the mirror answers"
             ),
             News::Suspect { uri, until } => {
                 let name = &self.member.settings().name;
@@ -54,7 +54,7 @@ impl ClusterDriver {
             News::TooLarge(error) => rarely!(
                 error,
                 error,
-                "a change of the state cannot be given to the other computers; they go on without it"
+                "cannot write a change to etcd; the other computers do not get it"
             ),
             News::Merged { sent, lost } => {
                 self.known.lost_writes += lost;
@@ -77,10 +77,10 @@ impl ClusterDriver {
         ) {
             (Some(leader), _) => {
                 let (name, uri) = (&leader.name, &leader.uri);
-                format!("{name} leads, and cannot be reached at {uri}")
+                format!("{name} leads but cannot be reached at {uri}")
             }
             (None, Some((_, why))) => format!("etcd: {why}"),
-            (None, None) => "etcd has answered too late".to_owned(),
+            (None, None) => "etcd answered too late".to_owned(),
         };
         alarm!(
             error,
@@ -94,7 +94,7 @@ impl ClusterDriver {
     }
 }
 
-/// Why a master is begun, in words.
+/// The reason for a master's start, for reports.
 pub(super) fn cause(of: Cause) -> &'static str {
     match of {
         Cause::Started => STARTED,
@@ -103,7 +103,8 @@ pub(super) fn cause(of: Cause) -> &'static str {
     }
 }
 
-/// Says what does not hold of writes that were answered alone. One line for each parameter, and for each other subject: a node may have written to it a thousand times.
+/// Logs the lost ones among the writes that were answered while cut off. One line per subject, because a node may
+/// have written to it a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
     for (call, outcome) in &outcomes {
@@ -111,7 +112,7 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
         let method = call.method().name();
         match outcome {
             Outcome::Holds => {}
-            // It is not there any more: others have deleted it, too.
+            // Others have deleted the parameter, too.
             Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
             Outcome::Refused(text) => {
                 tracing::warn!(
@@ -151,13 +152,13 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
     }
 }
 
-/// A parameter's value for people; hidden if it is one of those.
+/// A parameter's value for the log, hidden if necessary.
 fn shown_value(hide: &Hide, key: &str, value: Option<&Value>) -> String {
     let text = |value| shown(&hide.mask(key, value));
     value.map_or_else(|| "(none)".to_owned(), text)
 }
 
-/// The parameter that `call` sets, and to what; nothing if it deletes it.
+/// The parameter that `call` sets, and its value. `None` for a deletion.
 fn parameter(call: &Request) -> Option<(String, Option<&Value>)> {
     let key = || Some(names::resolve(call.text(1)?, call.caller()?));
     match call.method() {

@@ -1,4 +1,4 @@
-//! Warns at the start about what is wrong with `--cluster`, even while it works.
+//! Warns at the start about mistakes in `--cluster`, even if it works.
 
 use std::time::Duration;
 
@@ -7,10 +7,11 @@ use crate::cluster::{
     survey::{self, Complaint, LIMIT},
 };
 
-/// An etcd that does not answer is tried again after this time, before a warning: it may be starting, too.
+/// An etcd that does not answer is tried again after this time, because it may be starting, too. Then rosrescue
+/// warns.
 const SECOND_LOOK: Duration = Duration::from_secs(5);
 
-/// Tries each endpoint on its own.
+/// Tries each endpoint separately.
 pub(super) async fn try_endpoints(replica: Replica) {
     let Replica { client, keys, .. } = replica;
     let found = survey::complaints(&client.try_each(&keys, LIMIT).await);
@@ -24,9 +25,9 @@ pub(super) async fn try_endpoints(replica: Replica) {
     }
 }
 
-/// Compares the name `robot`, which etcd does not know, with those of other robots.
+/// Looks for a typo in the name `robot`, which etcd does not know, among the other robots' names.
 pub(super) async fn look_for_typo(replica: Replica, robot: String) {
-    // This robot may be among them by now.
+    // This robot may have keys by now.
     if let Ok(mut robots) = replica.client.robots(LIMIT).await {
         robots.retain(|other| *other != robot);
         survey::typo(&robot, &robots).iter().for_each(warn);

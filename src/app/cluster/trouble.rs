@@ -1,4 +1,4 @@
-//! What etcd's trouble is, for people.
+//! The trouble with etcd, for the status and the log.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -10,11 +10,11 @@ use crate::{
     limit::{Pair, alarm, all_clear},
 };
 
-/// Why etcd does not give what is asked, and when it has given anything last.
+/// The last failure of etcd, and when it last answered.
 #[derive(Debug)]
 pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
 
-/// That etcd does not answer, and that it does again.
+/// The alarm that etcd does not answer, and its all-clear.
 static TROUBLE: Pair = Pair::new();
 
 impl Default for Trouble {
@@ -43,15 +43,12 @@ impl Trouble {
         }
     }
 
-    /// Whether etcd has given nothing for longer than `limit`. Says so: a request may go on for longer.
+    /// Whether etcd has not answered for longer than `limit`. If so, reports it, because a request may take longer.
     pub(super) fn is_silent(&self, limit: Duration) -> bool {
         let (known, heard) = self.lock().clone();
         let silent = heard.elapsed();
         if silent > limit && known.is_none() {
-            self.say(format!(
-                "it has not answered for {:.1} s",
-                silent.as_secs_f64()
-            ));
+            self.say(format!("no answer for {:.1} s", silent.as_secs_f64()));
         }
         silent > limit
     }
@@ -64,7 +61,7 @@ impl Trouble {
         }
     }
 
-    /// What etcd has given, if it has.
+    /// Notes the result of a request. Returns what etcd answered, if it did.
     pub(super) fn of<T>(&self, result: Result<T, ReplicaError>) -> Option<T> {
         match result {
             Ok(given) => {

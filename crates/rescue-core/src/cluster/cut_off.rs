@@ -1,5 +1,5 @@
-//! Writes that were answered while this computer was alone, until the leader has them. Pure; the shell keeps
-//! them beside the checkpoint as well.
+//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; the shell also
+//! stores them beside the checkpoint.
 
 use std::collections::VecDeque;
 
@@ -13,21 +13,21 @@ use crate::{
     master::{Master, Request},
 };
 
-/// Most times alone that are kept apart.
+/// How many periods of being cut off are kept apart.
 const TIMES_MOST: usize = 8;
-/// Most writes of a time whose own record in the journal is recognised.
+/// How many writes of a period can be recognised when they appear in the journal.
 const EXPECTED_MOST: usize = 4_000;
 
-/// One time alone.
+/// One period of being cut off.
 #[derive(Clone, Debug)]
 pub struct Time {
     /// The state when this computer was cut off.
     pub base: Master,
-    /// What was answered since.
+    /// The writes answered since.
     pub pending: Pending,
-    /// What others have changed since.
+    /// The others' changes since.
     pub changes: Changes,
-    /// How many of the writes were given to the journal, too.
+    /// How many of the writes may also be in the journal.
     expected: usize,
 }
 
@@ -42,14 +42,14 @@ impl Time {
     }
 }
 
-/// The times alone whose writes have not all reached a leader, the oldest first.
+/// The periods whose writes have not all reached a leader, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct CutOff {
     times: VecDeque<Time>,
 }
 
 impl CutOff {
-    /// What an earlier process has left: the state when it was cut off, and what it has answered since.
+    /// Restores what an earlier process left: the state when it was cut off, and the writes answered since.
     pub fn left(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
         let mut time = Time::new(base);
         for call in calls {
@@ -63,14 +63,14 @@ impl CutOff {
         }
     }
 
-    /// Whether nothing is owed to a leader.
+    /// Whether a leader has all writes.
     pub fn is_empty(&self) -> bool {
         self.times.is_empty()
     }
 
-    /// This computer is cut off, perhaps once more, in the state `base`.
+    /// Begins a period of being cut off, in the state `base`.
     pub fn begin(&mut self, base: Master) {
-        // The writes of the earlier times may still be on their way.
+        // The writes of earlier periods may still be on their way.
         let earlier: Vec<_> = self.calls().cloned().collect();
         let is_empty = self
             .times
@@ -79,12 +79,12 @@ impl CutOff {
         if is_empty && self.times.len() > 1 {
             self.times.pop_back();
         }
-        // The oldest one may be on its way.
+        // The oldest period may be on its way.
         if self.times.len() >= TIMES_MOST
             && let Some(second) = self.times.remove(2)
             && let Some(first) = self.times.get_mut(1)
         {
-            // What others have changed since the first one counts for both.
+            // The others' changes since the first of the two count for both.
             second
                 .pending
                 .calls()
@@ -95,14 +95,14 @@ impl CutOff {
         self.times.push_back(time);
     }
 
-    /// Others may have run `calls` of this computer, or may still: they are no changes of theirs.
+    /// Notes that others may run these calls of this computer. They do not count as others' changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
         if let Some(time) = self.times.back_mut() {
             time.changes.expect(calls);
         }
     }
 
-    /// The journal has these records now.
+    /// Notes new records of the journal.
     pub fn note(&mut self, records: &[Record]) {
         for time in &mut self.times {
             for record in records {
@@ -113,8 +113,8 @@ impl CutOff {
         }
     }
 
-    /// The journal's state is `is`, and was `was`, or that in which this computer was cut off. The records in
-    /// between are not known.
+    /// Notes that the journal's state changed from `was` to `is`, without the records in between. `None` stands for
+    /// the state when this computer was cut off.
     pub fn note_difference(&mut self, was: Option<&Master>, is: &Master) {
         for time in &mut self.times {
             let was = was.unwrap_or(&time.base);
@@ -122,7 +122,7 @@ impl CutOff {
         }
     }
 
-    /// `state`, that of the others, with what was answered alone and has not reached them.
+    /// Returns the others' `state` plus the kept writes.
     pub fn on(&self, state: &Master) -> Master {
         let mut state = state.clone();
         for time in &self.times {
@@ -133,8 +133,7 @@ impl CutOff {
         state
     }
 
-    /// Keeps what was answered. `given`: whether it is given to the journal, too, which may take it. Returns what
-    /// is new.
+    /// Keeps answered writes. `given` says whether they may also get into the journal. Returns the new ones.
     pub fn add<'a>(
         &mut self,
         changes: impl IntoIterator<Item = &'a Change>,
@@ -145,7 +144,7 @@ impl CutOff {
         };
         let mut calls = Vec::new();
         for change in changes {
-            // A state comes from a master, not from a node.
+            // A whole state comes from a master, not from a node.
             let Change::Call(record, _) = change else {
                 continue;
             };
@@ -153,7 +152,7 @@ impl CutOff {
                 continue;
             };
             let call = Request::from(call.clone());
-            // No more than the first ones are on their way at once.
+            // Only so many can be on their way at once.
             if given && time.expected < EXPECTED_MOST {
                 time.expected += 1;
                 time.changes.expect_record(record.seq, call.clone());
@@ -164,7 +163,7 @@ impl CutOff {
         calls
     }
 
-    /// The state at the beginning of the first time.
+    /// The state at the beginning of the oldest period.
     pub fn base(&self) -> Option<&Master> {
         self.times.front().map(|time| &time.base)
     }
@@ -179,17 +178,17 @@ impl CutOff {
         self.times.iter().map(|time| time.pending.len()).sum()
     }
 
-    /// The oldest time.
+    /// The oldest period.
     pub fn first_mut(&mut self) -> Option<&mut Time> {
         self.times.front_mut()
     }
 
-    /// The writes of the oldest time have reached the leader, or are lost and reported.
+    /// Drops the oldest period: its writes have reached the leader, or are lost and reported.
     pub fn sent(&mut self) {
         self.times.pop_front();
     }
 
-    /// What was answered this time is in the journal after all.
+    /// Drops the present period: its writes are in the journal after all.
     pub fn resumed(&mut self) {
         self.times.pop_back();
     }

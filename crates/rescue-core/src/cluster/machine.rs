@@ -1,8 +1,8 @@
-//! Decides who leads, what may be acknowledged, and when this computer is alone.
+//! Decides who leads, what may be acknowledged, and when this computer is cut off.
 //!
-//! A state machine without IO, as [`crate::lifecycle`] is: the shell passes in what happened and when, and
-//! carries out the returned actions. Every deadline is in here. All computers use their own clocks, and only
-//! to measure times: a clock may show anything, and may run up to a tenth too fast or too slow.
+//! A state machine without IO, like [`crate::lifecycle`]: the shell passes in what happened and when, and carries out
+//! the returned actions. All deadlines are decided here. Each computer uses its own clock, and only to measure
+//! durations. Clocks may differ, and may run up to a tenth too fast or too slow.
 
 use std::time::{Duration, Instant};
 
@@ -19,18 +19,18 @@ pub use types::{
     Action, Alive, Answer, Commit, Guard, Input, Leader, Op, Role, Settings, View, WhenAlone,
 };
 
-/// How long a request may take before it counts as [`Answer::Silence`]. Longer than a time to live: an etcd
-/// that takes 2 s for each answer still tells who leads.
+/// How long a request may take before it counts as [`Answer::Silence`]. It is longer than a time to live, because an
+/// etcd that needs 2 s per answer still shows who leads.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
-/// Pause before a request that was not answered is sent again.
+/// Pause before an unanswered request is sent again.
 const RETRY: Duration = Duration::from_millis(100);
-/// How often the leader writes `alive` within the time to live.
+/// How often the leader writes `alive` per time to live.
 const BEATS: u32 = 4;
-/// The part of the time to live by which a leader stops before another one may begin: a tenth each for a
-/// clock that is slow and one that is fast.
+/// A leader stops this part of the time to live (a fifth) before another may begin: a tenth for a slow clock, and a
+/// tenth for a fast one.
 const MARGIN: u32 = 5;
-/// How long after the time to live a next leader is waited for. A claim takes three delays of the network, but
-/// etcd may have to choose a leader of its own first: that takes up to 2.6 s from the death of the last one.
+/// How long after the time to live a computer waits for the next leader before it counts as cut off. A claim takes
+/// three network delays, but etcd may have to elect its own leader first, which takes up to 2.6 s.
 const PATIENCE: Duration = Duration::from_millis(1500);
 /// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
 const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
@@ -42,33 +42,33 @@ pub struct Machine {
     role: Role,
     view: View,
     started: Option<Instant>,
-    /// When this process went on, after it had stood still.
+    /// When this process continued after a pause.
     resumed: Option<Instant>,
-    /// When `view` was seen for the first time; another one that differs only in its own revision is no other.
+    /// When `view` was first seen. A view with another revision and the same keys counts as the same.
     observed: Option<Instant>,
-    /// When etcd was heard of last.
+    /// When etcd last answered.
     heard: Option<Instant>,
     reign: Option<Reign>,
     flight: Option<Flight>,
     retry_at: Option<Instant>,
     numbers: u64,
     claims: u64,
-    /// The mirror holds the journal up to here,
+    /// The last record of the journal that the mirror contains.
     followed: u64,
-    /// unless it has to be made anew.
+    /// Whether the mirror must be rebuilt from the journal.
     stale: bool,
     session: Session,
     recorded: u64,
     committed: u64,
     acknowledged: u64,
-    /// Whether the leader's rosrescue answers, and since when that is so.
+    /// Whether the leader's rosrescue answers, and since when.
     peer: Option<(bool, Instant)>,
     releasing: Option<String>,
     claim_not_before: Option<Instant>,
 }
 
 impl Machine {
-    /// A machine at rest; it starts with [`Input::Start`].
+    /// Creates a machine that does nothing until [`Input::Start`].
     pub fn new(settings: Settings) -> Self {
         Self {
             settings,
@@ -103,27 +103,27 @@ impl Machine {
         &self.settings
     }
 
-    /// When the leader's keys were seen in their present state for the first time.
+    /// When the leader's keys were first seen in their present state.
     pub fn observed(&self) -> Option<Instant> {
         self.observed
     }
 
-    /// When etcd was heard of last.
+    /// When etcd last answered.
     pub fn heard(&self) -> Option<Instant> {
         self.heard
     }
 
-    /// What is known of the leader.
+    /// The leader's keys as this computer knows them.
     pub fn view(&self) -> &View {
         &self.view
     }
 
-    /// What is known of the journal's session.
+    /// What is known about the journal's session.
     pub fn session(&self) -> Session {
         self.session
     }
 
-    /// The term in which this process leads.
+    /// The term in which this process leads, if it does.
     pub fn term(&self) -> Option<u64> {
         self.reign.map(|reign| reign.term)
     }
@@ -133,13 +133,13 @@ impl Machine {
         self.committed
     }
 
-    /// Whether nobody else can lead at `now`.
+    /// Whether no other computer can lead at `now`.
     pub fn is_sole(&self, now: Instant) -> bool {
         self.sole_until().is_some_and(|until| now < until)
     }
 
-    /// Until when this computer may act as the leader without asking again; in the past if it may not. None
-    /// while it is alone and serves: it does not claim to lead then.
+    /// Until when this computer may act as the leader without asking etcd again. In the past if it may not. `None`
+    /// while it is cut off and serves, because it does not claim to lead then.
     pub fn lease(&self, now: Instant) -> Option<Instant> {
         match self.role {
             _ if Mutant::ActsWithoutLease.lives() => None,
@@ -149,9 +149,9 @@ impl Machine {
         }
     }
 
-    /// Whether this computer may have a master of its own: only while nobody else can lead. A computer
-    /// that is alone has none. Its mirror answers, because a master would tell its nodes' state to nodes of the
-    /// others as soon as the network lets it.
+    /// Whether this computer may run a master: only while no other computer can lead. While it is cut off, its mirror
+    /// answers instead. A master would notify the other computers' nodes of its own state as soon as the network is
+    /// back.
     pub fn may_have_master(&self) -> bool {
         let unsafely = match self.role {
             Role::Leading => Mutant::ActsWithoutLease.lives(),
@@ -161,7 +161,7 @@ impl Machine {
         unsafely || self.role == Role::Leading && self.lapses_at().is_some()
     }
 
-    /// When another computer can lead at the earliest; none if one can.
+    /// The earliest time at which another computer can lead. `None` if one already can.
     fn lapses_at(&self) -> Option<Instant> {
         let reign = self.reign.filter(|reign| !reign.lapsed)?;
         Some(reign.sent? + self.settings.ttl)
@@ -172,7 +172,7 @@ impl Machine {
         Some(self.reign?.sent? + ttl - ttl / MARGIN)
     }
 
-    /// Takes an input at `now`. Returns the actions, in order.
+    /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
@@ -209,7 +209,7 @@ impl Machine {
         actions
     }
 
-    /// A request that never ends is one without an answer.
+    /// Counts a request that never ends as unanswered.
     fn give_up_request(&mut self, now: Instant) {
         let lost = self.flight.as_ref().filter(|flight| !flight.silent);
         let lost = lost.filter(|flight| flight.sent + ANSWER_LIMIT + RETRY <= now);
@@ -227,7 +227,7 @@ impl Machine {
         let view = match answer {
             Answer::Silence => {
                 self.retry_at = Some(now + RETRY);
-                // Its effect is unknown, so it is sent again. A claim shows in the keys.
+                // Its effect is unknown, so it is sent again. The keys show whether a claim succeeded.
                 self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
                     silent: true,
                     ..flight
@@ -243,7 +243,7 @@ impl Machine {
         self.flight.take_if(|flight| flight.number == number);
     }
 
-    /// The keys after `op` was made.
+    /// The keys after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
@@ -291,11 +291,11 @@ impl Machine {
         }
     }
 
-    /// etcd has lost its data, and shows `view`. Nothing of what was there counts.
+    /// Starts over with `view`, because etcd has lost its data.
     fn begin_anew(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
         self.flight = None;
         self.deposed(actions);
-        // What an old snapshot shows is no claim of this process.
+        // A claim in an old snapshot is not this process's claim.
         self.settings.id.push('+');
         (self.observed, self.heard) = (Some(now), Some(now));
         (self.peer, self.retry_at) = (None, None);
@@ -307,12 +307,12 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Claims nothing before `until`.
+    /// Does not claim leadership before `until`.
     pub fn hold_claims(&mut self, until: Instant) {
         self.claim_not_before = Some(until);
     }
 
-    /// etcd shows the keys.
+    /// Handles keys that etcd shows.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         self.heard = Some(now);
         if view.revision < self.view.revision {
@@ -329,7 +329,7 @@ impl Machine {
             self.session.see(alive, other && changed && !first);
         }
         if view.guard().leader != self.view.guard().leader {
-            // Nothing is known of the next leader's rosrescue.
+            // Nothing is known yet about the next leader's rosrescue.
             self.peer = None;
         }
         self.view = view;
@@ -356,7 +356,7 @@ impl Machine {
         }
     }
 
-    /// The beat in `flight` was made.
+    /// Handles the success of the beat in `flight`.
     fn beaten(&mut self, now: Instant, reign: Reign, flight: &Flight, actions: &mut Vec<Action>) {
         let Op::Beat {
             beat,
@@ -372,7 +372,7 @@ impl Machine {
             self.committed = self.view.seq();
         }
         if released.is_some() {
-            // A write may have come in between.
+            // Another write may have come in between.
             self.deposed(actions);
             actions.push(Action::Released);
             return;
@@ -394,7 +394,7 @@ impl Machine {
         }
     }
 
-    /// A claim of this process was made.
+    /// Handles the success of this process's claim.
     fn claimed(&mut self, term: u64, actions: &mut Vec<Action>) {
         let flight = self.flight.take();
         let claim = self.view.leader.as_ref().map_or(0, |leader| leader.claim);
@@ -424,7 +424,7 @@ impl Machine {
         !self.stale && self.followed >= self.view.seq()
     }
 
-    /// Another one leads, or could.
+    /// Gives up, because another computer leads or could lead.
     fn deposed(&mut self, actions: &mut Vec<Action>) {
         (self.reign, self.releasing) = (None, None);
         self.flight.take_if(|flight| flight.op != Op::Read);
@@ -440,7 +440,7 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Calls of this computer are in no journal.
+    /// Has the shell keep this computer's calls that are not in the journal.
     fn hand_back(&mut self, actions: &mut Vec<Action>) {
         let Self {
             committed,

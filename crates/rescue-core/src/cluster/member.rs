@@ -1,9 +1,9 @@
-//! Decides what one computer among several follows, adopts, answers, gives to the journal and merges, and when it
-//! may have a master. Pure.
+//! Decides what one computer of several does: whom it follows, what its mirror holds, which calls it answers, what it
+//! writes to the journal and merges, and when it may run a master. Pure.
 //!
-//! [`Machine`] decides who leads, and is a part of this. The shell passes in what happened and when, and carries
-//! out the returned actions in order. It decides nothing. The simulation in `cluster/tests` drives the same
-//! [`Member`].
+//! [`Machine`], a part of it, decides who leads. The shell passes in what happened and when, and carries out the
+//! returned actions in order. The shell decides nothing, so the simulation in `cluster/tests` tests what production
+//! decides.
 
 use std::{
     collections::VecDeque,
@@ -40,12 +40,12 @@ pub use self::{
     types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
 };
 
-/// Pause before etcd is asked again for what it did not give.
+/// Pause before a failed read of etcd is retried.
 const AGAIN: Duration = Duration::from_millis(200);
-/// It is best to know what was before one claims; but not for longer.
+/// How long a start waits for etcd's journal before this computer may claim leadership without it.
 const START_BY: Duration = Duration::from_secs(2);
 
-/// What the journal holds, as far as this computer knows.
+/// The journal, as far as this computer has read it.
 #[derive(Debug, Default)]
 struct Journal {
     state: Master,
@@ -54,7 +54,7 @@ struct Journal {
 }
 
 impl Journal {
-    /// Goes on by `records`.
+    /// Applies `records`, which follow the last known one.
     fn go_on(&mut self, now: Instant, records: &[Record]) {
         for record in records {
             if let JournalEntry::Call { call, .. } = &record.entry {
@@ -66,7 +66,7 @@ impl Journal {
     }
 }
 
-/// The leader's rosrescue is asked, now and then.
+/// The probes of the leader's rosrescue.
 #[derive(Debug, Default)]
 struct Probing {
     number: u64,
@@ -74,42 +74,42 @@ struct Probing {
     at: Option<Instant>,
 }
 
-/// Who led before, and how that ended.
+/// The previous leader, and how its leadership ended.
 #[derive(Debug, Default)]
 struct Before {
     leader: Option<(String, Instant)>,
     released: bool,
 }
 
-/// Another computer of this name.
+/// Evidence of another computer with this one's name.
 #[derive(Debug, Default)]
 struct Namesake {
-    /// The entry among the members is another one's.
+    /// Set if the member entry of this name belongs to another computer.
     sign: Option<Sign>,
-    /// Looks for one since etcd has been read.
+    /// Looks for such a computer. Set once etcd has been read.
     watch: Option<namesake::Watch>,
-    /// This process has claimed with success.
+    /// Whether this process has led.
     led: bool,
 }
 
-/// See the [module](self).
+/// The state machine of one computer; see the [module](self).
 #[derive(Debug)]
 pub struct Member {
     keys: Keys,
     machine: Machine,
-    /// As the shell was told last.
+    /// The role that the shell was told last.
     role: Role,
     standing: Standing,
     has_master: bool,
     own: Own,
-    /// The ledger's state wins over the journal's if this computer leads next.
+    /// Whether this computer, if it leads next, keeps its ledger's state instead of the journal's.
     own_wins: bool,
     lost: Lost,
     journal: Journal,
     reading: Reading,
     place: Place,
     outgoing: Outgoing,
-    /// The last record that was answered, in this time that calls are recorded here.
+    /// The last record whose call was answered, since calls began to be recorded here.
     acknowledged: u64,
     cut_off: CutOff,
     merging: Merging,
@@ -122,18 +122,18 @@ pub struct Member {
     queue: Queue,
 }
 
-/// What is to be taken next, and what is to be done.
+/// Inputs for the machine and actions for the shell, in order.
 #[derive(Debug, Default)]
 struct Queue {
     inputs: VecDeque<machine::Input>,
     actions: Vec<Action>,
-    /// When the machine is started, even if etcd has not been read.
+    /// When the machine starts even if etcd has not been read. `None` once it has started.
     start_by: Option<Instant>,
 }
 
 impl Member {
-    /// One that has not begun. `left`: what an earlier process has answered alone. `id`: a name for what is sent
-    /// of it to a leader, which nobody else uses.
+    /// Creates a member that waits for [`Input::Begin`]. `left` holds the writes that an earlier process answered while
+    /// it was cut off. `id` is the unique name under which such writes are sent to a leader.
     pub fn new(settings: Settings, keys: Keys, own: Own, left: CutOff, id: String) -> Self {
         let known = own.restored;
         Self {
@@ -162,7 +162,7 @@ impl Member {
         }
     }
 
-    /// Takes an input at `now`. Returns the actions, in order.
+    /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         self.hear(input.heard());
         match input {
@@ -223,7 +223,7 @@ impl Member {
         .min()
     }
 
-    /// What it is that decides who leads.
+    /// The part that decides who leads.
     pub fn machine(&self) -> &Machine {
         &self.machine
     }
@@ -237,7 +237,7 @@ impl Member {
         self.machine.settings()
     }
 
-    /// What etcd showed last of the leader.
+    /// The leader's keys as etcd showed them last.
     pub fn view(&self) -> &View {
         let (seen, known) = (self.reading.view(), self.machine.view());
         match seen.revision > known.revision {
@@ -251,27 +251,27 @@ impl Member {
         &self.standing
     }
 
-    /// How far the mirror holds the journal.
+    /// The place in the journal up to which the mirror is current.
     pub fn place(&self) -> Place {
         self.place
     }
 
-    /// The journal's last record that has been read.
+    /// The number of the last record that was read from the journal.
     pub fn seq(&self) -> u64 {
         self.journal.progress.seq
     }
 
-    /// Since when it is known that etcd has lost its data, until a computer leads again.
+    /// When this computer noticed that etcd has lost its data. `None` once a computer leads again.
     pub fn etcd_lost(&self) -> Option<Instant> {
         self.lost.since()
     }
 
-    /// The leader before has given up by itself.
+    /// Whether the previous leader gave up leadership by itself.
     pub fn was_released(&self) -> bool {
         self.before.released
     }
 
-    /// How many writes etcd does not have yet.
+    /// The number of writes that are not in etcd yet.
     pub fn uncommitted(&self) -> usize {
         match self.keeps() {
             true => self.cut_off.len(),
@@ -279,13 +279,13 @@ impl Member {
         }
     }
 
-    /// What was answered alone, and has not reached a leader: the state before, and the writes.
+    /// The writes answered while cut off that have not reached a leader, with the state before them.
     pub fn kept(&self) -> Option<(&Master, Vec<Request>)> {
         let base = self.cut_off.base()?;
         Some((base, self.cut_off.calls().cloned().collect()))
     }
 
-    /// What this computer says of itself.
+    /// This computer's entry among the members.
     pub fn says(&self) -> Said {
         let settings = self.settings();
         Said {
@@ -313,7 +313,7 @@ impl Member {
     /// Passes an input to the machine, and does what it decides.
     fn drive(&mut self, now: Instant, input: machine::Input) {
         let actions = self.machine.on(now, input);
-        // First: the next request does not take them once more.
+        // First, so that the next request does not send them again.
         for change in self.outgoing.committed(self.machine.committed()) {
             self.hold(now, change);
         }
@@ -335,28 +335,28 @@ impl Member {
         }
     }
 
-    /// Whether this computer's calls are recorded here: it leads, or it is alone and serves.
+    /// Whether calls are recorded on this computer: it leads, or it is cut off and serves.
     fn records(&self) -> bool {
         self.standing.records()
     }
 
-    /// Whether the ledger holds what the journal does.
+    /// Whether the ledger's state is the journal's.
     fn follows(&self) -> bool {
         self.reading.loaded && !self.own_wins && !self.records()
     }
 
-    /// Whether the mirror's answers hold: its state is not that of a session which may be over.
+    /// Whether the mirror may answer: its state is that of the session which continues.
     fn knows(&self) -> bool {
         self.own.restored
             || self.reading.loaded && self.machine.session() == machine::Session::GoesOn
     }
 
-    /// Whether what is answered now is kept for the leader.
+    /// Whether writes answered now are kept for a later leader.
     fn keeps(&self) -> bool {
         self.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
-    /// What follows from all that has happened.
+    /// Updates everything that depends on several parts.
     fn tend(&mut self, now: Instant) {
         self.tend_lost(now);
         self.tend_master();

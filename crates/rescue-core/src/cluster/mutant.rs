@@ -1,31 +1,31 @@
-//! Defects that were found in the field, to be put back one at a time: the simulation must find each.
+//! Defects found in the field. A test puts each back, and the simulation must find it.
 
-/// What is done wrong, as before.
+/// A defect that the product had.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mutant {
-    /// A former leader believes its own disk, although etcd's journal holds more.
+    /// A former leader trusts its own disk although etcd's journal holds more.
     OwnDiskWins,
-    /// A leader that stood still acts before it knows whether it leads, and one that is silent keeps its master.
+    /// A leader that was paused acts before it knows whether it still leads, and a silent one keeps its master.
     ActsWithoutLease,
-    /// A computer that is alone runs a master, which notifies nodes everywhere.
+    /// A computer that is cut off runs a master, which notifies nodes on other computers.
     MasterWhileAlone,
-    /// A follower's mirror answers, whatever its age.
+    /// A follower's mirror answers although it is out of date.
     StaleReads,
-    /// Two states are compared: what others have set and set back is no change.
+    /// A merge compares two states, so a value that others changed and changed back counts as unchanged.
     MergesByState,
-    /// What equals an own write is no change of others.
+    /// A value that equals this computer's own write never counts as another computer's change.
     GuessesByValues,
-    /// What was answered alone is judged once, and then sent whatever others write meanwhile.
+    /// Writes made while cut off are judged once, and then sent whatever others write meanwhile.
     JudgesOnce,
-    /// A leader that is cut off keeps calls that others have forwarded to it.
+    /// A leader that is cut off keeps calls that other computers forwarded to it.
     KeepsForwarded,
-    /// Each write of a time alone is kept.
+    /// Every write made while cut off is kept, instead of the last one of each subject.
     KeepsEachWrite,
     /// An etcd that has lost its data is not recognised.
     TrustsLostEtcd,
     /// Two computers of one name do not notice each other.
     IgnoresNamesake,
-    /// A request that never ends is waited for.
+    /// A request that never ends blocks the machine forever.
     WaitsForEver,
 }
 
@@ -46,7 +46,7 @@ impl Mutant {
         false
     }
 
-    /// Puts a defect into this thread, or takes it out.
+    /// Sets this thread's defect.
     #[cfg(test)]
     pub(crate) fn put(mutant: Option<Self>) {
         PRESENT.set(mutant);

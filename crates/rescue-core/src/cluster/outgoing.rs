@@ -1,4 +1,4 @@
-//! Changes of this computer that are not known to be in the journal. Pure.
+//! Changes of this computer that may not be in the journal yet. Pure.
 
 use std::{collections::VecDeque, ops::RangeInclusive};
 
@@ -12,25 +12,25 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// So many may be on their way at once.
+/// How many changes may be on their way at once.
 const FIRST: usize = journal::BATCH_RECORDS;
-/// Most bytes of those behind them while this computer is alone, about.
+/// The approximate size limit of the changes behind them while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
 
-/// In the order of their numbers.
+/// The changes, in the order of their numbers.
 #[derive(Debug, Default)]
 pub struct Outgoing {
     changes: VecDeque<Change>,
-    /// The last one that may be given to the journal,
+    /// The last change that may be written to the journal.
     ready: u64,
-    /// and the last one of which all parts are in etcd.
+    /// The last change whose parts are all in etcd.
     written: u64,
-    /// The parts of the one after that are being written.
+    /// Whether the parts of the next change are being written.
     pub preparing: bool,
 }
 
 impl Outgoing {
-    /// Nothing is left of earlier changes; the next one has a number after `seq`.
+    /// Starts over. The next change has a number after `seq`.
     pub fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
@@ -52,7 +52,7 @@ impl Outgoing {
         self.changes.iter()
     }
 
-    /// Makes the changes with these numbers in `state`.
+    /// Applies the changes with these numbers to `state`.
     pub fn apply(&self, seqs: RangeInclusive<u64>, state: &mut Master) {
         for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
             match change {
@@ -66,18 +66,18 @@ impl Outgoing {
         }
     }
 
-    /// Drops all: nobody is given them.
+    /// Drops all changes.
     pub fn forget(&mut self) {
         self.changes.clear();
     }
 
-    /// Whether so many have piled up that a state is to take the place of the later ones.
+    /// Whether so many changes have piled up that one state should replace the later ones.
     pub fn has_outgrown(&self) -> bool {
         let later = self.changes.iter().skip(FIRST);
         self.changes.len() > 2 * FIRST || later.map(weight_of).sum::<usize>() > BYTES_MOST
     }
 
-    /// Replaces all but the first ones, which may be on their way, by the state `rest`.
+    /// Replaces all changes but the first ones, which may be on their way, by the state `rest`.
     pub fn replace_rest(&mut self, rest: Option<Change>) {
         if let Some(rest) = rest {
             self.changes.truncate(FIRST);
@@ -85,18 +85,18 @@ impl Outgoing {
         }
     }
 
-    /// The last one that is ready.
+    /// The number of the last change that is ready to be written.
     pub fn ready(&self) -> u64 {
         self.ready
     }
 
-    /// All are ready: this computer is alone, and nobody is given them now.
+    /// Marks all changes as ready, because this computer is cut off and writes none of them now.
     pub fn all_ready(&mut self) {
         self.preparing = false;
         self.ready = self.changes.back().map_or(self.ready, Change::seq);
     }
 
-    /// Those that need no parts are ready, up to the first one that does. Returns its parts.
+    /// Marks changes as ready up to the first one that needs parts, and returns its parts.
     pub fn prepare(&mut self, keys: &Keys) -> Result<Option<Vec<Put>>, JournalError> {
         if self.preparing {
             return Ok(None);
@@ -115,14 +115,14 @@ impl Outgoing {
         Ok(None)
     }
 
-    /// The parts of the next one have been written.
+    /// Notes that the parts of the next change have been written.
     pub fn prepared(&mut self) {
         let next = self.changes.iter().find(|of| of.seq() > self.ready);
         self.ready = next.map_or(self.ready, Change::seq);
         self.written = self.ready;
     }
 
-    /// The next one cannot be written: a call that changes nothing takes its number.
+    /// Replaces the next change, which cannot be written, by a call that changes nothing.
     pub fn leave_out_next(&mut self) {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
@@ -131,14 +131,14 @@ impl Outgoing {
         }
     }
 
-    /// The parts of the next beat's entry that are not in etcd: it was made while this computer was alone.
+    /// The parts of the next beat's entry that are not in etcd, because it was made while this computer was cut off.
     pub fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
         let first = self.changes.front().filter(|of| of.seq() > self.written);
         let parts = first.map(|change| parts(keys, change));
         parts.and_then(Result::ok).unwrap_or_default()
     }
 
-    /// What the next beat adds to the journal, up to `seq`.
+    /// The journal entry of the next beat, up to `seq`.
     pub fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
         if let Some(first @ Change::State { .. }) =
             self.changes.front().filter(|of| of.seq() <= seq)
@@ -152,13 +152,13 @@ impl Outgoing {
         Ok(journal::pack(keys, &records.collect::<Vec<_>>())?.entry)
     }
 
-    /// Takes out all.
+    /// Removes and returns all changes.
     pub fn take_all(&mut self) -> Vec<Change> {
         self.preparing = false;
         self.changes.drain(..).collect()
     }
 
-    /// Takes out those that are in the journal, up to `seq`.
+    /// Removes and returns the changes up to `seq`, which are in the journal.
     pub fn committed(&mut self, seq: u64) -> Vec<Change> {
         let count = self.changes.iter().take_while(|of| of.seq() <= seq).count();
         self.ready = self.ready.max(seq);
@@ -174,7 +174,7 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
     }
 }
 
-/// About how many bytes a change takes.
+/// The approximate size of a change in bytes.
 fn weight_of(change: &Change) -> usize {
     match change {
         Change::Call(record, _) => match &record.entry {

@@ -1,4 +1,4 @@
-//! What a computer that has the master gives to the others, and who has changed what lately. Pure.
+//! Records the changes that other computers must get, and who changed what recently. Pure.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -11,34 +11,34 @@ use crate::{
     master::{Master, Request},
 };
 
-/// Most changes that are remembered for computers that were alone.
+/// How many changes are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
-/// And their most bytes, about.
+/// The approximate limit of their size, in bytes.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
-/// Where a call that is recorded comes from.
+/// The source of a recorded call.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Source {
     /// A node of this computer, or rosrescue itself.
     #[default]
     Here,
-    /// Another computer, which makes it again elsewhere if it gets no answer.
+    /// Another computer, which repeats the call elsewhere if it gets no answer.
     Forwarded,
-    /// A computer that was alone sends what was answered there, all under this name.
+    /// A computer that was cut off and now sends its writes under this name.
     Merge(Arc<str>),
 }
 
-/// What was changed lately, the oldest first.
+/// The latest changes, oldest first.
 #[derive(Debug, Default)]
 struct Recent {
-    /// All changes after this record are here.
+    /// The list is complete after this record.
     after: u64,
     changes: VecDeque<(u64, Source, Vec<Subject>)>,
     bytes: usize,
 }
 
 impl Recent {
-    /// All changes after record `seq` will be here.
+    /// Creates a list that is complete after record `seq`.
     fn from(seq: u64) -> Self {
         Self {
             after: seq,
@@ -58,7 +58,7 @@ impl Recent {
         }
     }
 
-    /// What was changed after record `seq`, and not by `merge`. None if that is not known any more.
+    /// The changes after record `seq` that `merge` did not make. `None` if the list does not reach back so far.
     fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
         if seq < self.after {
             return None;
@@ -78,7 +78,7 @@ fn bytes_of(subjects: &[Subject]) -> usize {
     subjects.iter().map(Subject::size).sum()
 }
 
-/// A change to be given to the other computers.
+/// A change that the other computers must get.
 #[derive(Clone, Debug)]
 pub enum Change {
     Call(Record, Source),
@@ -90,7 +90,7 @@ pub enum Change {
 }
 
 impl Change {
-    /// Its number in the journal of all computers.
+    /// Its number in the journal.
     pub fn seq(&self) -> u64 {
         match self {
             Self::Call(record, _) => record.seq,
@@ -99,8 +99,7 @@ impl Change {
     }
 }
 
-/// What a computer records while it has the master, or answers alone, with numbers of the journal of all
-/// computers.
+/// The changes that a computer records while it leads or is cut off, numbered as in the journal.
 #[derive(Debug)]
 pub struct Sharing {
     /// The number of the last record.
@@ -110,7 +109,7 @@ pub struct Sharing {
 }
 
 impl Sharing {
-    /// The first record has a number after `seq`.
+    /// Creates one whose first record comes after `seq`.
     pub fn after(seq: u64) -> Self {
         Self {
             last: seq,
@@ -124,7 +123,7 @@ impl Sharing {
         self.last
     }
 
-    /// A call of `source` was recorded. One that cannot be written is left out, as in the checkpoint.
+    /// Records a call from `source`. A call that cannot be encoded is left out, as in the checkpoint.
     pub fn record(&mut self, call: &Request, source: &Source) {
         let record = Record {
             seq: self.last + 1,
@@ -137,7 +136,7 @@ impl Sharing {
         }
     }
 
-    /// The state has changed otherwise than by calls, to `mirror`.
+    /// Records that the state was replaced by `mirror`.
     pub fn record_state(&mut self, mirror: &Master) {
         self.last += 1;
         // Anything may have changed.
@@ -146,21 +145,21 @@ impl Sharing {
         self.changes.push(Change::State { seq, state });
     }
 
-    /// What is to be given to the others, once.
+    /// Returns the recorded changes, each once.
     pub fn take(&mut self) -> Vec<Change> {
         std::mem::take(&mut self.changes)
     }
 
-    /// The same as one change: the state that they have led to, which is `mirror`.
+    /// Returns the recorded changes as one: their result, which is `mirror`.
     pub fn take_as_state(&mut self, mirror: &Master) -> Change {
         self.changes.clear();
         let (seq, state) = (self.last, Box::new(mirror.clone()));
         Change::State { seq, state }
     }
 
-    /// What becomes of `calls`, which a computer has answered while it was alone, if they are made now, in the
-    /// state `mirror`. It sends them under the name `merge`, and knows what others have changed up to record
-    /// `seq`. None if the changes after that are not known any more.
+    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. It sends them under the
+    /// name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the changes after that
+    /// record are no longer known.
     pub fn judge(
         &self,
         mirror: &Master,
@@ -192,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_changed_long_ago_is_not_known_any_more() {
+    fn old_changes_are_forgotten() {
         let mut recent = Recent::from(3);
         for seq in 4..=u64::try_from(RECENT_MOST).unwrap() + 13 {
             recent.add(seq, &Source::Here, &set_of("/a", 1));

@@ -1,4 +1,4 @@
-//! What is due, and when.
+//! The deadlines of the machine, and what it does at them.
 
 use std::time::{Duration, Instant};
 
@@ -20,7 +20,7 @@ impl Machine {
             .min()
     }
 
-    /// What is due at `now`.
+    /// Does what is due at `now`.
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()
@@ -127,7 +127,7 @@ impl Machine {
         })
     }
 
-    /// How long after it was seen in its present state leading is open to this computer.
+    /// How long after the keys were first seen in their present state this computer may claim.
     fn vacant_after(&self) -> Duration {
         let own = &self.settings;
         let Settings { name, id, ttl, .. } = own;
@@ -140,11 +140,11 @@ impl Machine {
             .as_ref()
             .and_then(|alive| alive.released.as_ref());
         match released {
-            // It has just given up itself.
+            // It has just given up leadership itself.
             _ if leader.id == *id => *ttl,
             Some(to) if to.is_empty() || to == name => Duration::ZERO,
             Some(_) => *ttl / BEATS,
-            // An earlier process on this computer. It cannot live: there is one at a time.
+            // An earlier process of this computer. It is dead, because only one runs at a time.
             None if own.is_of_this_computer(&leader.name, &leader.uri, &leader.boot) => {
                 Duration::ZERO
             }
@@ -152,7 +152,7 @@ impl Machine {
         }
     }
 
-    /// When this computer is alone, unless it hears of etcd or of the leader.
+    /// When this computer counts as cut off, unless etcd or the leader answers before.
     fn alone_at(&self) -> Option<Instant> {
         let patience = self.settings.ttl + PATIENCE;
         let silent = self.heard.or(self.started)? + patience;
@@ -163,11 +163,11 @@ impl Machine {
                 Some((false, since)) => Some(silent.min(since + patience)),
                 None => Some(silent),
             },
-            // Until then nothing is acknowledged that is not committed, unless nobody else can lead.
+            // Until then, only committed writes are acknowledged, unless no other computer can lead.
             Role::Leading => Some(self.reign?.sent? + patience),
             Role::Alone => None,
         };
-        // What happened while this process stood still is not known: etcd is asked first.
+        // After a pause of this process, etcd is asked first what has happened meanwhile.
         Some(at?.max(self.resumed.map_or(at?, |resumed| resumed + PATIENCE)))
     }
 }

@@ -1,13 +1,13 @@
-//! Work beside the calls: this computer's own entry among the members, snapshots, and etcd's compaction.
+//! Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
 
 use std::time::{Duration, Instant};
 
 use super::{Action, Member};
 use crate::cluster::{journal::Progress, machine::Role};
 
-/// How often a computer says how it is.
+/// How often a computer updates its entry among the members.
 pub const SAYS_EVERY: Duration = Duration::from_secs(5);
-/// How often the leader has etcd forget what is older than this.
+/// How often the leader compacts etcd, and the age from which revisions are dropped.
 const FORGET: Duration = Duration::from_secs(300);
 /// Pause after a snapshot that could not be written.
 const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
@@ -16,11 +16,11 @@ const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 pub(super) struct Chores {
     /// When to write this computer's entry among the members.
     say_at: Option<Instant>,
-    /// A snapshot is being written.
+    /// Whether a snapshot is being written.
     snapshot: bool,
-    /// One has failed: none before this moment.
+    /// After a failed snapshot, when the next one may begin.
     snapshot_at: Option<Instant>,
-    /// The revision of etcd at the last look, and when to have it forget what is older.
+    /// The revision up to which to compact etcd, and when.
     forget: Option<(Instant, u64)>,
 }
 
@@ -30,16 +30,16 @@ impl Chores {
         [self.say_at, forget].into_iter().flatten().min()
     }
 
-    /// Brings this computer's entry among the members up to date at `now`.
+    /// Has this computer's entry among the members updated at `now`.
     pub(super) fn say_at(&mut self, now: Instant) {
         self.say_at = Some(now);
     }
 }
 
 impl Member {
-    /// Begins what is due.
+    /// Starts the work that is due.
     pub(super) fn tend_chores(&mut self, now: Instant) {
-        // It would hide the entry of another computer with this name.
+        // Earlier, it would overwrite the entry of another computer with this name.
         let watch = self.namesake.watch.as_ref();
         let may_say = watch.is_some_and(|of| of.is_over(now));
         if self.chores.say_at.is_none_or(|at| at <= now) {

@@ -1,4 +1,4 @@
-//! Reads the journal, and brings the ledger there while another computer leads.
+//! Reads the journal, and keeps the ledger current while another computer leads.
 
 use std::time::Instant;
 
@@ -13,41 +13,41 @@ use crate::{
     },
 };
 
-/// What is read of etcd, and what is not.
+/// How far etcd has been read, and what must be read next.
 #[derive(Debug, Default)]
 pub(super) struct Reading {
     /// Whether the journal has been read once.
     pub(super) loaded: bool,
-    /// The machine waits for the journal up to here.
+    /// The record up to which the machine waits for the journal.
     pub(super) wanted: Option<u64>,
-    /// How far the machine knows that it has been read.
+    /// The last record whose reading was reported to the machine.
     reported: u64,
-    /// It is being read,
+    /// Whether a read is under way.
     loading: bool,
-    /// by a read that began when this revision was known,
+    /// The newest revision that was known when that read began.
     floor: u64,
-    /// or will be.
+    /// When the next read is due.
     load_at: Option<Instant>,
-    /// Who wants what etcd holds now waits for so many readings to end.
+    /// How many reads must end before the journal is as fresh as [`Self::refresh`] asked.
     fresh: Option<u8>,
     watching: bool,
-    /// Both keys, as etcd has shown them last. The machine is shown nothing before it is started.
+    /// The leader's keys as etcd showed them last, also before the machine starts.
     view: View,
 }
 
 impl Reading {
-    /// The journal is read at `at` at the latest.
+    /// Makes the next read due at `at` at the latest.
     pub(super) fn load_by(&mut self, at: Instant) {
         self.load_at = Some(self.load_at.map_or(at, |before| before.min(at)));
     }
 
-    /// The journal is to be read to a moment after `now`. What the watch has told may be of long before.
+    /// Asks for a read that begins after `now`. What the watch delivers may be much older.
     pub(super) fn refresh(&mut self, now: Instant) {
         self.fresh = Some(1 + u8::from(self.loading));
         self.load_by(now);
     }
 
-    /// Whether what [`Self::refresh`] asked for is there.
+    /// Whether the read that [`Self::refresh`] asked for has ended.
     pub(super) fn is_fresh(&self) -> bool {
         self.fresh == Some(0)
     }
@@ -56,13 +56,13 @@ impl Reading {
         self.load_at.filter(|_| !self.loading)
     }
 
-    /// The watch has ended.
+    /// Handles the end of the watch.
     pub(super) fn ended(&mut self, now: Instant) {
         self.watching = false;
         self.load_at = Some(now + AGAIN);
     }
 
-    /// etcd shows `view`, and has lost what it held before.
+    /// Starts over with `view`, because etcd has lost its data.
     pub(super) fn forget(&mut self, view: &View) {
         (self.wanted, self.reported) = (None, 0);
         (self.watching, self.view) = (false, view.clone());
@@ -74,7 +74,7 @@ impl Reading {
 }
 
 impl Member {
-    /// Has the journal read if it is not known as far as it must be.
+    /// Reads the journal if it is needed further than it is known.
     pub(super) fn catch_up(&mut self, now: Instant) {
         let seq = self.journal.progress.seq;
         let wanted = self.reading.wanted;
@@ -97,7 +97,7 @@ impl Member {
         }
     }
 
-    /// Has it found out whether the session in etcd goes on, if the machine waits for that.
+    /// Finds out whether the session in etcd continues, if the machine waits for that.
     fn decide(&mut self, seq: u64) {
         let waits = self.machine.role() == Role::CatchingUp
             && self.machine.session() == Session::Unknown
@@ -114,9 +114,9 @@ impl Member {
         self.act(Action::Decide { seq, state, closed });
     }
 
-    /// The watch shows both keys, and entries of the journal.
+    /// Handles keys and journal entries from the watch.
     pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
-        // First: what this computer has answered in vain was before what others have changed.
+        // First, because writes that this computer answered and lost came before the others' changes.
         self.see(now, view);
         for entry in entries {
             let new = match entry {
@@ -128,7 +128,7 @@ impl Member {
             };
             match new {
                 Some(new) => self.follow(now, &new),
-                // What does not follow is read apart, too.
+                // A gap is filled by a separate read.
                 None => {
                     self.reading.load_by(now);
                     break;
@@ -138,7 +138,7 @@ impl Member {
         self.yield_to_others();
     }
 
-    /// Shows the machine both keys.
+    /// Shows the leader's keys to the machine.
     fn see(&mut self, now: Instant, view: View) {
         if view.revision >= self.reading.view.revision {
             self.reading.view = view.clone();
@@ -147,7 +147,8 @@ impl Member {
         self.drive(now, machine::Input::View(view));
     }
 
-    /// The journal wins if another computer leads. Where etcd has lost its data, that one's state has to be there.
+    /// Gives up this computer's own state if another computer leads. After etcd has lost its data, that computer's state
+    /// must be in the journal first.
     fn yield_to_others(&mut self) {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
@@ -158,7 +159,7 @@ impl Member {
         }
     }
 
-    /// New records of the journal.
+    /// Applies new records of the journal.
     fn follow(&mut self, now: Instant, records: &[Record]) {
         if records.is_empty() {
             return;
@@ -172,12 +173,12 @@ impl Member {
         }
     }
 
-    /// Brings the ledger to the journal's state, if it follows it, with what was answered alone and is not there yet:
-    /// who wrote that is to see it.
+    /// Sets the ledger, if it follows the journal, to the journal's state plus the writes that were answered here and are
+    /// not in the journal yet. Callers must see their own writes.
     pub(super) fn adopt(&mut self) {
         if self.follows() {
             let mut state = self.cut_off.on(&self.journal.state);
-            // As a leader that may answer nothing more, and does not know yet whether another one leads.
+            // The same for writes answered as a leader, as long as it is unknown whether another computer leads.
             let (held, answered) = (self.journal.progress.seq, self.acknowledged);
             self.outgoing.apply(held + 1..=answered, &mut state);
             self.act(Action::FollowState(state));
@@ -190,7 +191,7 @@ impl Member {
             self.reading.load_at = Some(now + AGAIN);
             return;
         };
-        // The term of a checkpoint is a revision, too.
+        // The term in a checkpoint is a revision of etcd, too.
         let floor = match self.reading.loaded {
             true => self.reading.floor,
             false => self.reading.floor.max(self.own.term),
@@ -208,7 +209,7 @@ impl Member {
             if self.namesake.watch.is_none() {
                 self.begin_watch_for_namesake(now, &read.view);
             }
-            // etcd's journal is the truth. Our checkpoint may only hold more of it, written in the same term.
+            // etcd's journal is the truth. The checkpoint counts only if it continues that journal in the same term.
             let leader = read.view.leader.as_ref();
             let whole = self.own.seq >= read.view.seq() || Mutant::OwnDiskWins.lives();
             let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
@@ -221,7 +222,7 @@ impl Member {
             && read.progress.seq >= journal.progress.seq
         {
             let before = std::mem::replace(&mut journal.state, state);
-            // In a new journal the first state is that of the computer that held most.
+            // The first state of a new journal comes from the computer that held the most.
             let before = match self.own_wins {
                 true => &self.own.state,
                 false => &before,
@@ -236,7 +237,7 @@ impl Member {
             self.adopt();
         } else if let Ok(new) = journal.progress.take(read.records, 0) {
             match first {
-                // The ledger may hold something else.
+                // The ledger's state may differ.
                 true => {
                     self.journal.go_on(now, &new);
                     self.adopt();
@@ -268,13 +269,13 @@ impl Member {
         }
     }
 
-    /// Whether an earlier process of this computer leads, and nobody has since the checkpoint was written.
+    /// Whether `leader` is an earlier process of this computer, and still in the term of the checkpoint.
     fn was_self(&self, leader: &Leader) -> bool {
         let own = self.settings();
         leader.id != own.id && leader.name == own.name && leader.term == self.own.term
     }
 
-    /// How far the mirror holds the journal.
+    /// Updates the place up to which the mirror is current.
     pub(super) fn look_at_place(&mut self) {
         let seq = self.journal.progress.seq;
         // What only the checkpoint holds is lost if another computer leads next, and what is owed is not in it.
@@ -283,7 +284,7 @@ impl Member {
             return;
         }
         let view = self.view();
-        // The whole journal up to this leader's first record, at least.
+        // At least the whole journal before this leader's first record.
         let whole = self.reading.loaded && seq >= view.seq();
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.place.term, |leader| leader.term);
@@ -291,7 +292,7 @@ impl Member {
         self.place = Place { epoch, term, seq };
     }
 
-    /// Takes what computers say of themselves.
+    /// Handles entries of members.
     pub(super) fn hear(&mut self, heard: &[Heard]) {
         let own = self.machine.settings();
         for heard in heard.iter().filter(|heard| heard.name == own.name) {
@@ -302,7 +303,7 @@ impl Member {
         }
     }
 
-    /// Holds the start back if another computer may have this one's name.
+    /// Delays the start if another computer may have this one's name.
     fn begin_watch_for_namesake(&mut self, now: Instant, view: &View) {
         let signs = self.signs_of_namesake(view);
         let watch = namesake::Watch::new(now, self.settings().ttl, signs);
@@ -314,7 +315,7 @@ impl Member {
         self.namesake.watch = Some(watch);
     }
 
-    /// Notices another living computer of this name, best before this one takes part.
+    /// Ends this member if another living computer has its name.
     pub(super) fn look_for_namesake(&mut self, now: Instant) {
         let view = self.view();
         let signs = self.signs_of_namesake(view);
@@ -323,7 +324,7 @@ impl Member {
         let mut there = living.map(|sign| sign.uri.clone());
         if let Some(leader) = &view.leader {
             let own = self.machine.settings();
-            // There is one process at a time on a computer, so that one is another computer's.
+            // Only one process runs on a computer at a time, so this leader is another computer.
             if leader.id == own.id {
                 self.namesake.led = true;
             } else if self.namesake.led && leader.name == own.name {
@@ -335,7 +336,7 @@ impl Member {
         }
     }
 
-    /// What etcd shows of another computer with this one's name.
+    /// The evidence in etcd of another computer with this one's name.
     fn signs_of_namesake(&self, view: &View) -> Vec<Sign> {
         let leader = namesake::sign_of_leader(self.settings(), view);
         let member = self.namesake.sign.clone();

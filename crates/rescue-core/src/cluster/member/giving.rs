@@ -1,4 +1,4 @@
-//! Gives what this computer records to the journal, and keeps what was answered alone.
+//! Writes recorded changes to the journal, and keeps the writes that were answered while cut off.
 
 use std::time::Instant;
 
@@ -12,7 +12,7 @@ use crate::{
 };
 
 impl Member {
-    /// A request of the machine.
+    /// Carries out a request of the machine.
     pub(super) fn send(&mut self, number: u64, op: Op) {
         let term = self.machine.term().unwrap_or_default();
         let entry = match &op {
@@ -40,7 +40,7 @@ impl Member {
         });
     }
 
-    /// The ledger has recorded these.
+    /// Handles changes that the ledger has recorded.
     pub(super) fn recorded(&mut self, changes: Vec<Change>) {
         if !self.records() {
             return;
@@ -57,7 +57,7 @@ impl Member {
             return self.prepare();
         }
         self.outgoing.all_ready();
-        // Without a term nobody is given them: the leader gets what is kept.
+        // Without a term they never go to the journal. A later leader gets the kept writes instead.
         match leads_on {
             false => self.outgoing.forget(),
             true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),
@@ -66,7 +66,7 @@ impl Member {
         self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
     }
 
-    /// What has piled up, as one state.
+    /// Replaces the changes that have piled up by one state.
     pub(super) fn recorded_as_state(&mut self, state: Option<Change>) {
         if self.records() && self.outgoing.has_outgrown() {
             self.outgoing.replace_rest(state);
@@ -107,11 +107,11 @@ impl Member {
         if leads == Some(true) {
             self.outgoing.prepared();
         }
-        // If another one leads, the keys show it.
+        // If another computer leads, its keys will show that.
         self.prepare();
     }
 
-    /// A change is in the journal.
+    /// Notes that a change is in the journal.
     pub(super) fn hold(&mut self, now: Instant, change: Change) {
         let journal = &mut self.journal;
         if change.seq() <= journal.progress.seq {
@@ -132,8 +132,7 @@ impl Member {
         }
     }
 
-    /// Calls of this computer after record `committed` are in no journal, and were answered up to
-    /// `acknowledged`.
+    /// Keeps the writes after record `committed` up to `acknowledged`: they were answered but are not in the journal.
     pub(super) fn give_back(&mut self, committed: u64, acknowledged: u64) {
         let changes = self.outgoing.take_all();
         if self.keeps() {
@@ -149,7 +148,7 @@ impl Member {
         }
     }
 
-    /// Keeps all that is owed to a leader, or nothing.
+    /// Stores exactly the writes that a leader must still get.
     pub(super) fn keep_all(&mut self) {
         let kept = self.kept().map(|(base, calls)| (base.clone(), calls));
         self.act(match kept {

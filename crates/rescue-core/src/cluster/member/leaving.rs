@@ -1,23 +1,23 @@
-//! Giving up leading: as asked, and when rosrescue stops.
+//! Gives up leadership: for a handover, and when rosrescue stops.
 
 use std::time::{Duration, Instant};
 
 use super::{Action, Member};
 use crate::cluster::machine::{self, Role};
 
-/// How long a leader may take to give up leading.
+/// How long a handover may take.
 const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
-/// The same when it stops.
+/// How long giving up leadership may take when rosrescue stops.
 const STOP_LIMIT: Duration = Duration::from_secs(4);
 
-/// Why leading is given up.
+/// Why leadership is given up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Why {
     #[default]
     No,
-    /// Somebody has asked for it, and waits.
+    /// A handover was requested, and its caller waits.
     Asked,
-    /// rosrescue stops, and rosout first.
+    /// rosrescue stops, and waits for rosout.
     EndingRosout,
     Stops,
 }
@@ -25,12 +25,12 @@ enum Why {
 #[derive(Debug, Default)]
 pub(super) struct Release {
     why: Why,
-    /// It is given up until then, or not.
+    /// The time limit.
     pub(super) by: Option<Instant>,
 }
 
 impl Release {
-    /// Whether calls wait for the next leader.
+    /// Whether writes wait for the next leader.
     pub(super) fn is_begun(&self) -> bool {
         matches!(self.why, Why::Asked | Why::Stops)
     }
@@ -57,7 +57,7 @@ impl Member {
     pub(super) fn hand_over(&mut self, now: Instant, to: String, refused: Option<String>) {
         let refused = match self.machine.role() {
             Role::Leading if self.release.why != Why::No => {
-                Some("it is being done already".to_owned())
+                Some("a handover or a stop is already under way".to_owned())
             }
             Role::Leading => refused,
             _ => Some("this computer does not lead".to_owned()),
@@ -69,7 +69,7 @@ impl Member {
         self.release.by = Some(now + HANDOVER_LIMIT);
     }
 
-    /// Calls that write wait from now on for the next leader.
+    /// Gives up leadership. From now on writes wait for the next leader.
     fn begin_release(&mut self, why: Why, to: String) {
         self.release.why = why;
         let term = self.machine.term().unwrap_or_default();
@@ -77,7 +77,7 @@ impl Member {
         self.tell_machine(machine::Input::HandOver(to));
     }
 
-    /// Another computer may lead now, or leads.
+    /// Another computer may lead now.
     pub(super) fn released(&mut self) {
         if self.release.why == Why::Asked {
             self.release = Release::default();
@@ -89,7 +89,7 @@ impl Member {
         if self.release.by.is_some_and(|by| by <= now) {
             self.release.by = None;
             match self.release.why {
-                // Its request may be on its way to etcd: calls wait on.
+                // The request may still reach etcd, so writes keep waiting.
                 Why::Asked => {
                     let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
                     self.act(Action::HandedOver(Err(why)));
@@ -104,7 +104,7 @@ impl Member {
         self.tell_machine(machine::Input::Wake);
     }
 
-    /// A stop has nothing more to wait for when another computer may lead.
+    /// Finishes a stop as soon as this computer no longer leads.
     pub(super) fn end_if_stopped(&mut self) {
         if self.release.why == Why::Stops && self.machine.role() != Role::Leading {
             self.end();

@@ -1,8 +1,8 @@
-//! etcd has lost its data: its members are new, or were given an old snapshot. Its revision is lower than one that was
-//! seen before.
+//! Recognises an etcd that has lost its data, because its members are new or were restored from an old snapshot: its
+//! revision is lower than one seen before.
 //!
-//! The most recent state of a computer that lives becomes the new truth. Each one says in its entry among the members
-//! what it holds. After the time to live the one that holds most claims, and the others only if it does not.
+//! The most recent state of a living computer becomes the new truth. Each computer writes into its member entry what it
+//! holds. After the time to live, the computer that holds the most claims leadership. The others wait longer.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -14,18 +14,18 @@ use crate::cluster::{
     standing::Place,
 };
 
-/// How many times the time to live a computer that holds less leaves to the one that holds most.
+/// How long a computer that holds less waits for the one that holds the most, in times to live.
 const PATIENCE: u32 = 3;
 
 #[derive(Debug, Default)]
 pub(super) struct Lost {
-    /// Since when that is known, what this computer holds, and the journal's end at that moment.
+    /// When the loss was noticed, what this computer holds, and the last record of the new journal at that time.
     now: Option<(Instant, Holds, u64)>,
-    /// What others say that they hold.
+    /// What the other computers hold, by name.
     others: BTreeMap<String, Holds>,
-    /// Another one holds more.
+    /// Whether another computer holds more.
     second: bool,
-    /// How often it has happened.
+    /// How often etcd has lost its data.
     pub(super) times: u64,
 }
 
@@ -38,7 +38,7 @@ impl Lost {
         self.now.map(|(since, ..)| since)
     }
 
-    /// Whether the journal of another leader is still as it was when the loss was noticed.
+    /// Whether the new journal still lacks another leader's state.
     pub(super) fn waits_for(&self, progress: Progress) -> bool {
         self.now.is_some_and(|(.., seq)| progress.seq <= seq)
     }
@@ -53,7 +53,8 @@ impl Lost {
 }
 
 impl Member {
-    /// An answer that shows an older revision than is known may be an old one; if not, etcd has lost its data.
+    /// Reads etcd again if `answer` shows an older revision than a known one. Either the answer is late, or etcd has lost
+    /// its data.
     pub(super) fn doubt_etcd(&mut self, now: Instant, answer: &Answer) {
         if let Answer::Is(view) = answer
             && view.revision < self.view().revision
@@ -62,12 +63,12 @@ impl Member {
         }
     }
 
-    /// Whether etcd, which shows `view`, has lost what it held when the revision was `floor`.
+    /// Whether etcd's `view` is older than revision `floor`, which etcd had reached before.
     pub(super) fn has_lost(&self, view: &View, floor: u64) -> bool {
         view.revision < floor && !Mutant::TrustsLostEtcd.lives()
     }
 
-    /// Begins anew with an etcd that shows `view`, and with what this computer holds.
+    /// Starts over with the new etcd, which shows `view`, and with this computer's state.
     pub(super) fn begin_anew(&mut self, now: Instant, view: &View) {
         let holds = match self.reading.loaded {
             true => Holds {
@@ -102,7 +103,7 @@ impl Member {
         self.act(Action::Say);
     }
 
-    /// The journal of the new etcd has been read up to here, if there is a new one.
+    /// Whether etcd has lost its data. If so, notes how far the new journal has been read.
     pub(super) fn begun_anew(&mut self) -> bool {
         let seq = self.journal.progress.seq;
         if let Some((.., upto)) = &mut self.lost.now {
@@ -111,7 +112,7 @@ impl Member {
         self.lost.now.is_some()
     }
 
-    /// Leaves the claim to a computer that holds more, for a while.
+    /// Lets a computer that holds more claim first.
     pub(super) fn tend_lost(&mut self, now: Instant) {
         let Some((since, holds, _)) = self.lost.now else {
             return;

@@ -1,4 +1,4 @@
-//! Sends what was answered alone to the leader, as far as it still holds.
+//! Sends the writes that were answered while cut off to the leader, except those that conflict with others' writes.
 
 use std::{
     collections::BTreeSet,
@@ -20,44 +20,44 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Pause before calls that were not answered are sent again.
+/// Pause before unanswered calls are sent again.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Who sets a parameter that nodes have to be told of. No node has this name.
+/// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 const TELLER: &str = "/rosrescue";
-/// Most calls, and about most bytes, of one portion. Other writes pass in between.
+/// The largest number of calls in one portion. Other writes pass between portions.
 const CALLS_MOST: usize = 100;
+/// The approximate largest size of one portion, in bytes.
 const BYTES_MOST: usize = 512 << 10;
 
 #[derive(Debug, Default)]
 enum Step {
     #[default]
     Idle,
-    /// Until the journal has been read as it is now.
+    /// Waits until the journal has been read as it is now.
     Reading,
-    /// Until the leader at this address and of this term, or this computer, has answered for the first of what is
-    /// left.
+    /// Waits for the answer to this portion, from the leader at this address and of this term, or from this computer.
     Asked(Ask, Option<(String, u64)>),
-    /// Until then, the same is asked again; or all is judged anew.
+    /// Waits until this time, then sends the same portion again, or judges everything again.
     Pause(Instant, Option<Ask>),
 }
 
-/// The writes of the oldest time alone are being sent.
+/// The state of sending the writes of the oldest period of being cut off.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The name under which all portions of a time alone are sent.
+    /// The prefix of the name under which the portions of one period are sent.
     id: String,
-    /// How many times alone were sent before.
+    /// How many periods were sent before.
     times: u64,
     step: Step,
-    /// How many portions were sent: an answer to an earlier one is too late.
+    /// The number of the last portion. Answers to earlier ones are ignored.
     asked: u64,
-    /// What still has to be sent; none before it was judged.
+    /// The writes still to be sent. `None` before they have been judged.
     left: Option<Vec<Request>>,
-    /// Parameters of which nodes here heard a value that was lost: they are told the present value.
+    /// Parameters of which nodes here heard a value that was lost. These nodes must hear the present value.
     untold: BTreeSet<String>,
-    /// The leader is asked to tell the nodes of [`Self::untold`].
+    /// Whether the portion under way sets the parameters in [`Self::untold`] again.
     telling: bool,
-    /// It conflicts with nothing that was changed up to this record.
+    /// The writes in `left` conflict with no change up to this record.
     judged: u64,
     sent: u64,
     lost: u64,
@@ -92,7 +92,8 @@ impl Merging {
 }
 
 impl Member {
-    /// The leader to whom what was answered alone can be sent: its address and term, or none if it is this computer.
+    /// The leader that takes such writes: its address and term, or `Some(None)` for this computer. `None` if no leader is
+    /// known.
     fn merges_to(&self) -> Option<Option<(String, u64)>> {
         match self.machine.role() {
             Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
@@ -118,7 +119,7 @@ impl Member {
                 }
             }
             Step::Asked(ask, asked) => {
-                // A leader that is gone may never answer.
+                // A leader that is gone never answers.
                 if to.is_some_and(|to| to != *asked) {
                     self.merging.step = Step::Pause(now + AGAIN, Some(ask.clone()));
                 }
@@ -139,7 +140,7 @@ impl Member {
         self.reading.refresh(now);
     }
 
-    /// Judges what is left by what others have changed, up to the journal's last record.
+    /// Judges the remaining writes by the others' changes up to the journal's last record.
     fn judge(&mut self, now: Instant) {
         let Some(time) = self.cut_off.first_mut() else {
             self.merging.step = Step::Idle;
@@ -173,7 +174,7 @@ impl Member {
         if calls.is_empty() {
             return self.merged();
         }
-        // If there is no answer, the journal may have them all the same. What is set again changes nothing.
+        // Without an answer, the journal may still contain them. Setting a value again changes nothing.
         if let Some(time) = self.cut_off.first_mut().filter(|_| !self.merging.telling) {
             time.changes.expect(calls.iter().cloned());
         }
@@ -196,7 +197,7 @@ impl Member {
         self.act(Action::Merge { number, ask, to });
     }
 
-    /// The leader has answered a portion, or not.
+    /// Handles the answer to a portion. `None` if the leader did not answer.
     pub(super) fn portion_answered(
         &mut self,
         now: Instant,
@@ -230,12 +231,12 @@ impl Member {
         }
     }
 
-    /// The leader has told nodes values that they lack.
+    /// Handles the answer to a portion that set parameters again.
     fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[Outcome]) {
         let untold = &mut self.merging.untold;
         let before = untold.len();
         for (call, outcome) in ask.calls.iter().zip(outcomes) {
-            // It was changed since, and nodes may have heard of that before they heard of what was lost.
+            // If it was changed meanwhile, nodes may have heard the new value before the lost one.
             if !matches!(outcome, Outcome::Lost { .. }) {
                 call.text(1).map(|key| untold.remove(key));
             }
@@ -250,7 +251,7 @@ impl Member {
         for (call, outcome) in &outcomes {
             match outcome {
                 Outcome::Holds => self.merging.sent += 1,
-                // It is not there any more: others have deleted it, too.
+                // Others have deleted the parameter, too.
                 Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
                 Outcome::Refused(_) | Outcome::Lost { .. } => self.merging.lost += 1,
             }
@@ -260,7 +261,7 @@ impl Member {
         }
     }
 
-    /// The writes of the oldest time have been sent.
+    /// Finishes the oldest period: all its writes have been sent.
     fn merged(&mut self) {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
         self.tell(News::Merged { sent, lost });
@@ -279,7 +280,7 @@ impl Member {
     }
 }
 
-/// The resolved name of the parameter that a lost write was about.
+/// The resolved name of the parameter of a lost write.
 fn parameter(lost: &Lost) -> Option<String> {
     parameter_of(&lost.call)
 }
@@ -289,7 +290,7 @@ fn parameter_of(call: &Request) -> Option<String> {
     sets.then(|| Some(names::resolve(call.text(1)?, call.caller()?)))?
 }
 
-/// Sets each of the parameters that `state` has to the value that it has: all that subscribe it are told.
+/// Calls that set each of these parameters to its value in `state`, so that its subscribers are notified.
 fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
     let values = keys.iter().filter_map(|key| {
         let parts: Vec<_> = names::parts(key).collect();
@@ -302,11 +303,11 @@ fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
     calls.collect()
 }
 
-/// How many of the calls are the next portion.
+/// How many of the calls fit into the next portion.
 fn portion(calls: &[Request]) -> usize {
     let (mut count, mut bytes) = (0, 0);
     for call in calls.iter().take(CALLS_MOST) {
-        // Its answer holds a value that the master may not be able to write.
+        // Its answer contains a value that the master may be unable to return.
         let is_alone = *call.method() == Method::SubscribeParam;
         bytes += weight(call);
         if count > 0 && (is_alone || bytes > BYTES_MOST) {

@@ -1,4 +1,4 @@
-//! What changes when this computer begins to have the master, and when it no longer has it.
+//! Changes of this computer's role: it starts a master, or gives it up.
 
 use std::time::Instant;
 
@@ -13,12 +13,12 @@ use crate::{
     master::Master,
 };
 
-/// How often the leader's rosrescue is asked within the time to live,
+/// Probes of the leader's rosrescue per time to live.
 pub const PROBES: u32 = 4;
-/// and when etcd has been silent for that time: only the leader shows then whether it still leads.
+/// The same while etcd is silent. Then only the leader itself shows whether it still leads.
 const PROBES_IN_SILENCE: u32 = 20;
 
-/// Whether a change is not another computer's call, which is made elsewhere when it gets no answer here.
+/// Whether a change is this computer's own. A forwarded call is made elsewhere if it gets no answer here.
 pub(super) fn is_ours(change: &Change) -> bool {
     !matches!(change, Change::Call(_, Source::Forwarded)) || Mutant::KeepsForwarded.lives()
 }
@@ -78,7 +78,7 @@ impl Member {
         let held = self.journal.state.clone();
         let state = match over {
             true => Some(Master::default()),
-            // What was answered alone is merged, and not a part of the state that the others are given.
+            // Writes answered while cut off are merged later. They are not part of the state that the others get.
             false => (!self.cut_off.is_empty() && !owns).then(|| held.clone()),
         };
         self.act(Action::Lead { seq, held, state });
@@ -100,19 +100,19 @@ impl Member {
             true => &self.journal.state,
             false => &self.own.state,
         };
-        // The nodes go on from what they wrote alone before.
+        // The nodes continue from what they wrote while cut off before.
         let base = self.cut_off.on(base);
         self.begin_cut_off(base.clone());
         self.act(Action::ServeOwnOnly(true));
         if led {
-            // What is recorded is answered from now on; but not what others make elsewhere.
+            // Recorded calls are answered from now on, except forwarded ones, which are made elsewhere.
             let answered = self.acknowledged;
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
             self.keep(kept);
         } else {
-            // First: nothing is forwarded any more.
+            // First, so that no more calls are forwarded.
             self.stand(Standing::Nobody { known: true });
             self.act(Action::AskForwarded);
             let seq = self.machine.committed();
@@ -126,10 +126,10 @@ impl Member {
         self.all_ready();
     }
 
-    /// What is answered from now on is kept for the leader. `base`: the present state.
+    /// From now on, keeps answered writes for the leader. `base` is the present state.
     pub(super) fn begin_cut_off(&mut self, base: Master) {
         let first = self.cut_off.is_empty();
-        // It is not known yet what the others have: that is compared with the first time.
+        // Before etcd has been read, the others' state is unknown. It is compared with the first period.
         if first || self.reading.loaded {
             self.cut_off.begin(base);
         }
@@ -152,7 +152,7 @@ impl Member {
         }
     }
 
-    /// Has a master as long as the machine allows it.
+    /// Runs a master as long as the machine allows it.
     pub(super) fn tend_master(&mut self) {
         let may = self.machine.may_have_master();
         if self.has_master && !may {
@@ -164,7 +164,7 @@ impl Member {
         }
     }
 
-    /// Whatever is recorded or answered here from now on is not for the others.
+    /// Stops recording and answering for the other computers.
     fn give_up(&mut self) {
         self.act(Action::Leave);
         let known = self.knows();
@@ -175,7 +175,7 @@ impl Member {
         self.adopt();
     }
 
-    /// Says who has the master, and where calls go.
+    /// Publishes who has the master and where calls go, if that has changed.
     pub(super) fn stand(&mut self, standing: Standing) {
         if self.standing != standing {
             self.standing = standing.clone();
@@ -183,7 +183,7 @@ impl Member {
         }
     }
 
-    /// Calls of nodes wait as long as what was answered before them, alone, is on its way.
+    /// Publishes that this computer leads. Calls wait while earlier writes, answered while cut off, are being merged.
     pub(super) fn stand_leading(&mut self, term: u64) {
         let pass = match (self.cut_off.is_empty(), self.release.is_begun()) {
             (false, _) => Pass::Nothing,
@@ -193,7 +193,7 @@ impl Member {
         self.stand(Standing::Leads { term, pass });
     }
 
-    /// Who leads, if it is another computer that is not known to have given up, and no earlier process of this one.
+    /// The address and term of the leader, if it is another computer that has not given up leadership.
     pub(super) fn leader(&self) -> Option<(&str, u64)> {
         let own = self.settings();
         let view = self.view();
@@ -203,7 +203,7 @@ impl Member {
         (!released && !is_own).then_some((&*leader.uri, leader.term))
     }
 
-    /// Follows who leads.
+    /// Updates the standing when the leader changes.
     pub(super) fn tend_standing(&mut self) {
         self.look_at_place();
         let own = &self.settings().id;
@@ -219,7 +219,7 @@ impl Member {
             return;
         }
         let standing = match self.leader() {
-            // What was answered alone goes first.
+            // Writes answered while cut off must be merged before new calls.
             Some((uri, term)) if self.cut_off.is_empty() => {
                 let uri = uri.to_owned();
                 Standing::Follows { uri, term }
@@ -231,7 +231,7 @@ impl Member {
         self.stand(standing);
     }
 
-    /// Asks the leader's rosrescue whether it leads, now and then.
+    /// Probes the leader's rosrescue regularly.
     pub(super) fn tend_probes(&mut self, now: Instant) {
         let asks = matches!(self.machine.role(), Role::Following | Role::Alone);
         let leader = self.leader().filter(|_| asks);

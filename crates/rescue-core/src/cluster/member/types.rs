@@ -17,20 +17,20 @@ use crate::{
     master::{Displaced, Master, Request},
 };
 
-/// What this computer's checkpoint holds when it begins to take part.
+/// What this computer's checkpoint holds at the start.
 #[derive(Clone, Debug, Default)]
 pub struct Own {
     /// The state in the ledger.
     pub state: Master,
-    /// Whether the state is of a session that goes on.
+    /// Whether the state belongs to a session that continues.
     pub restored: bool,
     /// The last term in which this computer led.
     pub term: u64,
-    /// How much of the journal the state holds.
+    /// The last record of the journal that the state contains.
     pub seq: u64,
 }
 
-/// What a computer says of itself, in JSON at `ROBOT/members/NAME`.
+/// A computer's entry among the members, as JSON at `ROBOT/members/NAME`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Said {
     pub uri: String,
@@ -40,12 +40,12 @@ pub struct Said {
     /// See [`Settings::boot`].
     #[serde(default)]
     pub boot: String,
-    /// etcd has lost its data. This computer holds the state of this place in what was lost.
+    /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
     #[serde(default)]
     pub holds: Option<Holds>,
 }
 
-/// A place in a journal that etcd has lost: the term of its leader, and the number of a record.
+/// A place in a journal that etcd has lost: its leader's term and a record number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Holds {
     pub term: u64,
@@ -56,14 +56,14 @@ pub struct Holds {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     pub name: String,
-    /// None if it is there no more.
+    /// `None` if the entry was deleted.
     pub said: Option<Said>,
-    /// Of its last change.
+    /// The revision of the entry's last change.
     pub revision: u64,
 }
 
 impl Heard {
-    /// That this entry, under the name of `own`, is another computer's.
+    /// Returns evidence of a namesake if this entry, which has the name in `own`, belongs to another computer.
     pub(super) fn sign_of_namesake(&self, own: &Settings) -> Option<Sign> {
         let said = self.said.as_ref()?;
         let is_own = own.is_of_this_computer(&self.name, &said.uri, &said.boot);
@@ -75,23 +75,23 @@ impl Heard {
     }
 }
 
-/// An entry of the journal, as the watch shows it.
+/// A journal entry as the watch delivers it.
 #[derive(Clone, Debug)]
 pub enum Entry {
     Records {
         records: Vec<Record>,
         bytes: usize,
     },
-    /// One that has to be read apart, up to this record.
+    /// An entry that must be read separately, up to this record.
     Apart(u64),
 }
 
-/// The journal as far as it was not known.
+/// The part of the journal that was not known yet.
 #[derive(Clone, Debug)]
 pub struct Read {
-    /// Both keys, at the same moment.
+    /// The leader's two keys at the same revision.
     pub view: View,
-    /// The state that the records go on from, and who was displaced before; none if they go on from what was known.
+    /// The state before the records, and who was displaced until then. `None` if the records follow the known journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
@@ -105,11 +105,11 @@ pub struct Read {
     reason = "few exist at a time, and none is stored"
 )]
 pub enum Input {
-    /// Take part from now on.
+    /// The member starts.
     Begin,
-    /// To request `number` of the machine.
+    /// The answer to request `number` of the machine.
     Answer { number: u64, answer: Answer },
-    /// The watch shows both keys, what was added to the journal, and what computers say.
+    /// The watch delivers the leader's keys, new journal entries, and changed member entries.
     Watched {
         view: View,
         entries: Vec<Entry>,
@@ -117,40 +117,40 @@ pub enum Input {
     },
     /// The watch has ended.
     WatchEnded,
-    /// To [`Action::Load`]; none if etcd could not be read.
+    /// The result of [`Action::Load`]. `None` if etcd could not be read.
     Loaded(Option<Read>),
-    /// The ledger has recorded these.
+    /// The ledger has recorded these changes.
     Recorded(Vec<Change>),
-    /// To [`Action::TakeAsState`].
+    /// The result of [`Action::TakeAsState`].
     AsState(Option<Change>),
-    /// To [`Action::AskForwarded`]: writes of this computer's nodes that a leader has not answered.
+    /// The result of [`Action::AskForwarded`]: writes of this computer's nodes that a leader has not answered.
     Forwarded(Vec<Request>),
-    /// To [`Action::Prepare`]: whether this process still leads, if that is known.
+    /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
     Prepared(Option<bool>),
-    /// To [`Action::Decide`].
+    /// The result of [`Action::Decide`].
     Decided { seq: u64, goes_on: bool },
-    /// To [`Action::Probe`] `number`: whether the leader's rosrescue answers, and says that it leads.
+    /// The result of [`Action::Probe`] `number`: whether the leader's rosrescue answered that it leads.
     Probed { number: u64, leads: bool },
-    /// To [`Action::Merge`] `number`; none if the leader has not answered.
+    /// The result of [`Action::Merge`] `number`. `None` if the leader did not answer.
     Merged {
         number: u64,
         answer: Option<wire::Answer>,
     },
-    /// To [`Action::WriteSnapshot`]: what it was of, and its bytes; none if it was not written.
+    /// The result of [`Action::WriteSnapshot`]: its place and its size in bytes. `None` if it was not written.
     SnapshotWritten(Option<(Progress, usize)>),
-    /// Give up leading in favour of this computer, or of any if it is empty. `refused`: why that computer cannot
-    /// lead.
+    /// Someone asks for a handover to the computer `to`, or to any if `to` is empty. `refused` says why that computer
+    /// cannot lead.
     HandOver { to: String, refused: Option<String> },
-    /// rosrescue is to stop.
+    /// rosrescue was asked to stop.
     Stop,
-    /// To [`Action::EndRosout`].
+    /// The result of [`Action::EndRosout`].
     RosoutEnded,
-    /// The time of [`Member::deadline`](super::Member::deadline) has come.
+    /// The deadline of [`Member::deadline`](super::Member::deadline) has passed.
     Wake,
 }
 
 impl Input {
-    /// What computers say.
+    /// The member entries in this input.
     pub fn heard(&self) -> &[Heard] {
         match self {
             Self::Watched { heard, .. } => heard,
@@ -160,7 +160,7 @@ impl Input {
     }
 }
 
-/// Why a master is begun.
+/// Why a master is started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cause {
     Started,
@@ -168,33 +168,34 @@ pub enum Cause {
     WasCutOff,
 }
 
-/// What people are told.
+/// An event to log for the operator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum News {
-    /// This computer is alone.
+    /// This computer is cut off.
     Alone {
         serves: bool,
     },
     NotAlone,
-    /// It leads from now on. Who led before and was heard of when, and whether that one gave up in order.
+    /// This computer leads from now on. `before` is the previous leader and when it was last heard of; `released` says
+    /// whether it gave up leadership by itself.
     Leads {
         before: Option<(String, Instant)>,
         released: bool,
     },
     LeadsAgain,
     Deposed,
-    /// etcd has lost its data; the most recent state of a living computer takes its place.
+    /// etcd has lost its data. The most recent state of a living computer will replace it.
     EtcdLost,
-    /// Its master is ended, since another computer may lead.
+    /// The master was killed, because another computer may lead.
     Lapsed,
-    /// The start waits for so long, since another computer may have this name.
+    /// The start waits until `until`, because the computer at `uri` may have this name.
     Suspect {
         uri: String,
         until: Instant,
     },
-    /// A change cannot be written into the journal.
+    /// A change is too large for the journal.
     TooLarge(String),
-    /// The writes of a time alone are with the leader: so many were sent, so many are lost.
+    /// The writes made while cut off have been merged: `sent` were accepted, `lost` were not.
     Merged {
         sent: u64,
         lost: u64,
@@ -208,8 +209,7 @@ pub enum News {
     reason = "few exist at a time, and none is stored"
 )]
 pub enum Action {
-    /// Write `parts` if there are any, in `term`, then carry out `op`, with `entry` for the journal. Its answer is
-    /// [`Input::Answer`].
+    /// Write `parts`, if any, in `term`; then carry out `op` with the journal's `entry`. Ends with [`Input::Answer`].
     Send {
         number: u64,
         op: Op,
@@ -217,73 +217,73 @@ pub enum Action {
         term: u64,
         parts: Vec<Put>,
     },
-    /// Read what follows on this.
+    /// Read the journal after this place.
     Load(Progress),
-    /// Watch both keys and the journal, from what they are here.
+    /// Watch the leader's keys and the journal from this revision on.
     Watch(View),
     /// Write the parts of a large change.
     Prepare {
         term: u64,
         parts: Vec<Put>,
     },
-    /// Find out whether the session goes on that the journal holds up to `seq`, with this state. `closed`: the
-    /// last leader has stopped in order.
+    /// Find out whether the session of the journal, which has `state` at record `seq`, continues. `closed` says whether
+    /// the last leader stopped in order.
     Decide {
         seq: u64,
         state: Master,
         closed: bool,
     },
-    /// Show calls who has the master.
+    /// Publish who has the master and where calls go.
     Stand(Standing),
-    /// Record nothing, acknowledge nothing that waits, and tell no node anything.
+    /// Stop recording, acknowledging and notifying.
     Leave,
-    /// Record calls from now on, with numbers after `seq`; the others hold `held`. `state`: what the ledger holds from
-    /// now on, if it is something else than now.
+    /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
+    /// the ledger's state, if set.
     Lead {
         seq: u64,
         held: Master,
         state: Option<Master>,
     },
-    /// Another computer has recorded these.
+    /// Apply these records of another computer.
     Follow(Vec<Record>),
-    /// This is the state where the master is.
+    /// Take over this state of another computer.
     FollowState(Master),
     /// Answer the calls up to this record.
     Acknowledge(u64),
-    /// Replace what the ledger has recorded and not given yet by its state.
+    /// Replace the recorded changes that were not handed out yet by the ledger's state.
     TakeAsState,
     AskForwarded,
-    /// These were told to shut down lately, perhaps in vain.
+    /// Tell these displaced nodes to shut down again, because they may have missed it.
     TellDisplaced(Vec<Displaced>),
-    /// The checkpoint is one of this term.
+    /// Note this term in the checkpoint.
     Term(u64),
     BeginMaster(Cause),
-    /// End it at once.
+    /// Kill the master at once.
     EndMaster,
-    /// The mirror answers: there is no master.
+    /// The mirror answers, because there is no master.
     StandIn,
-    /// No call is answered here.
+    /// Answer no call on this computer.
     TurnAway,
-    /// Whether nodes of the other computers are told nothing.
+    /// Whether to notify this computer's nodes only.
     ServeOwnOnly(bool),
-    /// Keep these writes, answered alone since the state was `base`, in place of what is kept.
+    /// Keep exactly these writes, answered while cut off since the state was `base`.
     KeepAll {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Keep these as well.
+    /// Keep these writes as well.
     Keep(Vec<Request>),
-    /// Nothing need be kept any more.
+    /// Delete the kept writes.
     KeepNothing,
-    /// Ask the leader to make these writes: its address and term, or none for this computer.
+    /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
     Merge {
         number: u64,
         ask: Ask,
         to: Option<(String, u64)>,
     },
-    /// This has become of writes that were answered alone.
+    /// Report the outcomes of writes that were answered while cut off.
     Report(Vec<(Request, Outcome)>),
-    /// Ask the rosrescue at `uri` whether it leads in `term`, within a quarter of the time to live.
+    /// Ask the rosrescue at `uri` whether it leads in `term`. Wait for a quarter of the time to live at most.
     Probe {
         number: u64,
         uri: String,
@@ -297,15 +297,15 @@ pub enum Action {
         state: Master,
         displaced: Vec<Displaced>,
     },
-    /// Have etcd forget what is older than this revision.
+    /// Compact etcd up to this revision.
     Forget(u64),
-    /// The handover is done, or why it is not.
+    /// Answer a handover request: done, or why not.
     HandedOver(Result<(), String>),
-    /// End what roscore does besides, while calls still pass.
+    /// Stop roscore's other duties while calls still pass.
     EndRosout,
     Tell(News),
-    /// Take part no longer.
+    /// Stop.
     End,
-    /// The same, for another computer there has this name.
+    /// Stop, because the computer at this address has the same name.
     EndForNamesake(String),
 }

@@ -1,4 +1,4 @@
-//! What was changed, by subject: not by comparing states, which do not show that a parameter was set and set back.
+//! Tracks changes by subject. Comparing two states would not show that a parameter was set and set back.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},
@@ -11,12 +11,12 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// What a call changes, as far as another one may be about the same.
+/// The subject of a call, by which two calls can conflict.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Subject {
-    /// A parameter, by its resolved name, which ends in `/`.
+    /// A parameter: its resolved name, with a slash at the end.
     Param(String),
-    /// Somebody has registered something as this node.
+    /// A registration by this node.
     Node(String),
     Service(String),
     Topic {
@@ -27,7 +27,7 @@ pub enum Subject {
 }
 
 impl Subject {
-    /// About how many bytes it takes.
+    /// The approximate size in bytes.
     pub fn size(&self) -> usize {
         size_of::<Self>()
             + match self {
@@ -36,7 +36,7 @@ impl Subject {
             }
     }
 
-    /// What `call`, other than a multicall, changes. An unregistration is in nobody's way.
+    /// The subjects of `call`, which is no multicall. An unregistration conflicts with nothing.
     pub fn of(call: &Request) -> Vec<Self> {
         let Some(caller) = call.caller() else {
             return Vec::new();
@@ -67,7 +67,7 @@ impl Subject {
     }
 }
 
-/// A parameter's name with a slash at its end, so that names above it are its beginnings.
+/// A parameter's name with a slash at the end, so that the names above it are its prefixes.
 pub(super) fn param_path(key: &str) -> String {
     let mut path = String::with_capacity(key.len() + 1);
     path.push('/');
@@ -88,7 +88,7 @@ pub(super) fn param_of(call: &Request) -> Option<String> {
     }
 }
 
-/// What others have changed since some moment.
+/// The others' changes since some moment.
 #[derive(Clone, Debug, Default)]
 pub struct Changes {
     params: BTreeSet<String>,
@@ -97,20 +97,20 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// Calls of this computer that the others may have run before, or may still run: these are no changes of
-    /// theirs.
+    /// Notes calls of this computer that the others may have run, or may still run. They do not count as others'
+    /// changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
         for call in calls {
             self.own.add(call);
         }
     }
 
-    /// This computer has given `call` to the journal as record `seq`, and the journal may have it.
+    /// Notes that this computer sent `call` to the journal as record `seq`, and the journal may contain it.
     pub fn expect_record(&mut self, seq: u64, call: Request) {
         self.own.records.insert(seq, call);
     }
 
-    /// The journal has `call` as record `seq`.
+    /// Notes record `seq` of the journal.
     pub fn note(&mut self, seq: u64, call: &Request) {
         if self
             .own
@@ -138,8 +138,8 @@ impl Changes {
         }
     }
 
-    /// The others' state was `was` and is `is`; what they did in between is not known. What they set and set
-    /// back does not show.
+    /// Notes that the others' state changed from `was` to `is`, without the calls in between. What was changed and
+    /// changed back does not show.
     pub fn note_difference(&mut self, was: &Master, is: &Master) {
         let mut paths = Vec::new();
         differing("/", was.params(), is.params(), &mut paths);
@@ -204,12 +204,12 @@ impl Changes {
     }
 }
 
-/// Calls of this computer. Each is met once.
+/// Calls of this computer. Each one can explain one change.
 #[derive(Clone, Debug, Default)]
 struct Own {
-    /// By what they are about.
+    /// The calls, by subject.
     calls: HashMap<String, Vec<Request>>,
-    /// By their numbers in the journal.
+    /// The calls, by their numbers in the journal.
     records: HashMap<u64, Request>,
 }
 
@@ -248,7 +248,7 @@ impl Own {
         self.calls.values().flatten().chain(records)
     }
 
-    /// Whether one of them made the parameter at `path` what it is.
+    /// Whether one of the calls explains the value of the parameter at `path`.
     fn explains(&self, path: &str, is: Option<&Value>) -> bool {
         self.calls().any(|call| {
             let below = param_of(call).and_then(|of| path.strip_prefix(of.as_str()));
@@ -271,7 +271,7 @@ impl Own {
     }
 }
 
-/// The value at the path of these parts; none at the root.
+/// The value at a path. `None` at the root.
 pub(in crate::cluster) fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
     let (first, rest) = path.split_first()?;
     match (tree.get(*first)?, rest) {
@@ -281,7 +281,7 @@ pub(in crate::cluster) fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Optio
     }
 }
 
-/// The paths of the values, as deep as can be, by which the trees differ.
+/// Adds the deepest paths at which the trees differ.
 fn differing(path: &str, was: &Struct, is: &Struct, found: &mut Vec<String>) {
     let added = is.iter().map(|(key, _)| key);
     let added = added.filter(|key| was.get(key.as_str()).is_none());

@@ -1,4 +1,4 @@
-//! How a computer that was alone asks the leader to make its writes, and what it is answered.
+//! The request by which a computer that was cut off sends its writes to the leader, and its answer.
 
 use std::sync::Arc;
 
@@ -8,17 +8,17 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The method.
+/// The method's name.
 pub const METHOD: &str = "rosrescue/merge";
-/// The method of several calls in one.
+/// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
 
-/// Writes that were answered alone.
+/// A portion of writes that were answered while cut off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all portions of a time alone are sent.
+    /// The name under which all portions of one period are sent.
     pub id: Arc<str>,
-    /// They conflict with nothing that was changed up to this record of the journal.
+    /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,
     pub calls: Vec<Request>,
 }
@@ -34,7 +34,7 @@ impl Ask {
         )
     }
 
-    /// None if `request` is something else.
+    /// Reads a request. `None` if it is another method.
     pub fn read(request: &Request) -> Option<Self> {
         let is_it = matches!(request.method(), Method::Unknown(name) if **name == *METHOD);
         let calls = request.params().get(3).filter(|_| is_it)?;
@@ -47,14 +47,14 @@ impl Ask {
     }
 }
 
-/// What has become of one write.
+/// The outcome of one write.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
-    /// It was made, or what it sets is there.
+    /// It was made, or its value is already set.
     Holds,
-    /// The master has refused it.
+    /// The master refused it.
     Refused(String),
-    /// Others have changed the same.
+    /// Others have changed the same subject.
     Lost { why: String, present: Option<Value> },
 }
 
@@ -73,14 +73,14 @@ impl From<&Lost> for Outcome {
 /// The leader's answer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Answer {
-    /// It does not know all that was changed after the record: judge anew.
+    /// The leader no longer knows all changes after the record, so the writes must be judged again.
     Again,
-    /// For each write.
+    /// The outcome of each write.
     Done(Vec<Outcome>),
 }
 
 impl Answer {
-    /// What has become of writes with these verdicts, when the master has answered those that ran with `reply`.
+    /// The answer for writes with these verdicts, after the master answered those that ran with `reply`.
     pub fn of(verdicts: &[Verdict], reply: &Reply) -> Self {
         let results = match reply {
             Reply::Value(Value::Array(results)) => results.as_slice(),
@@ -90,7 +90,7 @@ impl Answer {
         let outcomes = verdicts.iter().map(|verdict| match verdict {
             Verdict::Holds => Outcome::Holds,
             Verdict::Lost(lost) => lost.into(),
-            // Without a result it was made: the master could not write the whole answer.
+            // A write without a result was made; the master could not encode the whole answer.
             Verdict::Runs => match results.next().and_then(entry_reply) {
                 Some(reply) if !is_success(&reply) => Outcome::Refused(text(&reply)),
                 _ => Outcome::Holds,
@@ -111,7 +111,7 @@ impl Answer {
         Reply::Value(vec![code.into(), text.into(), Value::Array(outcomes)].into())
     }
 
-    /// The answer for `count` writes; none if it is no answer to this, as from one that does not know the method.
+    /// Reads the answer for `count` writes. `None` for anything else, such as the answer of an older version.
     pub fn read(reply: &Reply, count: usize) -> Option<Self> {
         let Reply::Value(Value::Array(answer)) = reply else {
             return None;
@@ -151,7 +151,7 @@ fn outcome(value: &Value) -> Option<Outcome> {
     })
 }
 
-/// The words of a refusal.
+/// The text of a refusal.
 fn text(reply: &Reply) -> String {
     match reply {
         Reply::Fault { text, .. } => text.clone(),
