@@ -33,7 +33,7 @@ mod startup;
 use self::{
     assemble::{Identity, assemble, last_master, server},
     cluster::ClusterDriver,
-    duty::Parts,
+    duty::Context,
     startup::{begin, kernel_id},
 };
 
@@ -166,7 +166,7 @@ struct Supervised {
 }
 
 /// Tells the operator that the master is protected, as soon as calls pass. Never ends.
-async fn announce(parts: &Parts, say: impl Fn(&str)) {
+async fn announce(parts: &Context, say: impl Fn(&str)) {
     let mut gate = parts.gate.clone();
     gate.wait_for(|state| state.is_open() || state == State::Elsewhere)
         .await;
@@ -198,7 +198,7 @@ fn accept(
 }
 
 /// Starts the tasks that look after the nodes, and after clients that bypass this rosrescue.
-fn watch(config: &Config, parts: &Parts, tasks: &mut JoinSet<()>) {
+fn watch(config: &Config, parts: &Context, tasks: &mut JoinSet<()>) {
     tasks.spawn(nodes::liveness::watch(parts.nodes.clone()));
     tasks.spawn(nodes::watch(parts.nodes.clone(), config.reap_interval));
     if matches!(config.master, MasterConfig::External(_)) {
@@ -222,7 +222,7 @@ impl Runs {
     /// Joins the other computers, if there are others. Also returns how to reach them.
     async fn choose(
         config: &Config,
-        parts: &Arc<Parts>,
+        parts: &Arc<Context>,
         supervised: Option<Supervised>,
         mark: HeaderValue,
         restored: bool,
@@ -255,7 +255,7 @@ impl Runs {
     /// Finds the master of an earlier rosrescue, which was at `port`, and decides what to do first.
     async fn begin(
         self,
-        parts: &Parts,
+        parts: &Context,
         port: Option<u16>,
         restored: bool,
         stop: &CancellationToken,

@@ -30,13 +30,13 @@ pub(crate) use self::durability::Mark;
 use self::{
     durability::Whole,
     journal::Journal,
-    late::Behind,
+    late::LateState,
     pending::PendingWrites,
     shared::{Agreed, Shared},
 };
 use crate::{
     checkpoint::{
-        format::{Entry, Session},
+        format::{RecordContent, Session},
         store::Store,
     },
     cli::SyncPolicy,
@@ -120,7 +120,7 @@ struct Inner {
     /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
     /// The state of a late incarnation once it has answered its outstanding calls.
-    behind: Option<Behind>,
+    behind: Option<LateState>,
     /// The incarnation that answered calls last.
     served: Option<u64>,
     /// Whether the mirror comes from a checkpoint and no master has been compared with it. A living
@@ -292,7 +292,7 @@ impl Ledger {
                 }
             }
             if answered.executed {
-                entries.push(Entry::call(answered.call.clone().into()));
+                entries.push(RecordContent::call(answered.call.clone().into()));
                 sources.push(source);
             }
         }
@@ -317,7 +317,7 @@ impl Ledger {
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
-        inner.append(vec![Entry::call(call.clone().into())]);
+        inner.append(vec![RecordContent::call(call.clone().into())]);
         drop(inner);
         self.write_soon();
     }
@@ -489,7 +489,7 @@ impl Inner {
                 true => 0,
                 false => self.cluster_seq(),
             };
-            let entry = Entry::Session(self.session.clone());
+            let entry = RecordContent::Session(self.session.clone());
             self.append(vec![entry]);
         }
     }
@@ -523,12 +523,12 @@ impl Inner {
     }
 
     /// Passes `entries` to the journal. A failure is kept in the store, and does not fail the call.
-    fn append(&mut self, entries: Vec<Entry>) {
+    fn append(&mut self, entries: Vec<RecordContent>) {
         self.append_from(entries, &[]);
     }
 
     /// Like [`Self::append`], with the source of each call. Missing sources stand for this computer.
-    fn append_from(&mut self, entries: Vec<Entry>, sources: &[&Source]) {
+    fn append_from(&mut self, entries: Vec<RecordContent>, sources: &[&Source]) {
         // The session's record comes first, because it names the incarnation of the following entries.
         self.write_session();
         self.share(&entries, sources);

@@ -9,7 +9,7 @@ use hyper::header::HeaderValue;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
-use super::{duty::Parts, startup::Beginning};
+use super::{duty::Context, startup::Beginning};
 use crate::{
     checkpoint::{format::Session, store::history},
     clock,
@@ -23,7 +23,7 @@ use crate::{
     ros_env::MasterUri,
     server::{
         Server,
-        access::Access,
+        access::AccessRules,
         answers::Answers,
         body,
         calls::Calls,
@@ -54,7 +54,7 @@ pub(super) async fn assemble(
     beginning: Beginning,
     last: Option<MasterUri>,
     mark: HeaderValue,
-) -> (Parts, Drain) {
+) -> (Context, Drain) {
     let address = match (&config.master, last) {
         (MasterConfig::External(address), _) => address.clone(),
         (_, Some(last)) => last,
@@ -109,7 +109,7 @@ pub(super) async fn assemble(
     for (node, at) in removed {
         nodes.removed.add(&node, at);
     }
-    let parts = Parts {
+    let parts = Context {
         ledger,
         upstream,
         gate_tx,
@@ -177,7 +177,7 @@ pub(super) struct Identity {
 /// the second one ends the page's streams.
 pub(super) fn server(
     config: &Config,
-    parts: &Parts,
+    parts: &Context,
     identity: Identity,
     others: Option<Others>,
     ends: (Arc<Notify>, CancellationToken),
@@ -190,7 +190,7 @@ pub(super) fn server(
         parts.ledger.clone(),
         parts.gate.clone(),
     );
-    let access = Access::new(config.allow.clone(), config.allow_write.clone());
+    let access = AccessRules::new(config.allow.clone(), config.allow_write.clone());
     if !config.allow.is_empty() || !config.allow_write.is_empty() {
         tracing::info!("{access}");
     }

@@ -26,18 +26,18 @@ use super::{RunError, duty::Duty, life};
 use crate::{
     checkpoint::{
         format::Checkpoint,
-        session::{self, Decision, Evidence, Restore},
+        session::{self, Decision, RestorePolicy, SessionEvidence},
     },
     cluster::{
-        etcd::{self, Change, Etcd, Kv, Watch, WatchEnd},
+        etcd::{self, Etcd, KeyChange, Kv, Watch, WatchEnd},
         journal::{self, Keys, Manifest, Put},
-        machine::{Answer, Op, Settings, View},
+        machine::{EtcdAnswer, Op, Settings, View},
         member::{Action, Entry, Heard, Input, Member, PROBES, Read},
         merge::{
             Verdict,
             wire::{self, Ask},
         },
-        replica::{Loaded, Replica},
+        replica::{LoadedState, Replica},
         standing::{Place, Standing},
     },
     gate::State,
@@ -202,7 +202,7 @@ impl ClusterDriver {
                 });
             }
             Action::Decide { seq, state, closed } => {
-                let evidence = Evidence {
+                let evidence = SessionEvidence {
                     same_boot: self.given.restored,
                     closed,
                     node_alive: false,
@@ -350,7 +350,7 @@ impl ClusterDriver {
     fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {
         let (replica, settings) = (self.replica.clone(), self.member.settings().clone());
         let trouble = self.trouble.clone();
-        let answer = Answer::Silence;
+        let answer = EtcdAnswer::Silence;
         let otherwise = Input::Answer { number, answer };
         self.spawn(otherwise, async move {
             let run = async {
@@ -359,7 +359,7 @@ impl ClusterDriver {
                 }
                 replica.run(&settings, &op, entry.as_ref()).await
             };
-            let answer = trouble.of(run.await).unwrap_or(Answer::Silence);
+            let answer = trouble.of(run.await).unwrap_or(EtcdAnswer::Silence);
             Input::Answer { number, answer }
         });
     }
@@ -401,7 +401,7 @@ impl ClusterDriver {
     }
 
     /// Turns the watch's changes, or its end, into an input.
-    fn changed(&mut self, changes: Result<Vec<Change>, WatchEnd>) -> Input {
+    fn changed(&mut self, changes: Result<Vec<KeyChange>, WatchEnd>) -> Input {
         let changes = match changes {
             Ok(changes) => changes,
             Err(end) => {
@@ -454,7 +454,7 @@ impl ClusterDriver {
 }
 
 /// Converts what was read from etcd.
-fn read(keys: &Keys, loaded: Loaded) -> Option<Read> {
+fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     let members = loaded.members.iter();
     let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));
     let heard = heard.collect();
@@ -501,10 +501,15 @@ fn entry(seq: u64, kv: &Kv) -> Entry {
 }
 
 /// Finds out whether the session in etcd continues.
-async fn decide(seq: u64, state: Master, restore: Restore, evidence: Evidence) -> Input {
+async fn decide(
+    seq: u64,
+    state: Master,
+    restore: RestorePolicy,
+    evidence: SessionEvidence,
+) -> Input {
     let node_alive = session::depends_on_nodes(restore, evidence)
         && life::any_alive(&state, evidence.same_boot).await;
-    let evidence = Evidence {
+    let evidence = SessionEvidence {
         node_alive,
         ..evidence
     };
@@ -527,7 +532,7 @@ async fn merge(
     to: Option<(String, u64)>,
     peers: Arc<Peers>,
     queue: WriteQueue,
-) -> Option<wire::Answer> {
+) -> Option<wire::MergeAnswer> {
     let Some((uri, term)) = to else {
         return queue.merge(ask).await;
     };
@@ -540,12 +545,12 @@ async fn merge(
     };
     let reply = send(ask.to_request()).await?;
     let count = ask.calls.len();
-    match wire::Answer::read(&reply, count) {
+    match wire::MergeAnswer::read(&reply, count) {
         Some(answer) => Some(answer),
         // An earlier version, which does not know this method.
         None => {
             let reply = send(Request::multicall(ask.calls)).await;
-            reply.map(|reply| wire::Answer::of(&vec![Verdict::Runs; count], &reply))
+            reply.map(|reply| wire::MergeAnswer::of(&vec![Verdict::Runs; count], &reply))
         }
     }
 }
@@ -577,7 +582,7 @@ async fn failed(duty: &mut Option<Duty>) -> ProcessError {
     }
 }
 
-async fn next_changes(watch: &mut Option<Watch>) -> Result<Vec<Change>, WatchEnd> {
+async fn next_changes(watch: &mut Option<Watch>) -> Result<Vec<KeyChange>, WatchEnd> {
     match watch {
         Some(watch) => watch.next().await,
         None => std::future::pending().await,
@@ -590,14 +595,14 @@ mod tests {
 
     #[tokio::test]
     async fn work_that_panics_is_answered() {
-        let answer = Answer::Silence;
+        let answer = EtcdAnswer::Silence;
         let otherwise = Input::Answer { number: 7, answer };
         let answered = answered(otherwise, async { panic!("on purpose") }).await;
         let expected = matches!(
             answered,
             Input::Answer {
                 number: 7,
-                answer: Answer::Silence
+                answer: EtcdAnswer::Silence
             }
         );
         assert!(expected, "{answered:?}");

@@ -26,7 +26,7 @@ use crate::{
 };
 
 /// What the tasks of this process share, and the settings of those that manage the master.
-pub(super) struct Parts {
+pub(super) struct Context {
     pub(super) ledger: Arc<Ledger>,
     pub(super) upstream: Arc<Upstream>,
     pub(super) gate_tx: gate::Tx,
@@ -47,7 +47,7 @@ pub(super) struct Parts {
     pub(super) node_timeout: Duration,
 }
 
-impl Parts {
+impl Context {
     pub(super) fn driver(&self, process: Option<MasterProcess>) -> Driver {
         Driver::new(
             Examiner {

@@ -11,7 +11,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::duty::Parts;
+use super::duty::Context;
 use crate::{
     gate::State,
     guardian::handover::{self, Guard},
@@ -36,7 +36,7 @@ const LOOK: Duration = Duration::from_secs(1);
 static STOPPED: Pair = Pair::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.
-pub(super) fn start(guard: Guard, parts: Arc<Parts>, stop: CancellationToken) -> JoinHandle<()> {
+pub(super) fn start(guard: Guard, parts: Arc<Context>, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
@@ -64,7 +64,7 @@ pub(super) fn start(guard: Guard, parts: Arc<Parts>, stop: CancellationToken) ->
     })
 }
 
-impl Parts {
+impl Context {
     fn line(&self) -> String {
         let situation = Situation {
             gate: self.gate.state(),
@@ -132,7 +132,7 @@ fn is_restarted(pid: u32) -> bool {
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
 /// state to report while it runs.
-async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<Parts>) {
+async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<Context>) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
@@ -168,7 +168,7 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<P
     );
 }
 
-async fn report_ready(parts: Arc<Parts>) {
+async fn report_ready(parts: Arc<Context>) {
     parts.answers().await;
     let line = parts.line();
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
@@ -176,7 +176,7 @@ async fn report_ready(parts: Arc<Parts>) {
 
 /// Reports the status to systemd in one line and feeds the watchdog. Feeding needs what a call needs: a timer, a
 /// runtime thread, and the locks of status and mirror. So it proves that calls work.
-async fn report_status(parts: Arc<Parts>, stop: CancellationToken) {
+async fn report_status(parts: Arc<Context>, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));

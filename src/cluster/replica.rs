@@ -7,7 +7,7 @@ use thiserror::Error;
 use super::{
     etcd::{self, Etcd, EtcdError, Kv},
     journal::{self, JournalError, Keys, Manifest, Progress, Put},
-    machine::{Answer, Op, Settings, View},
+    machine::{EtcdAnswer, Op, Settings, View},
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
 
@@ -32,7 +32,7 @@ pub enum ReplicaError {
 
 /// The part of the state in etcd that was not known yet.
 #[derive(Debug)]
-pub struct Loaded {
+pub struct LoadedState {
     /// The keys `leader` and `alive`, read at the same moment.
     pub view: View,
     /// The snapshot that the records follow. `None` if they follow the known state.
@@ -58,7 +58,7 @@ impl Replica {
     /// # Errors
     ///
     /// Why the state is unknown.
-    pub async fn load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
+    pub async fn load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
         let mut attempt = 1;
         loop {
             match self.try_load(known).await {
@@ -73,9 +73,9 @@ impl Replica {
         }
     }
 
-    async fn try_load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
+    async fn try_load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
         let found = self.client.range(&self.keys.small(), self.limit).await?;
-        let mut loaded = Loaded {
+        let mut loaded = LoadedState {
             view: etcd::view_of(&found, &self.keys)?,
             checkpoint: None,
             records: Vec::new(),
@@ -167,7 +167,7 @@ impl Replica {
         settings: &Settings,
         op: &Op,
         entry: Option<&Put>,
-    ) -> Result<Answer, ReplicaError> {
+    ) -> Result<EtcdAnswer, ReplicaError> {
         Ok(self
             .client
             .run(&self.keys, settings, op, entry, self.limit)

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use super::{Ledger, Mark, delivery::Delivery};
 use crate::{
-    checkpoint::format::Entry,
+    checkpoint::format::RecordContent,
     cluster::sharing::Source,
     master::{Kind, Method, Request, is_success},
     order::Concern,
@@ -178,7 +178,7 @@ impl Ledger {
         // Outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
-        let entries = writes.iter().map(|&call| Entry::Call {
+        let entries = writes.iter().map(|&call| RecordContent::Call {
             call: call.clone().into(),
             pending: true,
         });

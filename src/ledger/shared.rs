@@ -6,7 +6,7 @@ use tokio::sync::watch;
 
 use super::{Inner, Ledger, Superseded};
 use crate::{
-    checkpoint::format::{Entry, Record},
+    checkpoint::format::{Record, RecordContent},
     cluster::{
         merge::Verdict,
         sharing::{Change, Sharing, Source},
@@ -178,9 +178,10 @@ impl Ledger {
         if !inner.is_elsewhere() {
             return Err(Superseded);
         }
-        let entries: Vec<Entry> = records.iter().map(|record| record.entry.clone()).collect();
+        let entries: Vec<RecordContent> =
+            records.iter().map(|record| record.entry.clone()).collect();
         for entry in &entries {
-            if let Entry::Call { call, .. } = entry {
+            if let RecordContent::Call { call, .. } = entry {
                 inner
                     .mirror
                     .apply_telling(&Request::from(call.clone()), &mut ());
@@ -221,12 +222,12 @@ impl Inner {
     }
 
     /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
-    pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
+    pub(super) fn share(&mut self, entries: &[RecordContent], sources: &[&Source]) {
         let Shared::Here { sharing, .. } = &mut self.shared else {
             return;
         };
         for (index, entry) in entries.iter().enumerate() {
-            if let Entry::Call { call, .. } = entry {
+            if let RecordContent::Call { call, .. } = entry {
                 let source = sources.get(index).copied().unwrap_or(&Source::Here);
                 sharing.record(&Request::from(call.clone()), source);
             }
@@ -281,7 +282,7 @@ mod tests {
     }
 
     fn record(seq: u64, call: Request) -> Record {
-        let entry = Entry::call(call.into());
+        let entry = RecordContent::call(call.into());
         Record { seq, entry }
     }
 

@@ -3,10 +3,10 @@
 use std::time::Instant;
 
 use rosrescue::{
-    checkpoint::format::{self, Checkpoint, Entry, Record, Session},
+    checkpoint::format::{self, Checkpoint, Record, RecordContent, Session},
     cluster::{
         journal::{self, Progress},
-        machine::{Answer, Guard, Op},
+        machine::{EtcdAnswer, Op, RevisionGuard},
         replica::{Replica, ReplicaError},
     },
     xmlrpc::Call,
@@ -26,14 +26,14 @@ fn record(seq: u64, bytes: usize) -> Record {
     let key = format!("/p{seq}");
     let value = "x".repeat(bytes);
     let params = ["/n", key.as_str(), value.as_str()].map(Into::into);
-    let entry = Entry::call(Call::new("setParam", params.to_vec()));
+    let entry = RecordContent::call(Call::new("setParam", params.to_vec()));
     Record { seq, entry }
 }
 
 /// A leader, as simple as possible.
 struct Leader {
     replica: Replica,
-    guard: Guard,
+    guard: RevisionGuard,
     beat: u64,
 }
 
@@ -49,10 +49,10 @@ impl Leader {
             settled: true,
         };
         let answer = replica.run(&settings("a"), &claim, None).await.unwrap();
-        let Answer::Applied { revision, .. } = answer else {
+        let EtcdAnswer::Applied { revision, .. } = answer else {
             panic!("{answer:?}");
         };
-        let guard = Guard {
+        let guard = RevisionGuard {
             leader: revision,
             alive: revision,
         };
@@ -84,7 +84,7 @@ impl Leader {
             let settings = settings("a");
             let answer = self.replica.run(&settings, &beat, entry.as_ref());
             let answer = answer.await.unwrap();
-            let Answer::Applied { revision, seq } = answer else {
+            let EtcdAnswer::Applied { revision, seq } = answer else {
                 panic!("{answer:?}");
             };
             self.guard.alive = revision;
@@ -245,7 +245,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
         settled: true,
     };
     let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
-    let Answer::Applied { revision, seq: 3 } = answer.unwrap() else {
+    let EtcdAnswer::Applied { revision, seq: 3 } = answer.unwrap() else {
         panic!("no journal holds the state");
     };
     leader.guard.alive = revision;

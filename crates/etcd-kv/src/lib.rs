@@ -22,11 +22,11 @@ use bytes::Bytes;
 use serde_json::json;
 use tokio::task::JoinSet;
 
-pub use connection::Access;
+pub use connection::Credentials;
 use connection::Endpoint;
 pub use error::EtcdError;
 pub use tls::Tls;
-pub use watch::{Change, Watch, WatchEnd};
+pub use watch::{KeyChange, Watch, WatchEnd};
 pub use wire::{Kv, Txn, TxnOp, TxnResult};
 
 /// Time without an answer after which the next endpoint is asked as well. A transaction takes 1 to 20 ms.
@@ -41,7 +41,7 @@ const PAGE: usize = 32;
 pub struct Options {
     /// The endpoints, each `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
-    pub access: Access,
+    pub access: Credentials,
 }
 
 /// A client for an etcd cluster.
@@ -69,7 +69,7 @@ pub struct Tried {
 
 /// The status that an etcd member reports.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Status {
+pub struct MemberStatus {
     pub endpoint: String,
     pub version: String,
     pub db_bytes: u64,
@@ -201,7 +201,7 @@ impl Client {
     }
 
     /// The status that each endpoint reports.
-    pub async fn status(&self, limit: Duration) -> Vec<Result<Status, EtcdError>> {
+    pub async fn status(&self, limit: Duration) -> Vec<Result<MemberStatus, EtcdError>> {
         let mut asked = JoinSet::new();
         for index in 0..self.endpoints.len() {
             let client = self.clone();
@@ -212,7 +212,7 @@ impl Client {
         found.into_iter().map(|(_, status)| status).collect()
     }
 
-    async fn status_of(&self, index: usize, limit: Duration) -> Result<Status, EtcdError> {
+    async fn status_of(&self, index: usize, limit: Duration) -> Result<MemberStatus, EtcdError> {
         let Some(endpoint) = self.endpoints.get(index) else {
             return Err(EtcdError::Options("there is no such endpoint".to_owned()));
         };

@@ -30,11 +30,11 @@ use std::{
 
 pub use self::{
     by_subject::BySubject,
-    outbox::Next,
+    outbox::NextNotification,
     subject::{Concern, Heard, Subject, heard_by_read},
 };
 use self::{
-    outbox::{Content, Outbox},
+    outbox::{Outbox, Payload},
     under_way::UnderWay,
 };
 use crate::{master::Master, xmlrpc::Call};
@@ -98,7 +98,10 @@ impl Order {
             // Notifications that wait there are older than the answer.
             self.outbox.renew(port, subject);
         }
-        Some(self.under_way.add(under_way::Kind::Answer, heard, None))
+        Some(
+            self.under_way
+                .add(under_way::DeliveryKind::Answer, heard, None),
+        )
     }
 
     /// Notes that the answer is ready. From now on it delays others only for a limited time.
@@ -180,14 +183,14 @@ impl Order {
     /// already, `call` may be older than what that master has sent. Then the node is told the state instead.
     pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
         let is_news = !self.in_flight.tells.has(&subject);
-        let content = is_news.then_some(Content::Call(call));
+        let content = is_news.then_some(Payload::Call(call));
         self.outbox
-            .add(port, subject, content.unwrap_or(Content::State));
+            .add(port, subject, content.unwrap_or(Payload::State));
     }
 
     /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
     pub fn tell_state(&mut self, port: &str, subject: Subject) {
-        self.outbox.add(port, subject, Content::State);
+        self.outbox.add(port, subject, Payload::State);
     }
 
     /// Like [`Self::tell_state`], but not before `at`.
@@ -201,17 +204,17 @@ impl Order {
     }
 
     /// What to do next for the node at `port`.
-    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> Next {
+    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> NextNotification {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
             let answer = self.under_way.answer_to(now, port, subject);
             let written = match answer {
                 Some(under_way::Answer::UnderWay { limit }) => {
                     self.awaited = true;
-                    return Next::Wait { until: limit };
+                    return NextNotification::Wait { until: limit };
                 }
                 Some(under_way::Answer::Written { at }) if now < at + LEAD => {
-                    return Next::Wait {
+                    return NextNotification::Wait {
                         until: Some(at + LEAD),
                     };
                 }
@@ -243,12 +246,12 @@ impl Order {
                 subject,
             };
             let limit = Some(now + NOTIFICATION_LIMIT);
-            let kind = under_way::Kind::Notification;
+            let kind = under_way::DeliveryKind::Notification;
             let number = self.under_way.add(kind, vec![heard], limit);
-            return Next::Send { call, number };
+            return NextNotification::Send { call, number };
         }
         self.outbox.remove(port);
-        Next::Idle
+        NextNotification::Idle
     }
 
     /// Notes that the node has taken the notification with this number, so that it reads later ones after it; or that
@@ -272,7 +275,7 @@ impl Order {
     /// Queues the repeats that are due.
     pub fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
-            self.outbox.add(&port, subject, Content::StateAgain);
+            self.outbox.add(&port, subject, Payload::StateAgain);
         }
     }
 

@@ -16,10 +16,10 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
-    app::{duty::Parts, startup},
-    checkpoint::session::Restore,
+    app::{duty::Context, startup},
+    checkpoint::session::RestorePolicy,
     cluster::{
-        etcd::{Access, Etcd, EtcdError, Options, Tls},
+        etcd::{Credentials, Etcd, EtcdError, Options, Tls},
         journal::Keys,
         machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
         member::{Member, Own},
@@ -36,12 +36,12 @@ use crate::{
 /// What a computer among several needs.
 pub(in crate::app) struct Given {
     pub(in crate::app) config: ClusterConfig,
-    pub(in crate::app) parts: Arc<Parts>,
+    pub(in crate::app) parts: Arc<Context>,
     pub(in crate::app) rosmaster: Rosmaster,
     pub(in crate::app) rosout: bool,
     /// Identifies this process.
     pub(in crate::app) instance: HeaderValue,
-    pub(in crate::app) restore: Restore,
+    pub(in crate::app) restore: RestorePolicy,
     /// How long a call waits that no component can answer.
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
@@ -57,7 +57,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
     let config = &given.config;
     let client = Etcd::new(&Options {
         endpoints: config.endpoints.clone(),
-        access: Access {
+        access: Credentials {
             tls: Tls {
                 ca: config.ca.clone(),
                 cert: config.cert.clone(),

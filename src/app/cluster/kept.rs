@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::{
     checkpoint::{
-        format::{Checkpoint, Entry},
+        format::{Checkpoint, RecordContent},
         session,
         store::{self, Store, StoreError},
     },
@@ -65,7 +65,7 @@ impl Kept {
         };
         let base = session::rebuild(loaded.checkpoint, Vec::new()).mirror;
         let calls = loaded.records.into_iter().filter_map(|record| {
-            let Entry::Call { call, .. } = record.entry else {
+            let RecordContent::Call { call, .. } = record.entry else {
                 return None;
             };
             Some(Request::from(call))
@@ -152,9 +152,9 @@ impl Kept {
     }
 }
 
-fn entries(calls: Vec<Request>) -> Vec<Entry> {
+fn entries(calls: Vec<Request>) -> Vec<RecordContent> {
     let calls = calls.into_iter();
-    calls.map(|call| Entry::call(call.into())).collect()
+    calls.map(|call| RecordContent::call(call.into())).collect()
 }
 
 fn remove_files(path: PathBuf) {

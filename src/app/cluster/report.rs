@@ -7,7 +7,7 @@ use crate::{
     checkpoint::format::shown,
     cluster::{
         member::{Cause, News},
-        merge::wire::Outcome,
+        merge::wire::WriteOutcome,
     },
     hide::Hide,
     limit::{Pair, alarm, all_clear, rarely},
@@ -105,16 +105,16 @@ pub(super) fn cause(of: Cause) -> &'static str {
 
 /// Logs the lost ones among the writes that were answered while cut off. One line per subject, because a node may
 /// have written to it a thousand times.
-pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
+pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
     for (call, outcome) in &outcomes {
         let node = call.caller().unwrap_or_default();
         let method = call.method().name();
         match outcome {
-            Outcome::Holds => {}
+            WriteOutcome::Holds => {}
             // Others have deleted the parameter, too.
-            Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
-            Outcome::Refused(text) => {
+            WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+            WriteOutcome::Refused(text) => {
                 tracing::warn!(
                     method,
                     node,
@@ -122,7 +122,7 @@ pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, Outcome)>) {
                     "the leader refused a write made while this computer was cut off"
                 );
             }
-            Outcome::Lost { why, present } => match parameter(call) {
+            WriteOutcome::Lost { why, present } => match parameter(call) {
                 Some((key, value)) => {
                     let alone = shown_value(hide, &key, value);
                     let others = shown_value(hide, &key, present.as_ref());

@@ -9,7 +9,7 @@ use tokio::{
 
 use super::*;
 use crate::{
-    checkpoint::format::{Entry, Record, Session},
+    checkpoint::format::{Record, RecordContent, Session},
     cli::{Reads, SyncPolicy},
     gate,
     ledger::Ledger,
@@ -402,7 +402,7 @@ async fn a_subscription_that_is_there_already_waits_for_no_leader() {
     let subscribe = |key| Request::new(Method::SubscribeParam, ["/n", "http://n:1/", key]);
     let record = Record {
         seq: 1,
-        entry: Entry::call(subscribe("/a").into()),
+        entry: RecordContent::call(subscribe("/a").into()),
     };
     let prompt = 5 * PATIENCE;
     for standing in [leader(None).await, Standing::Nobody { known: true }] {

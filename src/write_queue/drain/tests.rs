@@ -9,7 +9,7 @@ use crate::{
     gate::gate,
     health::port_of,
     lifecycle::Patience,
-    order::{Next as Notification, REPEAT_AFTER, Subject},
+    order::{NextNotification as Notification, REPEAT_AFTER, Subject},
     ros_env::MasterUri,
     upstream::{Head, Upstream, verify::Verification},
     write_queue::write_queue,

@@ -4,9 +4,9 @@
 use std::collections::VecDeque;
 
 use crate::{
-    checkpoint::format::{Entry, Record},
+    checkpoint::format::{Record, RecordContent},
     cluster::{
-        merge::{self, Changes, Pending},
+        merge::{self, Changes, WritesToSend},
         mutant::Mutant,
         sharing::Change,
     },
@@ -24,7 +24,7 @@ pub struct Time {
     /// The state when this computer was cut off.
     pub base: Master,
     /// The writes answered since.
-    pub pending: Pending,
+    pub pending: WritesToSend,
     /// The others' changes since.
     pub changes: Changes,
     /// How many of the writes may also be in the journal.
@@ -35,7 +35,7 @@ impl Time {
     fn new(base: Master) -> Self {
         Self {
             base,
-            pending: Pending::default(),
+            pending: WritesToSend::default(),
             changes: Changes::default(),
             expected: 0,
         }
@@ -106,7 +106,7 @@ impl CutOff {
     pub fn note(&mut self, records: &[Record]) {
         for time in &mut self.times {
             for record in records {
-                if let Entry::Call { call, .. } = &record.entry {
+                if let RecordContent::Call { call, .. } = &record.entry {
                     time.changes.note(record.seq, &Request::from(call.clone()));
                 }
             }
@@ -148,7 +148,7 @@ impl CutOff {
             let Change::Call(record, _) = change else {
                 continue;
             };
-            let Entry::Call { call, .. } = &record.entry else {
+            let RecordContent::Call { call, .. } = &record.entry else {
                 continue;
             };
             let call = Request::from(call.clone());
@@ -205,7 +205,7 @@ mod tests {
     }
 
     fn record(seq: u64, call: Request) -> Record {
-        let entry = Entry::call(call.into());
+        let entry = RecordContent::call(call.into());
         Record { seq, entry }
     }
 

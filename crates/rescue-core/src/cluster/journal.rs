@@ -236,7 +236,7 @@ impl Manifest {
 
 /// The records that one transaction adds to the journal.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Batch {
+pub struct JournalBatch {
     /// How many of the records it contains.
     pub count: usize,
     pub entry: Option<Put>,
@@ -248,7 +248,7 @@ pub struct Batch {
 ///
 /// [`JournalError::TooLarge`] if the first record is too large for the journal. Such a call must not be run: see
 /// [`check_size`].
-pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
+pub fn pack(keys: &Keys, records: &[Record]) -> Result<JournalBatch, JournalError> {
     let (mut value, mut seq, mut count) = (Vec::new(), 0, 0);
     for record in records.iter().take(BATCH_RECORDS) {
         let before = value.len();
@@ -260,7 +260,7 @@ pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
         (seq, count) = (record.seq, count + 1);
     }
     if count == 0 {
-        return Ok(Batch::default());
+        return Ok(JournalBatch::default());
     }
     check_size(value.len())?;
     if value.len() > BATCH_BYTES {
@@ -269,7 +269,7 @@ pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
     }
     let key = keys.journal(seq);
     let entry = Some(Put { key, value });
-    Ok(Batch { count, entry })
+    Ok(JournalBatch { count, entry })
 }
 
 /// The parts of a large record, which must be written before its transaction, one by one. Without the transaction

@@ -14,9 +14,10 @@ mod session;
 mod types;
 
 use self::flight::{Flight, Reign};
-pub use self::session::Session;
+pub use self::session::JournalSession;
 pub use types::{
-    Action, Alive, Answer, Commit, Guard, Input, Leader, Op, Role, Settings, View, WhenAlone,
+    Action, Alive, Commit, EtcdAnswer, Input, Leader, Op, RevisionGuard, Role, Settings, View,
+    WhenAlone,
 };
 
 /// How long a request may take before it counts as [`Answer::Silence`]. It is longer than a time to live, because an
@@ -57,7 +58,7 @@ pub struct Machine {
     followed: u64,
     /// Whether the mirror must be rebuilt from the journal.
     stale: bool,
-    session: Session,
+    session: JournalSession,
     recorded: u64,
     committed: u64,
     acknowledged: u64,
@@ -85,7 +86,7 @@ impl Machine {
             claims: 0,
             followed: 0,
             stale: false,
-            session: Session::default(),
+            session: JournalSession::default(),
             recorded: 0,
             committed: 0,
             acknowledged: 0,
@@ -119,7 +120,7 @@ impl Machine {
     }
 
     /// What is known about the journal's session.
-    pub fn session(&self) -> Session {
+    pub fn session(&self) -> JournalSession {
         self.session
     }
 
@@ -216,16 +217,22 @@ impl Machine {
         if let Some(number) = lost.map(|flight| flight.number)
             && !Mutant::WaitsForEver.lives()
         {
-            self.answered(now, number, Answer::Silence, &mut Vec::new());
+            self.answered(now, number, EtcdAnswer::Silence, &mut Vec::new());
         }
     }
 
-    fn answered(&mut self, now: Instant, number: u64, answer: Answer, actions: &mut Vec<Action>) {
+    fn answered(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: EtcdAnswer,
+        actions: &mut Vec<Action>,
+    ) {
         let Some(flight) = self.flight.take_if(|flight| flight.number == number) else {
             return;
         };
         let view = match answer {
-            Answer::Silence => {
+            EtcdAnswer::Silence => {
                 self.retry_at = Some(now + RETRY);
                 // Its effect is unknown, so it is sent again. The keys show whether a claim succeeded.
                 self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
@@ -234,8 +241,8 @@ impl Machine {
                 });
                 return;
             }
-            Answer::Is(view) => view,
-            Answer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
+            EtcdAnswer::Is(view) => view,
+            EtcdAnswer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
         };
         self.retry_at = None;
         self.flight = Some(flight);
@@ -299,7 +306,7 @@ impl Machine {
         self.settings.id.push('+');
         (self.observed, self.heard) = (Some(now), Some(now));
         (self.peer, self.retry_at) = (None, None);
-        self.session = Session::GoesOn;
+        self.session = JournalSession::GoesOn;
         self.claim_not_before = Some(until);
         self.view = view;
         self.follow_to(0);

@@ -11,7 +11,7 @@ use std::{
 };
 
 use crate::{
-    checkpoint::format::{Entry as JournalEntry, Record},
+    checkpoint::format::{Record, RecordContent as JournalEntry},
     cluster::{
         cut_off::CutOff,
         displaced::DisplacedLately,
@@ -87,7 +87,7 @@ struct Namesake {
     /// Set if the member entry of this name belongs to another computer.
     sign: Option<Sign>,
     /// Looks for such a computer. Set once etcd has been read.
-    watch: Option<namesake::Watch>,
+    watch: Option<namesake::NamesakeWatch>,
     /// Whether this process has led.
     led: bool,
 }
@@ -348,7 +348,7 @@ impl Member {
     /// Whether the mirror may answer: its state is that of the session which continues.
     fn knows(&self) -> bool {
         self.own.restored
-            || self.reading.loaded && self.machine.session() == machine::Session::GoesOn
+            || self.reading.loaded && self.machine.session() == machine::JournalSession::GoesOn
     }
 
     /// Whether writes answered now are kept for a later leader.

@@ -13,8 +13,8 @@ use std::fmt;
 use self::changes::param_of;
 pub(super) use self::changes::value_at;
 pub use self::{
-    changes::{Changes, Subject},
-    pending::{Pending, weight},
+    changes::{ChangeSubject, Changes},
+    pending::{WritesToSend, weight},
 };
 use crate::{
     master::{Master, Method, Request, names},
@@ -111,7 +111,7 @@ pub fn merge<'a>(
             Verdict::Lost(lost) => merged.lost.push(lost),
         }
         if let Some(path) = path.filter(|_| *call.method() == Method::DeleteParam) {
-            deleted.add(Subject::Param(path));
+            deleted.add(ChangeSubject::Param(path));
         }
     }
     merged.send.reverse();
@@ -157,7 +157,7 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
     let name = || Some(names::resolve(call.text(1)?, caller));
     let node = |at: usize| node(changes, now, caller, call.text(at)?);
     let anew = |publishes| {
-        let subject = Subject::Topic {
+        let subject = ChangeSubject::Topic {
             publishes,
             topic: name()?,
             node: caller.to_owned(),
@@ -190,7 +190,7 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
 /// Whether others have a node `caller` at another address than `api`. A registration would end that node.
 fn node(changes: &Changes, now: &Master, caller: &str, api: &str) -> Option<Conflict> {
     let holder = now.api_of(caller).filter(|holder| *holder != api)?;
-    let theirs = changes.has(&Subject::Node(caller.to_owned()));
+    let theirs = changes.has(&ChangeSubject::Node(caller.to_owned()));
     theirs.then(|| Conflict::Node {
         name: caller.to_owned(),
         api: holder.to_owned(),
@@ -200,7 +200,7 @@ fn node(changes: &Changes, now: &Master, caller: &str, api: &str) -> Option<Conf
 /// Whether another node provides the service that is at `api` on this computer.
 fn service(changes: &Changes, now: &Master, name: &str, api: &str) -> Option<Conflict> {
     let provider = now.registry().services.get(name)?;
-    let theirs = changes.has(&Subject::Service(name.to_owned()));
+    let theirs = changes.has(&ChangeSubject::Service(name.to_owned()));
     (provider.api != api && theirs).then(|| Conflict::Service {
         name: name.to_owned(),
         node: provider.node.clone(),

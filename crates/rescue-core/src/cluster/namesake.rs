@@ -50,13 +50,13 @@ pub fn sign_of_leader(own: &Settings, view: &View) -> Option<Sign> {
 
 /// The evidence at the start, and when it was seen.
 #[derive(Clone, Debug)]
-pub struct Watch {
+pub struct NamesakeWatch {
     first: Vec<Sign>,
     since: Instant,
     hold: Option<Instant>,
 }
 
-impl Watch {
+impl NamesakeWatch {
     /// Creates a watch. `first` is the evidence in etcd at `now`, `ttl` the time to live of a leader.
     pub fn new(now: Instant, ttl: Duration, first: Vec<Sign>) -> Self {
         let limits = first.iter().map(|sign| match sign.key {
@@ -169,7 +169,7 @@ mod tests {
     fn a_namesake_is_alive_if_its_keys_change_and_forgotten_if_they_do_not() {
         let now = Instant::now();
         let there = "http://10.0.0.2:11311/";
-        let watch = Watch::new(now, TTL, vec![member(there, 5)]);
+        let watch = NamesakeWatch::new(now, TTL, vec![member(there, 5)]);
         assert_eq!(watch.hold(), Some(now + MEMBER_SAYS));
         assert!(!watch.is_over(now));
         assert_eq!(watch.living(now + TTL, &[member(there, 5)]), None);
@@ -179,7 +179,7 @@ mod tests {
         assert_eq!(watch.living(now + MEMBER_SAYS, &changed), None);
         let leader = |revision| sign_of_leader(&own("u"), &led("a", there, "", revision));
         let [first, next] = [5, 6].map(|revision| leader(revision).unwrap());
-        let watch = Watch::new(now, TTL, vec![first.clone()]);
+        let watch = NamesakeWatch::new(now, TTL, vec![first.clone()]);
         assert_eq!(watch.hold(), Some(now + TTL));
         assert_eq!(watch.living(now, &[first]), None);
         assert_eq!(watch.living(now, std::slice::from_ref(&next)), Some(&next));
@@ -188,7 +188,7 @@ mod tests {
     #[test]
     fn of_two_that_start_together_the_one_that_does_not_lead_notices() {
         let now = Instant::now();
-        let watch = Watch::new(now, TTL, Vec::new());
+        let watch = NamesakeWatch::new(now, TTL, Vec::new());
         assert_eq!((watch.hold(), watch.suspect()), (None, None));
         let there = "http://10.0.0.2:11311/";
         assert_eq!(watch.living(now, &[member(there, 5)]), None);

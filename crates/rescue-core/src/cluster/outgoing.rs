@@ -3,7 +3,7 @@
 use std::{collections::VecDeque, ops::RangeInclusive};
 
 use crate::{
-    checkpoint::format::{self, Checkpoint, Entry, Record},
+    checkpoint::format::{self, Checkpoint, Record, RecordContent},
     cluster::{
         journal::{self, JournalError, Keys, Put},
         sharing::{Change, Source},
@@ -57,7 +57,7 @@ impl Outgoing {
         for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
             match change {
                 Change::Call(record, _) => {
-                    if let Entry::Call { call, .. } = &record.entry {
+                    if let RecordContent::Call { call, .. } = &record.entry {
                         state.apply_telling(&call.clone().into(), &mut ());
                     }
                 }
@@ -126,7 +126,7 @@ impl Outgoing {
     pub fn leave_out_next(&mut self) {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
-            let (seq, entry) = (next.seq(), Entry::call(master::get_pid()));
+            let (seq, entry) = (next.seq(), RecordContent::call(master::get_pid()));
             *next = Change::Call(Record { seq, entry }, Source::Here);
         }
     }
@@ -178,8 +178,8 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
 fn weight_of(change: &Change) -> usize {
     match change {
         Change::Call(record, _) => match &record.entry {
-            Entry::Call { call, .. } => call.params.iter().map(Value::size).sum(),
-            Entry::Session(_) => 0,
+            RecordContent::Call { call, .. } => call.params.iter().map(Value::size).sum(),
+            RecordContent::Session(_) => 0,
         },
         // There is one.
         Change::State { .. } => 0,
@@ -209,7 +209,7 @@ mod tests {
     fn call(seq: u64, bytes: usize) -> Change {
         let value = "x".repeat(bytes).as_str().into();
         let call = Call::new("setParam", vec!["/n".into(), "/p".into(), value]);
-        let entry = Entry::call(call);
+        let entry = RecordContent::call(call);
         Change::Call(Record { seq, entry }, Source::Here)
     }
 
@@ -348,7 +348,7 @@ mod tests {
         let [Change::Call(Record { seq: 6, entry }, _)] = instead.as_slice() else {
             panic!("{instead:?}");
         };
-        assert_eq!(*entry, Entry::call(master::get_pid()));
+        assert_eq!(*entry, RecordContent::call(master::get_pid()));
         assert_eq!(added(&outgoing, &keys, 7), [5, 6, 7]);
     }
 }

@@ -3,9 +3,9 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use crate::{
-    checkpoint::format::{self, Entry, Record},
+    checkpoint::format::{self, Record, RecordContent},
     cluster::{
-        merge::{self, Changes, Subject, Verdict},
+        merge::{self, ChangeSubject, Changes, Verdict},
         mutant::Mutant,
     },
     master::{Master, Request},
@@ -33,7 +33,7 @@ pub enum Source {
 struct Recent {
     /// The list is complete after this record.
     after: u64,
-    changes: VecDeque<(u64, Source, Vec<Subject>)>,
+    changes: VecDeque<(u64, Source, Vec<ChangeSubject>)>,
     bytes: usize,
 }
 
@@ -47,7 +47,11 @@ impl Recent {
     }
 
     fn add(&mut self, seq: u64, source: &Source, call: &Request) {
-        let subjects: Vec<_> = call.calls().into_iter().flat_map(Subject::of).collect();
+        let subjects: Vec<_> = call
+            .calls()
+            .into_iter()
+            .flat_map(ChangeSubject::of)
+            .collect();
         self.bytes += bytes_of(&subjects);
         self.changes.push_back((seq, source.clone(), subjects));
         while (self.changes.len() > RECENT_MOST || self.bytes > RECENT_BYTES_MOST)
@@ -74,8 +78,8 @@ impl Recent {
     }
 }
 
-fn bytes_of(subjects: &[Subject]) -> usize {
-    subjects.iter().map(Subject::size).sum()
+fn bytes_of(subjects: &[ChangeSubject]) -> usize {
+    subjects.iter().map(ChangeSubject::size).sum()
 }
 
 /// A change that the other computers must get.
@@ -127,7 +131,7 @@ impl Sharing {
     pub fn record(&mut self, call: &Request, source: &Source) {
         let record = Record {
             seq: self.last + 1,
-            entry: Entry::call(call.clone().into()),
+            entry: RecordContent::call(call.clone().into()),
         };
         if format::push_record(&mut Vec::new(), &record).is_ok() {
             self.last += 1;

@@ -41,9 +41,9 @@ fn holds(order: &mut Order, now: Instant, call: &Request) -> bool {
 }
 
 /// The list of publishers in the `publisherUpdate` to send, and the number of the notification.
-fn sent(next: Next) -> (Value, u64) {
+fn sent(next: NextNotification) -> (Value, u64) {
     match next {
-        Next::Send { call, number } => (call.params[2].clone(), number),
+        NextNotification::Send { call, number } => (call.params[2].clone(), number),
         other => panic!("{other:?}"),
     }
 }
@@ -119,10 +119,16 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     let update = Arc::new(mirror.publisher_update("/t"));
     order.notify(A, topic("/t"), update.clone());
     assert_eq!(order.take_idle_ports(), [A]);
-    assert_eq!(order.next(start, A, &mirror), Next::Wait { until: None });
+    assert_eq!(
+        order.next(start, A, &mirror),
+        NextNotification::Wait { until: None }
+    );
     assert!(order.written(start, number));
     let until = Some(start + LEAD);
-    assert_eq!(order.next(start, A, &mirror), Next::Wait { until });
+    assert_eq!(
+        order.next(start, A, &mirror),
+        NextNotification::Wait { until }
+    );
     let now = start + LEAD;
     let (list, number) = sent(order.next(now, A, &mirror));
     assert_eq!(list, update.params[2]);
@@ -134,7 +140,7 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
         &publish("/c", "/t")
     ));
     order.taken(number);
-    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
 
     let again = order.next_repeat().unwrap();
     assert_eq!(again, now + REPEAT_AFTER);
@@ -144,7 +150,7 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     order.taken(number);
     assert_eq!(
         (order.next(again, A, &mirror), order.next_repeat()),
-        (Next::Idle, None)
+        (NextNotification::Idle, None)
     );
 }
 
@@ -172,12 +178,15 @@ fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
             subject: topic("/t"),
         }],
     );
-    assert_eq!(order.next(now, A, &mirror), Next::Wait { until: None });
+    assert_eq!(
+        order.next(now, A, &mirror),
+        NextNotification::Wait { until: None }
+    );
     order.written(now, 2);
     let (last, number) = sent(order.next(now + LEAD, A, &mirror));
     assert_eq!(last, lists[2]);
     order.taken(number);
-    assert_eq!(order.next(now + LEAD, A, &mirror), Next::Idle);
+    assert_eq!(order.next(now + LEAD, A, &mirror), NextNotification::Idle);
 }
 
 #[test]
@@ -194,7 +203,7 @@ fn notifications_that_pile_up_are_reduced_to_one_per_subject() {
         order.notify(A, param("/k/"), update);
     }
     let mut values = Vec::new();
-    while let Next::Send { call, number } = order.next(now, A, &mirror) {
+    while let NextNotification::Send { call, number } = order.next(now, A, &mirror) {
         values.push(call.params[2].as_int().unwrap());
         order.taken(number);
     }
@@ -209,19 +218,19 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     let old = Arc::new(mirror.publisher_update("/t"));
     order.notify(A, topic("/t"), old);
     order.sent(&[topic("/t")], Vec::new());
-    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
     mirror.apply(&publish("/b", "/t"));
     order.told_by_master(now, &topic("/t"), 1);
     assert!(!order.settled());
     order.tell_state(A, topic("/t"));
-    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
     let later = order.next_repeat().unwrap();
     assert_eq!(later, now + MASTER_TAKES + REPEAT_AFTER);
     order.repeat(later);
     let (list, number) = sent(order.next(later, A, &mirror));
     assert_eq!(list, mirror.publisher_update("/t").params[2]);
     order.taken(number);
-    assert_eq!(order.next(later, A, &mirror), Next::Idle);
+    assert_eq!(order.next(later, A, &mirror), NextNotification::Idle);
     // After the master's death, rosrescue's notification is sent at once. It is repeated, because the node may read the
     // master's later.
     order.told_by_master(later, &topic("/t"), 1);

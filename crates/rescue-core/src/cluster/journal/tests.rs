@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::{
-    checkpoint::format::{Checkpoint, Entry, Session},
+    checkpoint::format::{Checkpoint, RecordContent, Session},
     xmlrpc::Call,
 };
 
@@ -15,7 +15,7 @@ fn record(seq: u64, bytes: usize) -> Record {
         "setParam",
         vec!["/n".into(), format!("/p{seq}").as_str().into(), value],
     );
-    let entry = Entry::call(call);
+    let entry = RecordContent::call(call);
     Record { seq, entry }
 }
 
@@ -89,7 +89,7 @@ fn what_is_written_is_read_whatever_its_size() {
     };
     let session = Record {
         seq: 1,
-        entry: Entry::Session(session),
+        entry: RecordContent::Session(session),
     };
     assert_eq!(through(std::slice::from_ref(&session)).0, [session]);
 }
@@ -101,7 +101,7 @@ fn a_record_that_is_too_large_is_refused_with_a_reason() {
     assert!(matches!(error, JournalError::TooLarge { .. }));
     assert!(error.to_string().contains("in parts"), "{error}");
     assert_eq!(check_size(20 << 20), Ok(()));
-    assert_eq!(pack(&keys, &[]), Ok(Batch::default()));
+    assert_eq!(pack(&keys, &[]), Ok(JournalBatch::default()));
 }
 
 #[test]

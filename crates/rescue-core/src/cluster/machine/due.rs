@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::{
-    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, RETRY,
-    Reign, Role, Session, Settings,
+    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, JournalSession, Machine, Op,
+    PATIENCE, RETRY, Reign, Role, Settings,
 };
 
 impl Machine {
@@ -24,7 +24,7 @@ impl Machine {
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()
-            && self.session != Session::Unknown
+            && self.session != JournalSession::Unknown
             && self.is_sole(now)
             && let Some(reign) = &mut self.reign
         {

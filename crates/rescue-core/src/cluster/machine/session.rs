@@ -7,7 +7,7 @@ use super::types::Alive;
 
 /// What is known about the journal's session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Session {
+pub enum JournalSession {
     /// Nothing: no computer was seen leading it. The next leader has to decide.
     #[default]
     Unknown,
@@ -17,7 +17,7 @@ pub enum Session {
     Over(u64),
 }
 
-impl Session {
+impl JournalSession {
     /// Applies the shell's decision about the journal up to record `seq`, unless another computer was faster.
     pub(super) fn decided(&mut self, seq: u64, goes_on: bool) {
         if *self == Self::Unknown {

@@ -88,8 +88,8 @@ pub struct View {
 
 impl View {
     /// The revisions that a transaction expects.
-    pub fn guard(&self) -> Guard {
-        Guard {
+    pub fn guard(&self) -> RevisionGuard {
+        RevisionGuard {
             leader: self.leader.as_ref().map_or(0, |leader| leader.term),
             alive: self.alive.as_ref().map_or(0, |alive| alive.revision),
         }
@@ -103,7 +103,7 @@ impl View {
 
 /// The revisions that both keys must have for a transaction to succeed. 0 stands for a missing key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub struct Guard {
+pub struct RevisionGuard {
     pub leader: u64,
     pub alive: u64,
 }
@@ -115,7 +115,7 @@ pub enum Op {
     Read,
     /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
     Claim {
-        guard: Guard,
+        guard: RevisionGuard,
         claim: u64,
         seq: u64,
         settled: bool,
@@ -123,7 +123,7 @@ pub enum Op {
     /// Write `alive`, and the records after the last beat up to `seq`, or fewer if they are too many. A repeated beat
     /// may carry other records; at most one of them succeeds.
     Beat {
-        guard: Guard,
+        guard: RevisionGuard,
         beat: u64,
         seq: u64,
         released: Option<String>,
@@ -133,7 +133,7 @@ pub enum Op {
 
 /// The answer of etcd.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Answer {
+pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
     /// The transaction failed, or it was a read. These are the keys.
@@ -148,7 +148,7 @@ pub enum Input {
     /// The machine starts. The checkpoint contains the journal up to this record.
     Start(u64),
     /// The answer to request `number`.
-    Answer { number: u64, answer: Answer },
+    Answer { number: u64, answer: EtcdAnswer },
     /// The watch delivers the keys.
     View(View),
     /// The mirror contains the journal up to this record.

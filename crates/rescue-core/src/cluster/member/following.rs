@@ -6,7 +6,7 @@ use super::{AGAIN, Action, Entry, Heard, Member, News, Read};
 use crate::{
     checkpoint::format::Record,
     cluster::{
-        machine::{self, Leader, Role, Session, View},
+        machine::{self, JournalSession, Leader, Role, View},
         mutant::Mutant,
         namesake::{self, Sign},
         standing::Place,
@@ -100,7 +100,7 @@ impl Member {
     /// Finds out whether the session in etcd continues, if the machine waits for that.
     fn decide(&mut self, seq: u64) {
         let waits = self.machine.role() == Role::CatchingUp
-            && self.machine.session() == Session::Unknown
+            && self.machine.session() == JournalSession::Unknown
             && !self.deciding;
         if !waits {
             return;
@@ -306,7 +306,7 @@ impl Member {
     /// Delays the start if another computer may have this one's name.
     fn begin_watch_for_namesake(&mut self, now: Instant, view: &View) {
         let signs = self.signs_of_namesake(view);
-        let watch = namesake::Watch::new(now, self.settings().ttl, signs);
+        let watch = namesake::NamesakeWatch::new(now, self.settings().ttl, signs);
         if let (Some(until), Some(uri)) = (watch.hold(), watch.suspect()) {
             let uri = uri.to_owned();
             self.queue.start_by = self.queue.start_by.map(|_| until);

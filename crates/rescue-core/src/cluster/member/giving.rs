@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::{Action, Member, News, roles::is_ours};
 use crate::{
     cluster::{
-        machine::{self, Answer, Op, Role},
+        machine::{self, EtcdAnswer, Op, Role},
         sharing::Change,
     },
     master::Request,
@@ -23,7 +23,7 @@ impl Member {
             Ok(entry) => entry,
             Err(error) => {
                 self.tell(News::TooLarge(error.to_string()));
-                let answer = Answer::Silence;
+                let answer = EtcdAnswer::Silence;
                 return self.tell_machine(machine::Input::Answer { number, answer });
             }
         };

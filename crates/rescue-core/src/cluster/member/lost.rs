@@ -9,7 +9,7 @@ use std::{collections::BTreeMap, time::Instant};
 use super::{Action, Heard, Holds, Member, News};
 use crate::cluster::{
     journal::Progress,
-    machine::{self, Answer, View},
+    machine::{self, EtcdAnswer, View},
     mutant::Mutant,
     standing::Place,
 };
@@ -55,8 +55,8 @@ impl Lost {
 impl Member {
     /// Reads etcd again if `answer` shows an older revision than a known one. Either the answer is late, or etcd has lost
     /// its data.
-    pub(super) fn doubt_etcd(&mut self, now: Instant, answer: &Answer) {
-        if let Answer::Is(view) = answer
+    pub(super) fn doubt_etcd(&mut self, now: Instant, answer: &EtcdAnswer) {
+        if let EtcdAnswer::Is(view) = answer
             && view.revision < self.view().revision
         {
             self.reading.load_by(now);

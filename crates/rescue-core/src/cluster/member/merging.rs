@@ -12,7 +12,7 @@ use crate::{
         machine::Role,
         merge::{
             self, Changes, Lost, weight,
-            wire::{self, Ask, Outcome},
+            wire::{self, Ask, WriteOutcome},
         },
         mutant::Mutant,
     },
@@ -202,7 +202,7 @@ impl Member {
         &mut self,
         now: Instant,
         number: u64,
-        answer: Option<wire::Answer>,
+        answer: Option<wire::MergeAnswer>,
     ) {
         let Step::Asked(ask, _) = &mut self.merging.step else {
             return;
@@ -213,8 +213,8 @@ impl Member {
         let ask = ask.clone();
         match answer {
             None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
-            Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
-            Some(wire::Answer::Done(outcomes)) => {
+            Some(wire::MergeAnswer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
+            Some(wire::MergeAnswer::Done(outcomes)) => {
                 if self.merging.telling {
                     return self.told(now, &ask, &outcomes);
                 }
@@ -222,7 +222,8 @@ impl Member {
                     left.drain(..ask.calls.len().min(left.len()));
                 }
                 let lost_there = ask.calls.iter().zip(&outcomes);
-                let lost_there = lost_there.filter(|(_, of)| matches!(of, Outcome::Lost { .. }));
+                let lost_there =
+                    lost_there.filter(|(_, of)| matches!(of, WriteOutcome::Lost { .. }));
                 let lost_there = lost_there.filter_map(|(call, _)| parameter_of(call));
                 self.merging.untold.extend(lost_there);
                 self.report(ask.calls.into_iter().zip(outcomes).collect());
@@ -232,12 +233,12 @@ impl Member {
     }
 
     /// Handles the answer to a portion that set parameters again.
-    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[Outcome]) {
+    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
         let untold = &mut self.merging.untold;
         let before = untold.len();
         for (call, outcome) in ask.calls.iter().zip(outcomes) {
             // If it was changed meanwhile, nodes may have heard the new value before the lost one.
-            if !matches!(outcome, Outcome::Lost { .. }) {
+            if !matches!(outcome, WriteOutcome::Lost { .. }) {
                 call.text(1).map(|key| untold.remove(key));
             }
         }
@@ -247,13 +248,13 @@ impl Member {
         }
     }
 
-    fn report(&mut self, outcomes: Vec<(Request, Outcome)>) {
+    fn report(&mut self, outcomes: Vec<(Request, WriteOutcome)>) {
         for (call, outcome) in &outcomes {
             match outcome {
-                Outcome::Holds => self.merging.sent += 1,
+                WriteOutcome::Holds => self.merging.sent += 1,
                 // Others have deleted the parameter, too.
-                Outcome::Refused(_) if *call.method() == Method::DeleteParam => {}
-                Outcome::Refused(_) | Outcome::Lost { .. } => self.merging.lost += 1,
+                WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+                WriteOutcome::Refused(_) | WriteOutcome::Lost { .. } => self.merging.lost += 1,
             }
         }
         if !outcomes.is_empty() {

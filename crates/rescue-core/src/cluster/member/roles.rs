@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::{Action, Cause, Member, News};
 use crate::{
     cluster::{
-        machine::{Role, Session, WhenAlone},
+        machine::{JournalSession, Role, WhenAlone},
         mutant::Mutant,
         sharing::{Change, Source},
         standing::{Pass, Standing},
@@ -62,7 +62,7 @@ impl Member {
     }
 
     fn begin_to_lead(&mut self, now: Instant) {
-        let over = matches!(self.machine.session(), Session::Over(_));
+        let over = matches!(self.machine.session(), JournalSession::Over(_));
         let before = self.before.leader.take();
         let own = &self.settings().name;
         let cause = match before.as_ref().is_some_and(|(name, _)| name != own) {

@@ -8,8 +8,8 @@ use crate::{
     checkpoint::format::Record,
     cluster::{
         journal::{Progress, Put},
-        machine::{Answer, Op, Settings, View},
-        merge::wire::{self, Ask, Outcome},
+        machine::{EtcdAnswer, Op, Settings, View},
+        merge::wire::{self, Ask, WriteOutcome},
         namesake::{Key, Sign},
         sharing::Change,
         standing::Standing,
@@ -108,7 +108,7 @@ pub enum Input {
     /// The member starts.
     Begin,
     /// The answer to request `number` of the machine.
-    Answer { number: u64, answer: Answer },
+    Answer { number: u64, answer: EtcdAnswer },
     /// The watch delivers the leader's keys, new journal entries, and changed member entries.
     Watched {
         view: View,
@@ -134,7 +134,7 @@ pub enum Input {
     /// The result of [`Action::Merge`] `number`. `None` if the leader did not answer.
     Merged {
         number: u64,
-        answer: Option<wire::Answer>,
+        answer: Option<wire::MergeAnswer>,
     },
     /// The result of [`Action::WriteSnapshot`]: its place and its size in bytes. `None` if it was not written.
     SnapshotWritten(Option<(Progress, usize)>),
@@ -282,7 +282,7 @@ pub enum Action {
         to: Option<(String, u64)>,
     },
     /// Report the outcomes of writes that were answered while cut off.
-    Report(Vec<(Request, Outcome)>),
+    Report(Vec<(Request, WriteOutcome)>),
     /// Ask the rosrescue at `uri` whether it leads in `term`. Wait for a quarter of the time to live at most.
     Probe {
         number: u64,

@@ -13,7 +13,7 @@ use crate::{
 
 /// The subject of a call, by which two calls can conflict.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub enum Subject {
+pub enum ChangeSubject {
     /// A parameter: its resolved name, with a slash at the end.
     Param(String),
     /// A registration by this node.
@@ -26,7 +26,7 @@ pub enum Subject {
     },
 }
 
-impl Subject {
+impl ChangeSubject {
     /// The approximate size in bytes.
     pub fn size(&self) -> usize {
         size_of::<Self>()
@@ -92,7 +92,7 @@ pub(super) fn param_of(call: &Request) -> Option<String> {
 #[derive(Clone, Debug, Default)]
 pub struct Changes {
     params: BTreeSet<String>,
-    rest: HashSet<Subject>,
+    rest: HashSet<ChangeSubject>,
     own: Own,
 }
 
@@ -122,14 +122,16 @@ impl Changes {
         }
         for call in call.calls() {
             if !self.own.take(call) {
-                Subject::of(call).into_iter().for_each(|it| self.add(it));
+                ChangeSubject::of(call)
+                    .into_iter()
+                    .for_each(|it| self.add(it));
             }
         }
     }
 
-    pub fn add(&mut self, subject: Subject) {
+    pub fn add(&mut self, subject: ChangeSubject) {
         match subject {
-            Subject::Param(path) => {
+            ChangeSubject::Param(path) => {
                 self.params.insert(path);
             }
             other => {
@@ -146,12 +148,12 @@ impl Changes {
         for path in paths {
             let parts: Vec<&str> = names::parts(&path).collect();
             if !self.own.explains(&path, value_at(is.params(), &parts)) {
-                self.add(Subject::Param(path));
+                self.add(ChangeSubject::Param(path));
             }
         }
         for (node, api) in is.nodes() {
             if was.api_of(node) != Some(api) && !self.own.registers(node, api) {
-                self.add(Subject::Node(node.to_owned()));
+                self.add(ChangeSubject::Node(node.to_owned()));
             }
             for publishes in [true, false] {
                 let topics: Vec<_> = match publishes {
@@ -162,7 +164,7 @@ impl Changes {
                 let new = new.filter(|topic| !was.has_topic(node, publishes, topic));
                 for topic in new.filter(|_| !self.own.registers(node, api)) {
                     let (topic, node) = (topic.to_owned(), node.to_owned());
-                    self.rest.insert(Subject::Topic {
+                    self.rest.insert(ChangeSubject::Topic {
                         publishes,
                         topic,
                         node,
@@ -175,7 +177,7 @@ impl Changes {
             if was.registry().services.get(name) != Some(service)
                 && !self.own.registers(&service.node, node)
             {
-                self.add(Subject::Service(name.clone()));
+                self.add(ChangeSubject::Service(name.clone()));
             }
         }
     }
@@ -199,7 +201,7 @@ impl Changes {
                 .is_some_and(|below| below.starts_with(path))
     }
 
-    pub(super) fn has(&self, subject: &Subject) -> bool {
+    pub(super) fn has(&self, subject: &ChangeSubject) -> bool {
         self.rest.contains(subject)
     }
 }

@@ -26,7 +26,7 @@ struct Registered {
 
 /// Writes to be sent, in order, without those that later ones made superfluous.
 #[derive(Clone, Debug, Default)]
-pub struct Pending {
+pub struct WritesToSend {
     calls: BTreeMap<u64, Request>,
     last: u64,
     /// Parameters by path, and whether they are set or deleted.
@@ -36,7 +36,7 @@ pub struct Pending {
     others: HashMap<String, u64>,
 }
 
-impl Pending {
+impl WritesToSend {
     /// Adds a write that was answered. The entries of a multicall are writes of their own.
     pub fn add(&mut self, call: &Request) {
         for call in call.calls() {

@@ -4,7 +4,7 @@ use proptest::{collection::vec, prelude::*};
 
 mod model;
 
-use super::{Changes, Conflict, Merged, Pending, changes::param_path, merge};
+use super::{Changes, Conflict, Merged, WritesToSend, changes::param_path, merge};
 use crate::{
     master::{Master, Method, Notice, Request, is_success},
     xmlrpc::Value,
@@ -46,7 +46,7 @@ fn after(base: &[Request], there: &[Request], here: &[Request]) -> Merged {
     let base = state(&Master::default(), base);
     let mut changes = Changes::default();
     let now = changed(&base, there, &mut changes);
-    let mut pending = Pending::default();
+    let mut pending = WritesToSend::default();
     here.iter().for_each(|call| pending.add(call));
     merge(&changes, &now, pending.calls())
 }
@@ -145,7 +145,7 @@ fn where_only_states_are_known_what_differs_was_changed() {
 #[test]
 fn of_each_subject_only_what_makes_its_last_state_is_kept() {
     let kept = |calls: &[Request]| {
-        let mut pending = Pending::default();
+        let mut pending = WritesToSend::default();
         calls.iter().for_each(|call| pending.add(call));
         pending.calls().cloned().collect::<Vec<_>>()
     };

@@ -37,7 +37,7 @@ pub(super) struct Ledger {
     pub(super) sharing: Option<Sharing>,
     pub(super) unanswered: Vec<Unanswered>,
     /// Merged portions that wait for the journal up to a record: who has asked, and the answer.
-    pub(super) merges: Vec<(u64, Asker, wire::Answer)>,
+    pub(super) merges: Vec<(u64, Asker, wire::MergeAnswer)>,
     /// Counts the times that calls are recorded here.
     pub(super) reign: u64,
     pub(super) agreed: u64,
@@ -67,7 +67,7 @@ impl Ledger {
     }
 
     /// Nothing is recorded any more. Returns the portions that are not answered.
-    pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::Answer)> {
+    pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
         self.sharing = None;
         self.reign += 1;
         self.agreed = 0;

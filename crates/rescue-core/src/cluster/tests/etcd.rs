@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 
 use super::history::value_of;
 use crate::{
-    checkpoint::format::{self, Entry as JournalEntry, Record},
+    checkpoint::format::{self, Record, RecordContent as JournalEntry},
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
-        machine::{Alive, Answer, Leader, Op, Settings, View},
+        machine::{Alive, EtcdAnswer, Leader, Op, Settings, View},
         member::{Entry, Heard, Read, Said},
     },
     master::{Displaced, Master, Request},
@@ -139,13 +139,13 @@ impl Etcd {
     }
 
     /// Makes the transaction, if the keys are as it expects.
-    pub(super) fn run(&mut self, sent: &Sent) -> Answer {
+    pub(super) fn run(&mut self, sent: &Sent) -> EtcdAnswer {
         let expected = match &sent.op {
-            Op::Read => return Answer::Is(self.view.clone()),
+            Op::Read => return EtcdAnswer::Is(self.view.clone()),
             Op::Claim { guard, .. } | Op::Beat { guard, .. } => *guard,
         };
         if self.view.guard() != expected {
-            return Answer::Is(self.view.clone());
+            return EtcdAnswer::Is(self.view.clone());
         }
         self.view.revision += 1;
         let revision = self.view.revision;
@@ -185,7 +185,7 @@ impl Etcd {
             }
         }
         let seq = self.seq();
-        Answer::Applied { revision, seq }
+        EtcdAnswer::Applied { revision, seq }
     }
 
     fn set_alive(&mut self, beat: u64, seq: u64, released: Option<String>, settled: bool) {

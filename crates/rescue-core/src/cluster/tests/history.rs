@@ -7,7 +7,7 @@ use super::{
     world::COMPUTERS,
 };
 use crate::{
-    checkpoint::format::Entry as JournalEntry,
+    checkpoint::format::RecordContent as JournalEntry,
     cluster::machine::Commit,
     master::{Master, Method, Request},
     xmlrpc::Value,

@@ -15,9 +15,9 @@ use super::{
 use crate::{
     cluster::{
         journal::Progress,
-        machine::{ANSWER_LIMIT, Answer, Commit, Role, View, WhenAlone},
+        machine::{ANSWER_LIMIT, Commit, EtcdAnswer, Role, View, WhenAlone},
         member::{Action, Input, News},
-        merge::wire::{self, Ask, Outcome},
+        merge::wire::{self, Ask, WriteOutcome},
         sharing::Source,
         standing::{Pass, Place, Standing},
     },
@@ -340,7 +340,7 @@ impl World {
     fn request(&mut self, sent: Box<Sent>, awaited: bool) {
         let (at, life, number) = (sent.from, sent.life, sent.number);
         let silence = |number| {
-            let answer = Answer::Silence;
+            let answer = EtcdAnswer::Silence;
             Event::Input(at, life, Input::Answer { number, answer })
         };
         if !self.network.reaches_etcd(at) {
@@ -558,7 +558,9 @@ impl World {
             Action::Follow(records) => {
                 let computer = &mut self.computers[at];
                 for record in &records {
-                    if let crate::checkpoint::format::Entry::Call { call, .. } = &record.entry {
+                    if let crate::checkpoint::format::RecordContent::Call { call, .. } =
+                        &record.entry
+                    {
                         let call = Request::from(call.clone());
                         computer.ledger.mirror.apply_telling(&call, &mut ());
                         computer.disk.own.seq += 1;
@@ -613,7 +615,7 @@ impl World {
             }
             Action::Report(outcomes) => {
                 for (call, outcome) in outcomes {
-                    if !matches!(outcome, Outcome::Holds) {
+                    if !matches!(outcome, WriteOutcome::Holds) {
                         self.trace(|| format!("{at}: reports {call:?} {outcome:?}"));
                         self.counts.reported += 1;
                         self.history.reported(&call);
@@ -699,7 +701,7 @@ impl World {
             let late = self.dice.below(3000) * MS;
             self.after(late, Event::Request(sent.clone(), false));
             if self.dice.one_in(2) {
-                let (number, answer) = (sent.number, Answer::Silence);
+                let (number, answer) = (sent.number, EtcdAnswer::Silence);
                 let silence = Input::Answer { number, answer };
                 self.after(50 * MS, Event::Input(sent.from, sent.life, silence));
                 return;

@@ -171,7 +171,7 @@ impl World {
             let sharing = ledger.sharing.as_ref();
             let verdicts = sharing.and_then(|of| of.judge(mirror, ask.seq, &ask.id, &calls));
             answer = Some(match verdicts {
-                None => wire::Answer::Again,
+                None => wire::MergeAnswer::Again,
                 Some(verdicts) => {
                     let source = Source::Merge(ask.id.clone());
                     let mut results = Vec::new();
@@ -189,7 +189,7 @@ impl World {
                             }
                         }
                     }
-                    wire::Answer::of(&verdicts, &Reply::Value(results.into()))
+                    wire::MergeAnswer::of(&verdicts, &Reply::Value(results.into()))
                 }
             });
         }
@@ -209,7 +209,7 @@ impl World {
         &mut self,
         (to, life, number): Asker,
         at: usize,
-        answer: Option<wire::Answer>,
+        answer: Option<wire::MergeAnswer>,
     ) {
         let delay = self.delay();
         let answer = answer.filter(|_| to == at || self.network.joins(at, to));
