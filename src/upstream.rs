@@ -13,7 +13,7 @@ use std::{
     io,
     net::SocketAddr,
     sync::{Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
@@ -30,6 +30,7 @@ pub(crate) use self::connection::Connection;
 pub(crate) use self::verify::VerifyError;
 use self::{sentinel::Sentinel, verify::Verification};
 use crate::{
+    lifecycle::OpenCalls,
     resolver,
     ros_env::MasterUri,
     xmlrpc::{self, Reply},
@@ -156,6 +157,7 @@ pub struct Upstream {
     writers: watch::Sender<usize>,
     /// How calls are verified to reach the present incarnation. `None` while calls do not pass.
     verification: Mutex<Option<Verification>>,
+    open_calls: Mutex<OpenCalls>,
 }
 
 /// Counts a connection for writes until it is dropped.
@@ -165,6 +167,16 @@ struct Writer(watch::Sender<usize>);
 impl Drop for Writer {
     fn drop(&mut self) {
         self.0.send_modify(|count| *count = count.saturating_sub(1));
+    }
+}
+
+/// A call to the master that is under way until this is dropped; see [`Upstream::silent_since`].
+#[derive(Debug)]
+pub(crate) struct OpenCall<'a>(&'a Upstream);
+
+impl Drop for OpenCall<'_> {
+    fn drop(&mut self) {
+        self.0.lock_open_calls().ended(Instant::now());
     }
 }
 
@@ -185,6 +197,7 @@ impl Upstream {
             found: watch::Sender::new(None),
             writers: watch::Sender::new(0),
             verification: Mutex::default(),
+            open_calls: Mutex::default(),
         }
     }
 
@@ -241,6 +254,23 @@ impl Upstream {
 
     fn lock_verification(&self) -> MutexGuard<'_, Option<Verification>> {
         self.verification
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes that a call begins.
+    pub(crate) fn begin_call(&self) -> OpenCall<'_> {
+        self.lock_open_calls().begins(Instant::now());
+        OpenCall(self)
+    }
+
+    /// Since when calls to the served master are under way and none has ended.
+    pub(crate) fn silent_since(&self) -> Option<Instant> {
+        self.lock_open_calls().silent_since()
+    }
+
+    fn lock_open_calls(&self) -> MutexGuard<'_, OpenCalls> {
+        self.open_calls
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
     }

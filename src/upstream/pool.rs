@@ -101,6 +101,7 @@ impl Pool {
         body: &Bytes,
     ) -> Result<RawReply, ReadError> {
         let attempt = async {
+            let _open = self.upstream.begin_call();
             // The semaphore is never closed.
             let _permit = self.permits.acquire().await;
             let (upstream, token) = (&self.upstream, self.ledger.token());

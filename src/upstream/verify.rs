@@ -117,6 +117,7 @@ pub(crate) async fn probe(
     token: &Token,
     sentinel: &Sentinel,
 ) -> Result<(), VerifyError> {
+    let _open = upstream.begin_call();
     look_up(&mut upstream.connect().await?, token).await?;
     Ok(sentinel.renew(upstream).await?)
 }

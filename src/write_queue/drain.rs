@@ -157,12 +157,7 @@ impl Drain {
                 _ = self.order_changed.changed() => {}
                 _ = self.lease.changed() => {}
                 () = wait::until(self.grace) => {}
-                () = wait::until(self.late_at) => {
-                    if let Some(batch) = &mut self.in_flight {
-                        batch.told_late = true;
-                    }
-                    self.signals.is_late.notify_one();
-                }
+                () = wait::until(self.late_at) => {}
                 () = wait::tick(&mut interval) => {
                     if self.in_flight.as_ref().is_none_or(|batch| !batch.items.is_empty()) {
                         self.resync.request();
@@ -190,6 +185,7 @@ impl Drain {
                 State::Injecting | State::Unknown => self.grace = None,
             }
             self.late_at = self.late_at(state);
+            self.tell_late();
             self.tell_sent
                 .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));
         }
@@ -205,9 +201,22 @@ impl Drain {
         if batch.items.is_empty() && self.queue.is_empty() || self.link.ledger.is_doubted() {
             return None;
         }
-        let now = Instant::now();
-        let patience = self.signals.patience.borrow().clone().at(now);
-        Some(batch.sent + patience)
+        let mut patience = self.signals.patience.borrow().clone();
+        let silent_since = self.link.upstream.silent_since();
+        let late_at = patience.late_at(Instant::now(), batch.sent.into_std(), silent_since);
+        Some(late_at.into())
+    }
+
+    /// Tells the recovery that the master is late, if it is.
+    fn tell_late(&mut self) {
+        if let Some(batch) = &mut self.in_flight
+            && let Some(_) = self
+                .late_at
+                .take_if(|at| *at <= tokio::time::Instant::now())
+        {
+            batch.told_late = true;
+            self.signals.is_late.notify_one();
+        }
     }
 
     /// Sends the next batch, if none is in flight and there is something to send.

@@ -58,6 +58,8 @@ pub(super) async fn round_trip(
     connection: Option<NextConnection>,
     request: Option<(Head, Bytes)>,
 ) -> RoundTripResult {
+    let upstream = link.upstream.clone();
+    let _open = upstream.begin_call();
     let token = link.ledger.token();
     let ready = match connection {
         Some(next) => next.ready().await,

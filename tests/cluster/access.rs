@@ -1,4 +1,4 @@
-//! Credentials to etcd with users, passwords and certificates.
+//! Access to etcd with users, passwords and certificates.
 
 use std::{path::Path, process::Command, time::Duration};
 
@@ -41,7 +41,7 @@ async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
             .view(&keys, LIMIT)
             .await
             .unwrap_err();
-        assert!(matches!(error, EtcdError::Credentials { .. }), "{error}");
+        assert!(matches!(error, EtcdError::Access { .. }), "{error}");
         let said = error.to_string();
         assert!(
             said.contains(refused) && said.contains("check user, password"),

@@ -52,7 +52,7 @@ fn run(
                             let answer =
                                 client.run(&keys, &settings, &op, None, ANSWER_LIMIT).await;
                             let answer = answer.unwrap_or(EtcdAnswer::Silence);
-                            let _ = inward.try_send(Input::EtcdAnswer { number, answer });
+                            let _ = inward.try_send(Input::Answer { number, answer });
                         });
                     }
                     Action::CatchUp(seq) => drop(inward.try_send(Input::Followed(seq))),

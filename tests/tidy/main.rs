@@ -13,6 +13,7 @@ mod blocks;
 mod commands;
 mod documents;
 mod lines;
+mod scripts;
 mod types;
 mod words;
 

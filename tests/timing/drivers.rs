@@ -21,9 +21,10 @@ use rustix::process::Signal;
 /// Maximum time of one pass of a driver's loop, in milliseconds. If drivers had to wait for the master, they
 /// would stall for at least 350. On a computer with little other load no pass takes more than 15.
 const PASS: f64 = 300.0;
-/// The same limit with a master that hangs, for drivers that also write: the mirror answers after 100 ms. If drivers had
-/// to wait until the master counts as hung, a pass would take at least 1,600.
-const PASS_HUNG: f64 = 300.0;
+/// The same limit with a master that hangs, for drivers that read and then write: the mirror answers after 100 ms. A
+/// driver that had to wait once for its read and once for its write would take at least 200, and one that had to wait
+/// until the master counts as hung at least 1,600.
+const PASS_HUNG: f64 = 190.0;
 /// Pause between two hangs, so that rosrescue stands in equally soon each time: after five within a minute it waits longer.
 const BETWEEN_HANGS: Duration = Duration::from_secs(13);
 /// How many times longer a pass may take than the longest one of an undisturbed driver.

@@ -13,9 +13,11 @@ use std::{
 use self::evidence::{BUSY_LIMIT, Evidence, Sample, SilenceVerdict};
 
 pub mod evidence;
+mod open_calls;
 mod patience;
 mod types;
 
+pub use open_calls::OpenCalls;
 pub use patience::Patience;
 pub use types::{Action, Cause, Input, Probing, Supervision};
 
@@ -168,6 +170,7 @@ impl Lifecycle {
             && match input {
                 Input::ProbeMissed | Input::Unreachable => true,
                 Input::Refused => is_old && self.is_slow_to_start(now),
+                Input::ConnectionLost => is_old && self.is_hopeless(now),
                 _ => false,
             }
     }
@@ -225,10 +228,13 @@ impl Lifecycle {
                 self.give_up(now)
             }
             Input::Unreachable => self.unreachable(now),
-            Input::NotAMaster | Input::ConnectionLost
-                if self.phase == Phase::Examining && self.is_hopeless(now) =>
-            {
+            Input::NotAMaster if self.phase == Phase::Examining && self.is_hopeless(now) => {
                 self.give_up(now)
+            }
+            // rosmaster closes connections that carry nothing for a few seconds, so those of a
+            // starved rosmaster or rosrescue end, too.
+            Input::ConnectionLost if self.phase == Phase::Examining && self.is_hopeless(now) => {
+                self.give_up_if_hung(now, BUSY_LIMIT, true)
             }
             Input::NotAMaster => {
                 self.seek(now);

@@ -11,6 +11,10 @@ const MEMORY: Duration = Duration::from_secs(60);
 const FREE: usize = 5;
 /// The longest patience.
 const LONGEST: Duration = Duration::from_secs(10);
+/// Shortest time that a write waits, however long the master has been silent. It may be about to
+/// answer a slow read. A rosmaster answers within a millisecond, or within some ten behind a call
+/// that keeps its interpreter busy.
+const CHANCE: Duration = Duration::from_millis(20);
 
 /// How long writes wait for a slow master. The time grows when the mirror often stands in for a master that was only
 /// late, and shrinks when those times are a minute old.
@@ -42,6 +46,21 @@ impl Patience {
         let further = self.alarms.len().saturating_sub(FREE);
         let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
         (self.base * 2_u32.pow(doublings)).min(LONGEST.max(self.base))
+    }
+
+    /// When the mirror answers a write that was sent at `sent` to a master that has been silent
+    /// since `silent_since`.
+    ///
+    /// The master's silence counts, so that a client that first reads and then writes does not wait
+    /// twice. While the master answers other calls, only the write's own wait counts.
+    pub fn late_at(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        silent_since: Option<Instant>,
+    ) -> Instant {
+        let since = silent_since.map_or(sent, |since| since.min(sent));
+        (since + self.at(now)).max(sent + CHANCE)
     }
 
     fn forget(&mut self, now: Instant) {
@@ -76,6 +95,26 @@ mod tests {
         assert_eq!(patience.at(now), LONGEST);
         now += MEMORY + Duration::from_secs(1);
         assert_eq!(patience.at(now), BASE);
+    }
+
+    #[test]
+    fn a_client_that_reads_and_then_writes_does_not_wait_twice() {
+        let start = Instant::now();
+        let at = |ms| start + Duration::from_millis(ms);
+        let mut patience = Patience::new(BASE);
+        let mut late_at = |sent, silent| patience.late_at(at(sent), at(sent), silent);
+        // The write is alone.
+        assert_eq!(late_at(0, None), at(100));
+        assert_eq!(late_at(0, Some(at(0))), at(100));
+        // A read has had no answer for a while.
+        assert_eq!(late_at(40, Some(at(0))), at(100));
+        assert_eq!(late_at(101, Some(at(0))), at(121));
+        assert_eq!(late_at(900, Some(at(0))), at(920));
+        // The master has answered others meanwhile.
+        assert_eq!(late_at(0, Some(at(70))), at(100));
+        // After false alarms, silence counts less.
+        (0..=FREE).for_each(|_| patience.was_late(start));
+        assert_eq!(patience.late_at(at(101), at(101), Some(start)), at(200));
     }
 
     /// The mirror stands in only so many times within any minute, however late the master answers.

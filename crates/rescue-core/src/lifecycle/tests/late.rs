@@ -15,22 +15,26 @@ impl Script {
     /// Samples the child if the state machine asks for it, then feeds `input`.
     fn feed_seen(&mut self, does: Does, input: Input, expected: &[Action]) -> &mut Self {
         if self.machine.needs_sample(self.now, input) {
-            let ran = match does {
-                Does::Work => self.now.duration_since(self.start),
-                Does::Nothing | Does::Starve => Duration::ZERO,
-            };
-            let effort = Effort {
-                runnable: does != Does::Nothing,
-                ran,
-                ..Effort::default()
-            };
-            self.machine.observe(Sample {
-                at: self.now,
-                master: Some(effort),
-                own_wait: Duration::ZERO,
-            });
+            self.observe(does);
         }
         self.feed(input, expected)
+    }
+
+    fn observe(&mut self, does: Does) {
+        let ran = match does {
+            Does::Work => self.now.duration_since(self.start),
+            Does::Nothing | Does::Starve => Duration::ZERO,
+        };
+        let effort = Effort {
+            runnable: does != Does::Nothing,
+            ran,
+            ..Effort::default()
+        };
+        self.machine.observe(Sample {
+            at: self.now,
+            master: Some(effort),
+            own_wait: Duration::ZERO,
+        });
     }
 
     /// Misses a probe every half second until the gate is shut.
@@ -47,6 +51,31 @@ impl Script {
 
 const STARVED: Action = Action::Spare("it gets too little CPU time");
 const BUSY: Action = Action::Spare("it is busy");
+
+#[test]
+fn a_starved_master_whose_connections_end_is_not_killed() {
+    let mut script = Script::serving(Supervision::Ours);
+    script.lose();
+    // It closes each connection that the starved rosrescue has left idle for too long.
+    let mut lose_again = |does| {
+        script.now += Duration::from_secs(1);
+        script.machine.on(script.now, Input::Wake);
+        script.feed(Input::Connected, &[Action::Examine]);
+        if script
+            .machine
+            .needs_sample(script.now, Input::ConnectionLost)
+        {
+            script.observe(does);
+        }
+        script.machine.on(script.now, Input::ConnectionLost)
+    };
+    let actions: Vec<_> = (0..300).flat_map(|_| lose_again(Does::Starve)).collect();
+    assert!(actions.contains(&STARVED));
+    assert!(!actions.contains(&Action::Kill), "{actions:?}");
+    // One that has the processor and closes each connection nevertheless is of no use.
+    let mut actions = (0..3).flat_map(|_| lose_again(Does::Nothing));
+    assert!(actions.any(|action| action == Action::Kill));
+}
 
 #[test]
 fn a_late_master_is_stood_in_for_and_given_what_it_missed() {
