@@ -186,6 +186,11 @@ impl Member {
 
     pub(super) fn loaded(&mut self, now: Instant, read: Option<Read>) {
         self.reading.loading = false;
+        // One that began before it was wanted counts for nothing, whether it has failed or not.
+        let earlier = self.reading.fresh == Some(2);
+        if earlier {
+            self.reading.fresh = Some(1);
+        }
         let Some(read) = read else {
             self.reading.load_at = Some(now + AGAIN);
             return;
@@ -198,7 +203,9 @@ impl Member {
         if self.has_lost(&read.view, floor) {
             return self.begin_anew(now, &read.view);
         }
-        self.reading.fresh = self.reading.fresh.map(|left| left.saturating_sub(1));
+        if !earlier {
+            self.reading.fresh = self.reading.fresh.map(|_| 0);
+        }
         if !self.reading.watching {
             self.reading.watching = true;
             self.act(Action::Watch(read.view.clone()));

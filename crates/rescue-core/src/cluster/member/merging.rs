@@ -57,6 +57,8 @@ pub(super) struct Merging {
     untold: BTreeSet<String>,
     /// The leader is asked to tell the nodes of [`Self::untold`].
     telling: bool,
+    /// A portion was answered since the journal was read: the mirror lacks it.
+    unread: bool,
     /// It conflicts with nothing that was changed up to this record.
     judged: u64,
     sent: u64,
@@ -73,6 +75,7 @@ impl Merging {
             left: None,
             untold: BTreeSet::new(),
             telling: false,
+            unread: false,
             judged: 0,
             sent: 0,
             lost: 0,
@@ -160,6 +163,7 @@ impl Member {
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
         self.merging.left = Some(merged.send);
         self.merging.judged = self.journal.progress.seq;
+        self.merging.unread = false;
         self.report(lost);
         self.next_portion(now);
     }
@@ -171,7 +175,11 @@ impl Member {
         let left = if self.merging.telling { &untold } else { left };
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
         if calls.is_empty() {
-            return self.merged();
+            match self.merging.unread {
+                true => self.judge_anew(now),
+                false => self.merged(),
+            }
+            return;
         }
         // If there is no answer, the journal may have them all the same. What is set again changes nothing.
         if let Some(time) = self.cut_off.first_mut().filter(|_| !self.merging.telling) {
@@ -214,6 +222,7 @@ impl Member {
             None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
             Some(wire::Answer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
             Some(wire::Answer::Done(outcomes)) => {
+                self.merging.unread = true;
                 if self.merging.telling {
                     return self.told(now, &ask, &outcomes);
                 }
