@@ -187,6 +187,11 @@ impl Member {
 
     pub(super) fn loaded(&mut self, now: Instant, read: Option<Read>) {
         self.reading.loading = false;
+        // A read that began before it was asked for does not count, whether it failed or not.
+        let earlier = self.reading.fresh == Some(2);
+        if earlier {
+            self.reading.fresh = Some(1);
+        }
         let Some(read) = read else {
             self.reading.load_at = Some(now + AGAIN);
             return;
@@ -199,7 +204,9 @@ impl Member {
         if self.has_lost(&read.view, floor) {
             return self.begin_anew(now, &read.view);
         }
-        self.reading.fresh = self.reading.fresh.map(|left| left.saturating_sub(1));
+        if !earlier {
+            self.reading.fresh = self.reading.fresh.map(|_| 0);
+        }
         if !self.reading.watching {
             self.reading.watching = true;
             self.act(Action::Watch(read.view.clone()));

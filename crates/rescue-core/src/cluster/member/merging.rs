@@ -57,6 +57,8 @@ pub(super) struct Merging {
     untold: BTreeSet<String>,
     /// Whether the portion under way sets the parameters in [`Self::untold`] again.
     telling: bool,
+    /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
+    unread: bool,
     /// The writes in `left` conflict with no change up to this record.
     judged: u64,
     sent: u64,
@@ -73,6 +75,7 @@ impl Merging {
             left: None,
             untold: BTreeSet::new(),
             telling: false,
+            unread: false,
             judged: 0,
             sent: 0,
             lost: 0,
@@ -161,6 +164,7 @@ impl Member {
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
         self.merging.left = Some(merged.send);
         self.merging.judged = self.journal.progress.seq;
+        self.merging.unread = false;
         self.report(lost);
         self.next_portion(now);
     }
@@ -172,7 +176,11 @@ impl Member {
         let left = if self.merging.telling { &untold } else { left };
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
         if calls.is_empty() {
-            return self.merged();
+            match self.merging.unread {
+                true => self.judge_anew(now),
+                false => self.merged(),
+            }
+            return;
         }
         // Without an answer, the journal may still contain them. Setting a value again changes nothing.
         if let Some(time) = self.cut_off.first_mut().filter(|_| !self.merging.telling) {
@@ -215,6 +223,7 @@ impl Member {
             None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
             Some(wire::MergeAnswer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
             Some(wire::MergeAnswer::Done(outcomes)) => {
+                self.merging.unread = true;
                 if self.merging.telling {
                     return self.told(now, &ask, &outcomes);
                 }

@@ -205,7 +205,7 @@ impl History {
         changed: bool,
     ) {
         let call = &mut self.calls[call];
-        call.unchanged = !changed;
+        call.unchanged |= !changed;
         call.by.get_or_insert(by);
         call.ran.get_or_insert(now);
         if call.heard.is_none() {
@@ -388,7 +388,9 @@ impl History {
         // From these moments on no read is older than that.
         let mut floors: Vec<(u64, usize, String)> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
-            if (call.computer, call.key) != (computer, key) || call.reported {
+            // One that changed nothing may have been run again later.
+            let counts = !call.reported && !call.unchanged;
+            if (call.computer, call.key) != (computer, key) || !counts {
                 continue;
             }
             let Some(heard) = call.heard else { continue };

@@ -696,6 +696,11 @@ impl World {
     }
 
     fn send(&mut self, sent: Box<Sent>) {
+        let well = self.etcd.log.is_empty() || self.network.healed_for(self.now, 0);
+        if self.plan.faults && !well && self.dice.one_in(400) {
+            // Who was to send it is gone, and nobody says so.
+            return;
+        }
         if self.plan.faults && self.dice.one_in(40) {
             // It arrives late, or twice.
             let late = self.dice.below(3000) * MS;

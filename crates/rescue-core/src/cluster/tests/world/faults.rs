@@ -132,6 +132,10 @@ impl World {
         }
         let pause = (100 + self.dice.below(1500)) * MS;
         self.after(pause, Event::Fault);
+        if self.etcd.log.is_empty() {
+            // The first leader alone has the state in which all begins.
+            return;
+        }
         let at = self.dice.below(COMPUTERS as u64) as usize;
         // Who leads is hit more often.
         let leader = self.leaders().first().copied();
