@@ -64,9 +64,6 @@ pub(crate) struct Drain {
     grace: Option<tokio::time::Instant>,
     /// Whether a batch was lost and the gate has not changed since.
     lost: bool,
-    /// Whether a master may have run calls that wait in the queue. It may have notified nodes, and the mirror
-    /// does not know yet of what.
-    unsettled: bool,
     signals: Arc<Signals>,
     /// When the batch in flight becomes late.
     late_at: Option<tokio::time::Instant>,
@@ -119,7 +116,6 @@ impl Drain {
             in_flight: None,
             grace: None,
             lost: false,
-            unsettled: false,
             signals,
             late_at: None,
             late_over: false,
@@ -228,7 +224,6 @@ impl Drain {
         {
             // The new master never got these calls.
             self.take_back(batch.items);
-            self.unsettled = true;
         }
         if self.opaque.incarnation != incarnation {
             let opaque = std::mem::take(&mut self.opaque).answers;
@@ -257,7 +252,7 @@ impl Drain {
         };
         if items.is_empty() && self.queue.is_empty() {
             // The callers of lost calls are gone.
-            self.settle();
+            self.link.ledger.settled_calls();
         }
         if items.is_empty() && !inspects {
             return;
@@ -272,8 +267,6 @@ impl Drain {
             let answers = items.iter().filter_map(|item| item.delivery.as_ref());
             order.sent(tells, answers.map(Delivery::number).collect());
         });
-        // The answer to this batch settles lost calls as well.
-        self.unsettled &= items.is_empty();
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
         let answerable = |item: &Item| item.call.as_ref().is_some_and(|call| call.is_answerable());
@@ -315,14 +308,8 @@ impl Drain {
             Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
             Err(error) => self.failed(items, &error),
         }
-        if !self.unsettled {
-            self.link.ledger.settled_calls();
-        }
-    }
-
-    /// Notes that the mirror has answered what a lost master may have run.
-    fn settle(&mut self) {
-        if std::mem::take(&mut self.unsettled) {
+        // A master that ran a lost batch may have notified nodes, and the mirror does not know yet of what.
+        if !self.lost {
             self.link.ledger.settled_calls();
         }
     }
@@ -387,7 +374,7 @@ impl Drain {
             self.link.ledger.abandon_batch();
             // Whether the master ran it is known only when the master is back. Until then the
             // mirror answers.
-            (self.lost, self.unsettled) = (true, true);
+            self.lost = true;
             self.signals.lost.notify_one();
         } else {
             self.retry_at = Some(now + RETRY_PAUSE);
@@ -439,7 +426,8 @@ impl Drain {
             .ledger
             .record_from(Instant::now(), incarnation, &answered)
         else {
-            self.unsettled = true;
+            // The gate is about to open for another master.
+            self.lost = true;
             return self.take_back(items);
         };
         if opaque {
@@ -490,7 +478,6 @@ impl Drain {
         self.grace = None;
         if self.in_flight.is_some() {
             self.link.ledger.abandon_batch();
-            self.unsettled = true;
         }
         // A master that comes back is examined only when this connection has ended, because it then
         // runs no call of it any more.
@@ -509,6 +496,7 @@ impl Drain {
             self.take_back(batch.items);
         }
         self.answer_queue();
+        self.link.ledger.settled_calls();
     }
 
     /// Answers from the mirror what the master is late with, then the queue. The batch continues;
@@ -567,7 +555,6 @@ impl Drain {
                 self.queue.push_back(item);
             }
         }
-        self.settle();
         self.stats.calls_without_master.add(answers.count());
         self.answer(answers.mark, None, answers.made);
     }
@@ -576,8 +563,7 @@ impl Drain {
     fn send_elsewhere(&mut self) {
         (self.grace, self.connection) = (None, None);
         let in_flight = self.in_flight.take().map(|batch| batch.items);
-        self.unsettled |= in_flight.is_some();
-        self.settle();
+        self.link.ledger.settled_calls();
         let opaque = std::mem::take(&mut self.opaque).answers;
         let items = in_flight.into_iter().flatten();
         let items = items.chain(opaque.into_iter().map(|(item, _)| item));

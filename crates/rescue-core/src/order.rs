@@ -155,8 +155,8 @@ impl Order {
     /// Notes that the master has no unanswered calls left, or that the mirror has answered them. Returns whether
     /// anything waits for that.
     pub fn settled(&mut self) -> bool {
-        self.in_flight = InFlight::default();
-        std::mem::take(&mut self.awaited)
+        let in_flight = std::mem::take(&mut self.in_flight);
+        !in_flight.tells.is_empty() && std::mem::take(&mut self.awaited)
     }
 
     /// Notes that the master notifies this many nodes of `subject`.

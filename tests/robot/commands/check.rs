@@ -106,7 +106,11 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let free = free_port();
     let found = Found::by(check(&scratch, free).args(["--master", &uri]));
     found.assert_no_problem();
-    assert!(found.said("master").contains("answers"));
+    let said = found.said("master");
+    assert!(
+        said.contains("answers: HTTP/1.") && said.contains("Python 3."),
+        "{said}"
+    );
     let nobody = format!("http://127.0.0.1:{}", free_port());
     let found = Found::by(check(&scratch, free).args(["--master", &nobody]));
     found.assert_no_problem();

@@ -73,6 +73,10 @@ impl<T: Copy + PartialEq> BySubject<T> {
         all.flatten().copied()
     }
 
+    pub fn is_empty(&self) -> bool {
+        self.exact.is_empty() && self.params.is_empty()
+    }
+
     /// Whether `subject` concerns any value.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
