@@ -49,7 +49,7 @@ impl Etcd {
     ///
     /// # Errors
     ///
-    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
+    /// Why etcd gave no answer. The state machine gets [`EtcdAnswer::Silence`] for it.
     pub async fn run(
         &self,
         keys: &Keys,
@@ -136,7 +136,7 @@ impl Etcd {
         self.0.try_each(&keys.leader(), limit).await
     }
 
-    /// Names of the robots that have or had a leader in this etcd, up to [`ROBOTS_MOST`].
+    /// Names of the robots that have or had a leader in this etcd, up to `ROBOTS_MOST`.
     ///
     /// # Errors
     ///

@@ -161,7 +161,7 @@ impl Replica {
     ///
     /// # Errors
     ///
-    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
+    /// Why etcd gave no answer. The state machine gets [`EtcdAnswer::Silence`] for it.
     pub async fn run(
         &self,
         settings: &Settings,

@@ -16,7 +16,7 @@ const LARGE: [(&str, usize); 8] = [
     ("CommonArgs", 23),
     ("Config", 23),
     // Facts that people and programs read, as flat JSON.
-    ("Facts", 25),
+    ("SetupFacts", 25),
     ("Status", 40),
     // These must be split by responsibility.
     ("Drain", 22),

@@ -7,7 +7,7 @@
 //! notified of anything later about the same subject, and of two notifications the newer one must come last:
 //!
 //! * While the master serves, a write that can notify a node does not go to the master while an answer to
-//!   that node about the same subject is under way ([`Order::hold`]).
+//!   that node about the same subject is under way ([`Order::must_wait`]).
 //! * A notification that rosrescue sends waits for such an answer, and for [`LEAD`] after it. Where the
 //!   master may be notifying the node of the same subject, ours is put off ([`Order::next`]).
 //! * A node that is notified shortly after such an answer, or by two senders in a row, is told the state once

@@ -20,7 +20,7 @@ pub use types::{
     WhenAlone,
 };
 
-/// How long a request may take before it counts as [`Answer::Silence`]. It is longer than a time to live, because an
+/// How long a request may take before it counts as [`EtcdAnswer::Silence`]. It is longer than a time to live, because an
 /// etcd that needs 2 s per answer still shows who leads.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 /// Pause before an unanswered request is sent again.

@@ -793,9 +793,6 @@ impl World {
 }
 
 fn place(term: u64, seq: u64) -> Place {
-    Place {
-        term,
-        seq,
-        ..Place::default()
-    }
+    let epoch = 0;
+    Place { epoch, term, seq }
 }
