@@ -24,7 +24,7 @@ use crate::{
 
 mod assemble;
 mod cluster;
-mod duty;
+mod context;
 mod earlier;
 mod life;
 mod notify;
@@ -33,7 +33,7 @@ mod startup;
 use self::{
     assemble::{Identity, assemble, last_master, server},
     cluster::ClusterDriver,
-    duty::Context,
+    context::Context,
     startup::{begin, kernel_id},
 };
 
@@ -110,15 +110,15 @@ pub async fn run(
     // It marks our requests: one that comes back shows that the master's address is our own.
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let mark = HeaderValue::from_str(&instance)?;
-    let (parts, drain) = assemble(&config, beginning, last.clone(), mark.clone()).await;
-    let parts = Arc::new(parts);
-    let notified = notify::start(guard, parts.clone(), stop.clone());
+    let (context, drain) = assemble(&config, beginning, last.clone(), mark.clone()).await;
+    let context = Arc::new(context);
+    let notified = notify::start(guard, context.clone(), stop.clone());
     let halt = CancellationToken::new();
-    let (others, runs) = Runs::choose(&config, &parts, supervised, mark, restored, &halt).await?;
+    let (others, runs) = Runs::choose(&config, &context, supervised, mark, restored, &halt).await?;
     let looped = Arc::default();
     let server = server(
         &config,
-        &parts,
+        &context,
         Identity { names, instance },
         others,
         (Arc::clone(&looped), halt.clone()),
@@ -128,29 +128,29 @@ pub async fn run(
     // Meanwhile the mirror answers reads; writes wait, and so does everything that goes to the
     // master.
     let checkpointer = Checkpointer::begin(
-        parts.ledger.clone(),
-        parts.board.clone(),
+        context.ledger.clone(),
+        context.board.clone(),
         config.checkpoint.clone(),
         config.sync_interval,
     );
     let port = last.map(|uri| uri.port);
     let (checkpointer, begun) = tokio::join!(
         checkpointer,
-        runs.begin(&parts, port, restored, &stop, &halt)
+        runs.begin(&context, port, restored, &stop, &halt)
     );
     tasks.spawn(checkpointer.run(halt.clone()));
     tasks.spawn(drain.run());
-    watch(&config, &parts, &mut tasks);
+    watch(&config, &context, &mut tasks);
     let process = tokio::select! {
         process = begun.run(stop, halt) => process?,
-        () = announce(&parts, say) => None,
-        () = looped.notified() => return Err(RunError::Loop { master: parts.upstream.address() }),
+        () = announce(&context, say) => None,
+        () = looped.notified() => return Err(RunError::Loop { master: context.upstream.address() }),
     };
     connections.close();
     // Calls that still wait cannot be answered any more, so their connections are closed.
     let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
     tasks.shutdown().await;
-    close(parts.ledger.clone()).await;
+    close(context.ledger.clone()).await;
     if let Some(process) = process {
         process.stop().await;
     }
@@ -166,8 +166,8 @@ struct Supervised {
 }
 
 /// Tells the operator that the master is protected, as soon as calls pass. Never ends.
-async fn announce(parts: &Context, say: impl Fn(&str)) {
-    let mut gate = parts.gate.clone();
+async fn announce(context: &Context, say: impl Fn(&str)) {
+    let mut gate = context.gate.clone();
     gate.wait_for(|state| state.is_open() || state == State::Elsewhere)
         .await;
     say("ROS Rescue enabled. Master is now fault tolerant!!");
@@ -198,13 +198,13 @@ fn accept(
 }
 
 /// Starts the tasks that look after the nodes, and after clients that bypass this rosrescue.
-fn watch(config: &Config, parts: &Context, tasks: &mut JoinSet<()>) {
-    tasks.spawn(nodes::liveness::watch(parts.nodes.clone()));
-    tasks.spawn(nodes::watch(parts.nodes.clone(), config.reap_interval));
+fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
+    tasks.spawn(nodes::liveness::watch(context.nodes.clone()));
+    tasks.spawn(nodes::watch(context.nodes.clone(), config.reap_interval));
     if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(bypass::watch(
-            parts.upstream.clone(),
-            parts.board.clone(),
+            context.upstream.clone(),
+            context.board.clone(),
             config.advertised.to_string(),
         ));
     }
@@ -222,7 +222,7 @@ impl Runs {
     /// Joins the other computers, if there are others. Also returns how to reach them.
     async fn choose(
         config: &Config,
-        parts: &Arc<Context>,
+        context: &Arc<Context>,
         supervised: Option<Supervised>,
         mark: HeaderValue,
         restored: bool,
@@ -232,13 +232,13 @@ impl Runs {
             if restored {
                 // The mirror answers while orphans of an earlier rosrescue are still being looked
                 // for.
-                parts.gate_tx.set(State::StandingIn);
+                context.gate_tx.set(State::StandingIn);
             }
             return Ok((None, Self::Single(supervised)));
         };
-        let (others, member) = cluster::join(cluster::Given {
+        let (others, member) = cluster::join(cluster::ClusterSetup {
             config: cluster.clone(),
-            parts: parts.clone(),
+            context: context.clone(),
             rosmaster: supervised.rosmaster.clone(),
             rosout: supervised.rosout,
             instance: mark,
@@ -255,7 +255,7 @@ impl Runs {
     /// Finds the master of an earlier rosrescue, which was at `port`, and decides what to do first.
     async fn begin(
         self,
-        parts: &Context,
+        context: &Context,
         port: Option<u16>,
         restored: bool,
         stop: &CancellationToken,
@@ -266,7 +266,7 @@ impl Runs {
                 let rosout = supervised.as_ref().map(|supervised| supervised.rosout);
                 let rosmaster = supervised.map(|supervised| supervised.rosmaster);
                 let ends = (stop.clone(), halt.clone());
-                let (driver, first) = parts
+                let (driver, first) = context
                     .start_single(rosmaster, port, rosout, restored, ends)
                     .await;
                 Begun::Single(Box::new(driver), first)

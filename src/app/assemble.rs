@@ -1,4 +1,4 @@
-//! Creates the parts of the program from its settings and the state that it starts with.
+//! Creates the context of the program from its settings and the state that it starts with.
 
 use std::{
     sync::Arc,
@@ -9,7 +9,7 @@ use hyper::header::HeaderValue;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
-use super::{duty::Context, startup::Beginning};
+use super::{context::Context, startup::Beginning};
 use crate::{
     checkpoint::{format::Session, store::history},
     clock,
@@ -109,7 +109,7 @@ pub(super) async fn assemble(
     for (node, at) in removed {
         nodes.removed.add(&node, at);
     }
-    let parts = Context {
+    let context = Context {
         ledger,
         upstream,
         gate_tx,
@@ -128,7 +128,7 @@ pub(super) async fn assemble(
         checkpoint: config.checkpoint.clone(),
         node_timeout: config.node_timeout,
     };
-    (parts, drain)
+    (context, drain)
 }
 
 /// What earlier processes of this session left on the disk about rescues.
@@ -177,7 +177,7 @@ pub(super) struct Identity {
 /// the second one ends the page's streams.
 pub(super) fn server(
     config: &Config,
-    parts: &Context,
+    context: &Context,
     identity: Identity,
     others: Option<Others>,
     ends: (Arc<Notify>, CancellationToken),
@@ -186,9 +186,9 @@ pub(super) fn server(
     let clients = Arc::new(Clients::default());
     let pool = Pool::new(
         config.master_connections,
-        parts.upstream.clone(),
-        parts.ledger.clone(),
-        parts.gate.clone(),
+        context.upstream.clone(),
+        context.ledger.clone(),
+        context.gate.clone(),
     );
     let access = AccessRules::new(config.allow.clone(), config.allow_write.clone());
     if !config.allow.is_empty() || !config.allow_write.is_empty() {
@@ -205,31 +205,31 @@ pub(super) fn server(
         max_body: config.max_body,
         bodies: body::budget(config.max_body),
         answers: Answers::within(2 * config.max_body),
-        stats: parts.stats,
+        stats: context.stats,
         calls: Calls {
-            gate: parts.gate.clone(),
-            ledger: parts.ledger.clone(),
+            gate: context.gate.clone(),
+            ledger: context.ledger.clone(),
             reads: config.reads,
             last_large: Default::default(),
             compared: Default::default(),
             pool: Arc::new(pool),
-            write_queue: parts.write_queue.clone(),
-            slow: parts.slow.clone(),
-            stats: parts.stats,
-            uri: parts.uri.clone(),
+            write_queue: context.write_queue.clone(),
+            slow: context.slow.clone(),
+            stats: context.stats,
+            uri: context.uri.clone(),
             hold: config.hold,
             others,
         },
         pages: Pages {
-            uri: parts.uri.clone(),
+            uri: context.uri.clone(),
             checkpoint: config.checkpoint.display().to_string(),
-            upstream: parts.upstream.clone(),
-            gate: parts.gate.clone(),
-            ledger: parts.ledger.clone(),
-            nodes: parts.nodes.clone(),
-            board: parts.board.clone(),
+            upstream: context.upstream.clone(),
+            gate: context.gate.clone(),
+            ledger: context.ledger.clone(),
+            nodes: context.nodes.clone(),
+            board: context.board.clone(),
             clients,
-            stats: parts.stats,
+            stats: context.stats,
             rate: Rate::new(Instant::now()),
             hide: config.hide.clone(),
             stop: halt,

@@ -20,9 +20,9 @@ use tokio::{
 };
 use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
-pub(super) use self::join::{Given, join};
+pub(super) use self::join::{ClusterSetup, join};
 use self::{facts::Known, kept::Kept, trouble::Trouble};
-use super::{RunError, duty::Duty, life};
+use super::{RunError, context::MasterDuties, life};
 use crate::{
     checkpoint::{
         format::Checkpoint,
@@ -64,7 +64,7 @@ type Work = JoinSet<Input>;
 
 /// Passes events to this computer's [`Member`], and carries out its actions.
 pub(super) struct ClusterDriver {
-    given: Given,
+    setup: ClusterSetup,
     member: Member,
     replica: Replica,
     standing: watch::Sender<Standing>,
@@ -84,7 +84,7 @@ pub(super) struct ClusterDriver {
     watch: Option<Watch>,
     /// The leader's keys as the watch delivered them.
     watched: View,
-    duty: Option<Duty>,
+    duties: Option<MasterDuties>,
     /// Processes that are being stopped.
     endings: JoinSet<()>,
     kept: Kept,
@@ -125,10 +125,10 @@ impl ClusterDriver {
                 },
             };
         };
-        self.given.parts.ledger.leave();
+        self.setup.context.ledger.leave();
         self.end_master().await;
-        self.given.parts.gate_tx.set(State::Elsewhere);
-        self.given.halt.cancel();
+        self.setup.context.gate_tx.set(State::Elsewhere);
+        self.setup.halt.cancel();
         while self.endings.join_next().await.is_some() {}
         result.map(|()| None)
     }
@@ -144,7 +144,7 @@ impl ClusterDriver {
         }
         let actions = self.member.on(now, input);
         let lease = self.member.machine().lease(now);
-        self.given.parts.ledger.set_lease(lease);
+        self.setup.context.ledger.set_lease(lease);
         for action in actions {
             match action {
                 Action::End => return Some(Ok(())),
@@ -160,8 +160,8 @@ impl ClusterDriver {
     }
 
     async fn carry_out(&mut self, action: Action) {
-        let post = &self.given.parts;
-        let ledger = &post.ledger;
+        let context = &self.setup.context;
+        let ledger = &context.ledger;
         match action {
             Action::Send {
                 number,
@@ -182,7 +182,7 @@ impl ClusterDriver {
                 if view.leader.is_none() {
                     self.beside.spawn(survey::look_for_typo(
                         self.replica.clone(),
-                        self.given.config.robot.clone(),
+                        self.setup.config.robot.clone(),
                     ));
                 }
                 let range = self.replica.keys.small();
@@ -203,13 +203,13 @@ impl ClusterDriver {
             }
             Action::Decide { seq, state, closed } => {
                 let evidence = SessionEvidence {
-                    same_boot: self.given.restored,
+                    same_boot: self.setup.restored,
                     closed,
                     node_alive: false,
                 };
                 let goes_on = true;
                 let otherwise = Input::Decided { seq, goes_on };
-                self.spawn(otherwise, decide(seq, state, self.given.restore, evidence));
+                self.spawn(otherwise, decide(seq, state, self.setup.restore, evidence));
             }
             Action::Stand(standing) => {
                 tracing::debug!(?standing, "calls");
@@ -243,29 +243,29 @@ impl ClusterDriver {
             }
             Action::Term(term) => ledger.update_session(|session| session.term = term),
             Action::BeginMaster(cause) => {
-                let process = MasterProcess::new(self.given.rosmaster.clone(), None, None);
+                let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);
                 let cause = report::cause(cause);
-                self.duty = Some(post.begin(process, Some(self.given.rosout), cause));
+                self.duties = Some(context.begin(process, Some(self.setup.rosout), cause));
             }
             Action::EndMaster => self.end_master().await,
-            Action::StandIn => post.gate_tx.set(State::StandingIn),
-            Action::TurnAway => post.gate_tx.set(State::Elsewhere),
-            Action::ServeOwnOnly(own_only) => post.nodes.set_alone(own_only),
+            Action::StandIn => context.gate_tx.set(State::StandingIn),
+            Action::TurnAway => context.gate_tx.set(State::Elsewhere),
+            Action::ServeOwnOnly(own_only) => context.nodes.set_alone(own_only),
             Action::KeepAll { base, calls } => {
-                self.kept.replace(&post.checkpoint, base, calls).await;
+                self.kept.replace(&context.checkpoint, base, calls).await;
             }
             Action::Keep(calls) => {
                 self.kept.add(calls).await;
                 if self.kept.has_outgrown()
                     && let Some((base, calls)) = self.member.kept()
                 {
-                    let path = &self.given.parts.checkpoint;
+                    let path = &self.setup.context.checkpoint;
                     self.kept.replace(path, base.clone(), calls).await;
                 }
             }
-            Action::KeepNothing => self.kept.remove(&post.checkpoint).await,
+            Action::KeepNothing => self.kept.remove(&context.checkpoint).await,
             Action::Merge { number, ask, to } => {
-                let (peers, queue) = (self.peers.clone(), post.write_queue.clone());
+                let (peers, queue) = (self.peers.clone(), context.write_queue.clone());
                 let answer = None;
                 let otherwise = Input::Merged { number, answer };
                 self.spawn(otherwise, async move {
@@ -273,7 +273,7 @@ impl ClusterDriver {
                     Input::Merged { number, answer }
                 });
             }
-            Action::Report(outcomes) => report::report(&self.given.hide, outcomes),
+            Action::Report(outcomes) => report::report(&self.setup.hide, outcomes),
             Action::Probe { number, uri, term } => {
                 let leads = false;
                 let otherwise = Input::Probed { number, leads };
@@ -329,7 +329,7 @@ impl ClusterDriver {
                 }
             }
             Action::EndRosout => {
-                let ended = self.duty.as_mut().map(Duty::end_roscore);
+                let ended = self.duties.as_mut().map(MasterDuties::end_roscore);
                 self.spawn(Input::RosoutEnded, async move {
                     if let Some(ended) = ended {
                         ended.await;
@@ -370,10 +370,10 @@ impl ClusterDriver {
         loop {
             tokio::select! {
                 biased;
-                error = failed(&mut self.duty) => return Err(error),
+                error = failed(&mut self.duties) => return Err(error),
                 Some(Ok(done)) = self.work.join_next() => return Ok(done),
-                () = self.given.parts.ledger.shared.notified() => {
-                    return Ok(Input::Recorded(self.given.parts.ledger.take_changes()));
+                () = self.setup.context.ledger.shared.notified() => {
+                    return Ok(Input::Recorded(self.setup.context.ledger.take_changes()));
                 }
                 changes = next_changes(&mut self.watch) => return Ok(self.changed(changes)),
                 Some((to, tell)) = self.handovers.recv() => match self.handover {
@@ -393,11 +393,11 @@ impl ClusterDriver {
     }
 
     async fn end_master(&mut self) {
-        if let Some(duty) = self.duty.take() {
-            let ending = duty.end().await;
+        if let Some(duties) = self.duties.take() {
+            let ending = duties.end().await;
             self.endings.spawn(ending);
         }
-        self.given.parts.ledger.end_injection();
+        self.setup.context.ledger.end_injection();
     }
 
     /// Turns the watch's changes, or its end, into an input.
@@ -575,9 +575,9 @@ async fn answered(otherwise: Input, work: impl Future<Output = Input> + Send + '
     })
 }
 
-async fn failed(duty: &mut Option<Duty>) -> ProcessError {
-    match duty {
-        Some(duty) => duty.failed().await,
+async fn failed(duties: &mut Option<MasterDuties>) -> ProcessError {
+    match duties {
+        Some(duties) => duties.failed().await,
         None => std::future::pending().await,
     }
 }

@@ -11,7 +11,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::duty::Context;
+use super::context::Context;
 use crate::{
     gate::State,
     guardian::handover::{self, Guard},
@@ -36,7 +36,11 @@ const LOOK: Duration = Duration::from_secs(1);
 static STOPPED: Pair = Pair::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.
-pub(super) fn start(guard: Guard, parts: Arc<Context>, stop: CancellationToken) -> JoinHandle<()> {
+pub(super) fn start(
+    guard: Guard,
+    context: Arc<Context>,
+    stop: CancellationToken,
+) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
@@ -45,15 +49,15 @@ pub(super) fn start(guard: Guard, parts: Arc<Context>, stop: CancellationToken) 
                 pid,
                 restarted: is_restarted(pid),
             };
-            tokio::spawn(follow_guardian(pid, guarded, link, parts.clone()));
+            tokio::spawn(follow_guardian(pid, guarded, link, context.clone()));
             guarded
         }
     };
-    parts.board.update(|facts| facts.guarded = guarded);
+    context.board.update(|facts| facts.guarded = guarded);
     let is_notified = std::env::var_os("NOTIFY_SOCKET").is_some();
     if is_notified {
-        tokio::spawn(report_ready(parts.clone()));
-        tokio::spawn(report_status(parts, stop.clone()));
+        tokio::spawn(report_ready(context.clone()));
+        tokio::spawn(report_status(context, stop.clone()));
     }
     tokio::spawn(async move {
         stop.cancelled().await;
@@ -132,14 +136,14 @@ fn is_restarted(pid: u32) -> bool {
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
 /// state to report while it runs.
-async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<Context>) {
+async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, context: Arc<Context>) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
     let Ok(mut link) = link else { return };
     let (mut from, mut to) = link.split();
     let served = async {
-        parts.answers().await;
+        context.answers().await;
         // If the guardian is gone, the read below notices.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
@@ -151,14 +155,14 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<C
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             looks.tick().await;
-            parts.see_guardian(pid, guarded);
+            context.see_guardian(pid, guarded);
         }
     };
     tokio::select! {
         _ = ended => {}
         ((), ()) = async { tokio::join!(served, look) } => {}
     }
-    parts
+    context
         .board
         .update(|facts| facts.guarded = Guarded::NoLonger(pid));
     tracing::warn!(
@@ -168,15 +172,15 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<C
     );
 }
 
-async fn report_ready(parts: Arc<Context>) {
-    parts.answers().await;
-    let line = parts.line();
+async fn report_ready(context: Arc<Context>) {
+    context.answers().await;
+    let line = context.line();
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }
 
 /// Reports the status to systemd in one line and feeds the watchdog. Feeding needs what a call needs: a timer, a
 /// runtime thread, and the locks of status and mirror. So it proves that calls work.
-async fn report_status(parts: Arc<Context>, stop: CancellationToken) {
+async fn report_status(context: Arc<Context>, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));
@@ -186,7 +190,7 @@ async fn report_status(parts: Arc<Context>, stop: CancellationToken) {
     let mut fed = None;
     loop {
         let now = ticks.tick().await;
-        let line = parts.line();
+        let line = context.line();
         if !stop.is_cancelled() && line != last {
             last.clone_from(&line);
             send(move || sd_notify::notify(&[NotifyState::Status(&line)])).await;

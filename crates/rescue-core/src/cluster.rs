@@ -7,9 +7,9 @@
 //! off cannot commit, and a transaction that is sent twice takes effect once. The records of calls are in `journal/`,
 //! and are written in the same transaction. See decision 29.
 //!
-//! * [`displaced`]: who is to be told to shut down by the next leader.
+//! * [`displaced`]: whom the next leader tells to shut down.
 //! * [`machine`]: who leads, and what may be acknowledged.
-//! * [`member`]: what one computer follows, adopts, answers, gives and merges, and when it has a master.
+//! * [`member`]: what one computer follows, answers, writes to the journal and merges, and when it runs a master.
 //! * [`outgoing`], [`cut_off`], [`sharing`], [`standing`]: parts of that.
 //! * [`journal`]: records and snapshots to and from keys and values.
 //! * [`merge`]: what of the writes of a computer that was alone still holds.

@@ -194,7 +194,7 @@ impl ClusterDriver {
             last_takeover: known.last_takeover.clone(),
             lost_writes: known.lost_writes,
         };
-        let board = &self.given.parts.board;
+        let board = &self.setup.context.board;
         board.update(|board| board.cluster = Some(facts));
     }
 }

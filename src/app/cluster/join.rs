@@ -1,4 +1,4 @@
-//! Creates the parts of a computer among several.
+//! Creates the context of a computer among several.
 
 use std::{
     collections::VecDeque,
@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
-    app::{duty::Context, startup},
+    app::{context::Context, startup},
     checkpoint::session::RestorePolicy,
     cluster::{
         etcd::{Credentials, Etcd, EtcdError, Options, Tls},
@@ -34,9 +34,9 @@ use crate::{
 };
 
 /// What a computer among several needs.
-pub(in crate::app) struct Given {
+pub(in crate::app) struct ClusterSetup {
     pub(in crate::app) config: ClusterConfig,
-    pub(in crate::app) parts: Arc<Context>,
+    pub(in crate::app) context: Arc<Context>,
     pub(in crate::app) rosmaster: Rosmaster,
     pub(in crate::app) rosout: bool,
     /// Identifies this process.
@@ -53,8 +53,10 @@ pub(in crate::app) struct Given {
 }
 
 /// Returns the way to the other computers, and the driver to run.
-pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver), EtcdError> {
-    let config = &given.config;
+pub(in crate::app) async fn join(
+    setup: ClusterSetup,
+) -> Result<(Others, ClusterDriver), EtcdError> {
+    let config = &setup.config;
     let client = Etcd::new(&Options {
         endpoints: config.endpoints.clone(),
         access: Credentials {
@@ -85,37 +87,37 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
             WhenCutOff::Refuse => WhenAlone::Refuse,
         },
     };
-    let parts = &given.parts;
-    parts.ledger.leave();
+    let context = &setup.context;
+    context.ledger.leave();
     // A master left by an earlier process may have outdated state.
-    block_in_place(|| given.rosmaster.claim_orphan(None));
-    let known = given.restored;
+    block_in_place(|| setup.rosmaster.claim_orphan(None));
+    let known = setup.restored;
     let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
     let place = watch::Sender::new(Place::default());
     let forwarded = Arc::<Forwarded>::default();
-    let peers = Arc::new(Peers::new(given.instance.clone(), parts.probe_timeout));
+    let peers = Arc::new(Peers::new(setup.instance.clone(), context.probe_timeout));
     let others = Others {
         standing: standing_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
         forwarded: forwarded.clone(),
-        served: given.parts.served.clone(),
+        served: setup.context.served.clone(),
         followed: place.subscribe(),
         // A restored mirror may be outdated, so it answers nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {
-            seq: given.restored.into(),
+            seq: setup.restored.into(),
             ..Place::default()
         })),
         // The next leader needs the time to live, and etcd may have to elect its own leader first.
-        hold: given.hold.max(2 * config.ttl),
+        hold: setup.hold.max(2 * config.ttl),
     };
-    let (kept, left) = Kept::left(&parts.checkpoint, given.restored).await;
-    let session = parts.ledger.session();
+    let (kept, left) = Kept::left(&context.checkpoint, setup.restored).await;
+    let session = context.ledger.session();
     let own = Own {
-        state: parts.ledger.with_mirror(Clone::clone),
-        restored: given.restored,
+        state: context.ledger.with_mirror(Clone::clone),
+        restored: setup.restored,
         term: session.term,
         seq: session.cluster_seq,
     };
@@ -129,7 +131,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
             keys,
             limit: ANSWER_LIMIT,
         },
-        given,
+        setup,
         standing,
         place,
         peers,
@@ -141,7 +143,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, ClusterDriver)
         beside: JoinSet::new(),
         watch: None,
         watched: View::default(),
-        duty: None,
+        duties: None,
         endings: JoinSet::new(),
         kept,
         trouble: Arc::default(),

@@ -7,7 +7,7 @@ use crate::cluster::{
     survey::{self, Complaint, LIMIT},
 };
 
-/// An etcd that does not answer is tried again after this time, because it may be starting, too. Then rosrescue
+/// An etcd that does not answer gets a second attempt after this time, because it may be starting. Then rosrescue
 /// warns.
 const SECOND_LOOK: Duration = Duration::from_secs(5);
 

@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_time_alone_that_was_none_leaves_the_writes_of_the_one_before() {
+    fn a_period_that_ends_without_loss_keeps_the_writes_of_the_one_before() {
         let mut cut_off = begun();
         cut_off.add(&[change(5, set("/a", 1))], false);
         cut_off.begin(base());
@@ -248,7 +248,7 @@ mod tests {
 
     /// The first one's writes are on their way when the second begins.
     #[test]
-    fn of_two_times_alone_the_second_goes_on_from_the_first() {
+    fn the_second_of_two_periods_continues_from_the_first() {
         let others = base();
         let mut cut_off = begun();
         cut_off.add(&[change(5, set("/count", 1))], false);

@@ -13,7 +13,7 @@ mod flight;
 mod session;
 mod types;
 
-use self::flight::{Flight, Reign};
+use self::flight::{Flight, Leadership};
 pub use self::session::JournalSession;
 pub use types::{
     Action, Alive, Commit, EtcdAnswer, Input, Leader, Op, RevisionGuard, Role, Settings, View,
@@ -49,7 +49,7 @@ pub struct Machine {
     observed: Option<Instant>,
     /// When etcd last answered.
     heard: Option<Instant>,
-    reign: Option<Reign>,
+    leadership: Option<Leadership>,
     flight: Option<Flight>,
     retry_at: Option<Instant>,
     numbers: u64,
@@ -79,7 +79,7 @@ impl Machine {
             resumed: None,
             observed: None,
             heard: None,
-            reign: None,
+            leadership: None,
             flight: None,
             retry_at: None,
             numbers: 0,
@@ -126,7 +126,7 @@ impl Machine {
 
     /// The term in which this process leads, if it does.
     pub fn term(&self) -> Option<u64> {
-        self.reign.map(|reign| reign.term)
+        self.leadership.map(|leadership| leadership.term)
     }
 
     /// The last record of this computer that is known to be in the journal.
@@ -164,13 +164,13 @@ impl Machine {
 
     /// The earliest time at which another computer can lead. `None` if one already can.
     fn lapses_at(&self) -> Option<Instant> {
-        let reign = self.reign.filter(|reign| !reign.lapsed)?;
-        Some(reign.sent? + self.settings.ttl)
+        let leadership = self.leadership.filter(|leadership| !leadership.lapsed)?;
+        Some(leadership.sent? + self.settings.ttl)
     }
 
     fn sole_until(&self) -> Option<Instant> {
         let ttl = self.settings.ttl;
-        Some(self.reign?.sent? + ttl - ttl / MARGIN)
+        Some(self.leadership?.sent? + ttl - ttl / MARGIN)
     }
 
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
@@ -200,7 +200,7 @@ impl Machine {
                 self.acknowledge_early(now, &mut actions);
             }
             Input::Peer(leads) => self.peer(now, leads, &mut actions),
-            Input::Lost { view, until } => self.begin_anew(now, view, until, &mut actions),
+            Input::Lost { view, until } => self.start_over(now, view, until, &mut actions),
             Input::HandOver(to) => {
                 self.releasing = Some(to).filter(|_| self.role == Role::Leading);
             }
@@ -299,7 +299,7 @@ impl Machine {
     }
 
     /// Starts over with `view`, because etcd has lost its data.
-    fn begin_anew(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
+    fn start_over(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
         self.flight = None;
         self.deposed(actions);
         // A claim in an old snapshot is not this process's claim.
@@ -344,11 +344,11 @@ impl Machine {
         let mine = leader.filter(|leader| leader.id == self.settings.id);
         let mine = mine.map(|leader| leader.term);
         let alive = self.view.alive.as_ref();
-        match (self.reign, mine) {
-            (Some(reign), Some(term)) if reign.term == term => {
+        match (self.leadership, mine) {
+            (Some(leadership), Some(term)) if leadership.term == term => {
                 let beat = alive.map_or(0, |alive| alive.beat);
                 if let Some(flight) = self.flight.take_if(|flight| flight.is_beat(beat)) {
-                    self.beaten(now, reign, &flight, actions);
+                    self.beaten(now, leadership, &flight, actions);
                 }
             }
             (Some(_), _) => self.deposed(actions),
@@ -364,7 +364,13 @@ impl Machine {
     }
 
     /// Handles the success of the beat in `flight`.
-    fn beaten(&mut self, now: Instant, reign: Reign, flight: &Flight, actions: &mut Vec<Action>) {
+    fn beaten(
+        &mut self,
+        now: Instant,
+        leadership: Leadership,
+        flight: &Flight,
+        actions: &mut Vec<Action>,
+    ) {
         let Op::Beat {
             beat,
             released,
@@ -375,7 +381,7 @@ impl Machine {
             return;
         };
         self.retry_at = None;
-        if reign.caught_up {
+        if leadership.caught_up {
             self.committed = self.view.seq();
         }
         if released.is_some() {
@@ -384,17 +390,17 @@ impl Machine {
             actions.push(Action::Released);
             return;
         }
-        self.reign = Some(Reign {
+        self.leadership = Some(Leadership {
             sent: Some(flight.first),
             beat: *beat,
             full: *seq > self.view.seq(),
             lapsed: false,
-            ..reign
+            ..leadership
         });
         let upto = self.committed;
         self.acknowledge(upto, actions);
         if self.role == Role::Alone && self.is_sole(now) {
-            match reign.caught_up {
+            match leadership.caught_up {
                 true => self.become_role(Role::Leading, actions),
                 false => self.catch_up(actions),
             }
@@ -406,7 +412,7 @@ impl Machine {
         let flight = self.flight.take();
         let claim = self.view.leader.as_ref().map_or(0, |leader| leader.claim);
         let sent = flight.filter(|flight| flight.is_claim(claim));
-        self.reign = Some(Reign {
+        self.leadership = Some(Leadership {
             term,
             sent: sent.map(|flight| flight.first),
             beat: 0,
@@ -433,12 +439,12 @@ impl Machine {
 
     /// Gives up, because another computer leads or could lead.
     fn deposed(&mut self, actions: &mut Vec<Action>) {
-        (self.reign, self.releasing) = (None, None);
+        (self.leadership, self.releasing) = (None, None);
         self.flight.take_if(|flight| flight.op != Op::Read);
-        self.give_way(actions);
+        self.step_down(actions);
     }
 
-    fn give_way(&mut self, actions: &mut Vec<Action>) {
+    fn step_down(&mut self, actions: &mut Vec<Action>) {
         match self.role {
             Role::Leading | Role::Alone => self.hand_back(actions),
             _ => {}

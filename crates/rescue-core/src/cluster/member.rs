@@ -55,7 +55,7 @@ struct Journal {
 
 impl Journal {
     /// Applies `records`, which follow the last known one.
-    fn go_on(&mut self, now: Instant, records: &[Record]) {
+    fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
             if let JournalEntry::Call { call, .. } = &record.entry {
                 let request = Request::from(call.clone());
@@ -198,7 +198,7 @@ impl Member {
                 self.drive(now, input);
             }
             self.catch_up(now);
-            self.tend(now);
+            self.update(now);
             if self.queue.inputs.is_empty() {
                 break;
             }
@@ -357,13 +357,13 @@ impl Member {
     }
 
     /// Updates everything that depends on several parts.
-    fn tend(&mut self, now: Instant) {
-        self.tend_lost(now);
-        self.tend_master();
-        self.look_for_namesake(now);
-        self.tend_standing();
-        self.tend_probes(now);
-        self.tend_merge(now);
-        self.tend_chores(now);
+    fn update(&mut self, now: Instant) {
+        self.update_lost(now);
+        self.update_master();
+        self.check_for_namesake(now);
+        self.update_standing();
+        self.update_probes(now);
+        self.update_merge(now);
+        self.update_chores(now);
     }
 }

@@ -86,7 +86,7 @@ impl fmt::Display for Conflict {
                 )
             }
             Self::Registration { name, node } => {
-                write!(f, "`{node}` has registered `{name}` anew meanwhile")
+                write!(f, "`{node}` has registered `{name}` again meanwhile")
             }
         }
     }
@@ -156,7 +156,7 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
     let caller = call.caller()?;
     let name = || Some(names::resolve(call.text(1)?, caller));
     let node = |at: usize| node(changes, now, caller, call.text(at)?);
-    let anew = |publishes| {
+    let registered_again = |publishes| {
         let subject = ChangeSubject::Topic {
             publishes,
             topic: name()?,
@@ -176,8 +176,8 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
             Some(Conflict::Parameter(name()?))
         }
         Method::RegisterPublisher | Method::RegisterSubscriber => node(3),
-        Method::UnregisterPublisher => node(2).or_else(|| anew(true)),
-        Method::UnregisterSubscriber => node(2).or_else(|| anew(false)),
+        Method::UnregisterPublisher => node(2).or_else(|| registered_again(true)),
+        Method::UnregisterSubscriber => node(2).or_else(|| registered_again(false)),
         Method::RegisterService => {
             node(3).or_else(|| service(changes, now, &name()?, call.text(2)?))
         }

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::{
-    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, JournalSession, Machine, Op,
-    PATIENCE, RETRY, Reign, Role, Settings,
+    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, JournalSession, Leadership,
+    Machine, Op, PATIENCE, RETRY, Role, Settings,
 };
 
 impl Machine {
@@ -26,16 +26,16 @@ impl Machine {
             && self.has_caught_up()
             && self.session != JournalSession::Unknown
             && self.is_sole(now)
-            && let Some(reign) = &mut self.reign
+            && let Some(leadership) = &mut self.leadership
         {
-            reign.caught_up = true;
+            leadership.caught_up = true;
             self.follow_to(self.view.seq());
             self.become_role(Role::Leading, actions);
         }
         if self.lapses_at().is_some_and(|at| at <= now)
-            && let Some(reign) = &mut self.reign
+            && let Some(leadership) = &mut self.leadership
         {
-            reign.lapsed = true;
+            leadership.lapsed = true;
         }
         if self.alone_at().is_some_and(|at| at <= now) {
             self.become_role(Role::Alone, actions);
@@ -62,16 +62,16 @@ impl Machine {
 
     fn next(&mut self, now: Instant) -> Flight {
         let guard = self.view.guard();
-        let op = match self.reign {
-            Some(reign) => {
-                let seq = match reign.caught_up {
+        let op = match self.leadership {
+            Some(leadership) => {
+                let seq = match leadership.caught_up {
                     true => self.recorded,
                     false => self.view.seq(),
                 };
                 let whole = seq == self.committed && self.role == Role::Leading;
                 Op::Beat {
                     guard,
-                    beat: reign.beat + 1,
+                    beat: leadership.beat + 1,
                     seq,
                     released: self.releasing.clone().filter(|_| whole),
                     settled: self.session.settled_by(seq),
@@ -100,8 +100,8 @@ impl Machine {
 
     /// When the next request is due, unless one is under way.
     fn send_at(&self) -> Option<Instant> {
-        let due = match self.reign {
-            Some(reign) => self.beat_at(reign)?,
+        let due = match self.leadership {
+            Some(leadership) => self.beat_at(leadership)?,
             None => match self.observed {
                 Some(observed) => {
                     let vacant = observed + self.vacant_after();
@@ -113,15 +113,15 @@ impl Machine {
         Some(self.retry_at.map_or(due, |at| at.max(due)))
     }
 
-    fn beat_at(&self, reign: Reign) -> Option<Instant> {
-        let Some(sent) = reign.sent.filter(|_| self.releasing.is_none()) else {
+    fn beat_at(&self, leadership: Leadership) -> Option<Instant> {
+        let Some(sent) = leadership.sent.filter(|_| self.releasing.is_none()) else {
             return self.observed;
         };
         let pause = self.settings.ttl / BEATS;
-        let waiting = reign.caught_up && self.recorded > self.committed;
+        let waiting = leadership.caught_up && self.recorded > self.committed;
         Some(match self.settings.commit {
             Commit::Always if waiting => sent,
-            Commit::Interval if reign.full => sent,
+            Commit::Interval if leadership.full => sent,
             Commit::Interval if waiting => sent + COMMIT_INTERVAL.min(pause),
             _ => sent + pause,
         })
@@ -164,7 +164,7 @@ impl Machine {
                 None => Some(silent),
             },
             // Until then, only committed writes are acknowledged, unless no other computer can lead.
-            Role::Leading => Some(self.reign?.sent? + patience),
+            Role::Leading => Some(self.leadership?.sent? + patience),
             Role::Alone => None,
         };
         // After a pause of this process, etcd is asked first what has happened meanwhile.

@@ -6,7 +6,7 @@ use super::Op;
 
 /// The term in which this process leads, as far as it knows.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Reign {
+pub(super) struct Leadership {
     pub(super) term: u64,
     /// When the last successful transaction was sent. `None` if unknown.
     pub(super) sent: Option<Instant>,

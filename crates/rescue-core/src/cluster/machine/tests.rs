@@ -223,7 +223,7 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
     for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
         let (mut machine, now) = leading(alone);
         sent(&machine.on(now, Input::Recorded(1)));
-        // Nobody else can lead before that.
+        // No other computer can lead before that.
         assert!(machine.may_have_master());
         assert_eq!(machine.deadline(), Some(now + TTL));
         machine.on(now + TTL, Input::Wake);

@@ -38,7 +38,7 @@ impl Chores {
 
 impl Member {
     /// Starts the work that is due.
-    pub(super) fn tend_chores(&mut self, now: Instant) {
+    pub(super) fn update_chores(&mut self, now: Instant) {
         // Earlier, it would overwrite the entry of another computer with this name.
         let watch = self.namesake.watch.as_ref();
         let may_say = watch.is_some_and(|of| of.is_over(now));

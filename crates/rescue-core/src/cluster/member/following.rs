@@ -164,7 +164,7 @@ impl Member {
         if records.is_empty() {
             return;
         }
-        self.journal.go_on(now, records);
+        self.journal.apply(now, records);
         self.cut_off.note(records);
         if !self.cut_off.is_empty() || self.outgoing.count() > 0 {
             self.adopt();
@@ -202,7 +202,7 @@ impl Member {
             false => self.reading.floor.max(self.own.term),
         };
         if self.has_lost(&read.view, floor) {
-            return self.begin_anew(now, &read.view);
+            return self.start_over(now, &read.view);
         }
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);
@@ -239,21 +239,21 @@ impl Member {
                 self.cut_off.note(&read.records);
             }
             journal.displaced.add(now, displaced);
-            journal.go_on(now, &read.records);
+            journal.apply(now, &read.records);
             journal.progress = read.progress;
             self.adopt();
         } else if let Ok(new) = journal.progress.take(read.records, 0) {
             match first {
                 // The ledger's state may differ.
                 true => {
-                    self.journal.go_on(now, &new);
+                    self.journal.apply(now, &new);
                     self.adopt();
                 }
                 false => self.follow(now, &new),
             }
         }
         if first {
-            if !self.begun_anew() {
+            if !self.is_starting_over() {
                 self.cut_off.note_difference(None, &self.journal.state);
             }
             if self
@@ -323,7 +323,7 @@ impl Member {
     }
 
     /// Ends this member if another living computer has its name.
-    pub(super) fn look_for_namesake(&mut self, now: Instant) {
+    pub(super) fn check_for_namesake(&mut self, now: Instant) {
         let view = self.view();
         let signs = self.signs_of_namesake(view);
         let watch = self.namesake.watch.as_ref();

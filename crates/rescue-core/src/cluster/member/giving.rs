@@ -120,7 +120,7 @@ impl Member {
         match change {
             Change::Call(record, _) => {
                 if let Ok(new) = journal.progress.take(vec![record], 0) {
-                    journal.go_on(now, &new);
+                    journal.apply(now, &new);
                     self.cut_off.note(&new);
                 }
             }

@@ -69,7 +69,7 @@ impl Member {
     }
 
     /// Starts over with the new etcd, which shows `view`, and with this computer's state.
-    pub(super) fn begin_anew(&mut self, now: Instant, view: &View) {
+    pub(super) fn start_over(&mut self, now: Instant, view: &View) {
         let holds = match self.reading.loaded {
             true => Holds {
                 term: self.place.term,
@@ -104,7 +104,7 @@ impl Member {
     }
 
     /// Whether etcd has lost its data. If so, notes how far the new journal has been read.
-    pub(super) fn begun_anew(&mut self) -> bool {
+    pub(super) fn is_starting_over(&mut self) -> bool {
         let seq = self.journal.progress.seq;
         if let Some((.., upto)) = &mut self.lost.now {
             *upto = seq;
@@ -113,7 +113,7 @@ impl Member {
     }
 
     /// Lets a computer that holds more claim first.
-    pub(super) fn tend_lost(&mut self, now: Instant) {
+    pub(super) fn update_lost(&mut self, now: Instant) {
         let Some((since, holds, _)) = self.lost.now else {
             return;
         };

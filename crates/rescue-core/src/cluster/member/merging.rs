@@ -108,12 +108,12 @@ impl Member {
         }
     }
 
-    pub(super) fn tend_merge(&mut self, now: Instant) {
+    pub(super) fn update_merge(&mut self, now: Instant) {
         let to = self.merges_to();
         match &mut self.merging.step {
             Step::Idle => {
                 if to.is_some() && !self.cut_off.is_empty() {
-                    self.judge_anew(now);
+                    self.judge_again(now);
                 }
             }
             Step::Reading => {
@@ -131,14 +131,14 @@ impl Member {
                 if *until <= now {
                     match ask.take() {
                         Some(ask) => self.ask(now, ask),
-                        None => self.judge_anew(now),
+                        None => self.judge_again(now),
                     }
                 }
             }
         }
     }
 
-    fn judge_anew(&mut self, now: Instant) {
+    fn judge_again(&mut self, now: Instant) {
         self.merging.step = Step::Reading;
         self.reading.refresh(now);
     }
@@ -177,7 +177,7 @@ impl Member {
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
         if calls.is_empty() {
             match self.merging.unread {
-                true => self.judge_anew(now),
+                true => self.judge_again(now),
                 false => self.merged(),
             }
             return;
@@ -286,7 +286,7 @@ impl Member {
         if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {
             self.stand_leading(term);
         }
-        self.tend_standing();
+        self.update_standing();
     }
 }
 

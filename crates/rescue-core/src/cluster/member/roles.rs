@@ -153,7 +153,7 @@ impl Member {
     }
 
     /// Runs a master as long as the machine allows it.
-    pub(super) fn tend_master(&mut self) {
+    pub(super) fn update_master(&mut self) {
         let may = self.machine.may_have_master();
         if self.has_master && !may {
             self.tell(News::Lapsed);
@@ -204,7 +204,7 @@ impl Member {
     }
 
     /// Updates the standing when the leader changes.
-    pub(super) fn tend_standing(&mut self) {
+    pub(super) fn update_standing(&mut self) {
         self.look_at_place();
         let own = &self.settings().id;
         let view = self.view();
@@ -232,7 +232,7 @@ impl Member {
     }
 
     /// Probes the leader's rosrescue regularly.
-    pub(super) fn tend_probes(&mut self, now: Instant) {
+    pub(super) fn update_probes(&mut self, now: Instant) {
         let asks = matches!(self.machine.role(), Role::Following | Role::Alone);
         let leader = self.leader().filter(|_| asks);
         let leader = leader.map(|(uri, term)| (uri.to_owned(), term));

@@ -227,7 +227,7 @@ pub enum Action {
         parts: Vec<Put>,
     },
     /// Find out whether the session of the journal, which has `state` at record `seq`, continues. `closed` says whether
-    /// the last leader stopped in order.
+    /// the last leader stopped cleanly.
     Decide {
         seq: u64,
         state: Master,

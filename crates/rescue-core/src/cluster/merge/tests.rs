@@ -233,7 +233,7 @@ fn a_name_that_another_node_has_taken_is_not_taken_back() {
         lost(&base, &[gone], publish("/n", "/t", "http://old:1/")),
         None
     );
-    // The node was started anew, here.
+    // The node was started again on this computer.
     assert_eq!(
         lost(&base, &[], publish("/n", "/t", "http://here:1/")),
         None
@@ -253,7 +253,7 @@ fn a_service_of_another_node_stays() {
 }
 
 #[test]
-fn what_a_node_has_registered_anew_stays() {
+fn what_a_node_has_registered_again_stays() {
     let gone = call(Method::UnregisterPublisher, &["/n", "/t", "http://n:1/"]);
     let there = [publish("/n", "/t", "http://n:1/")];
     assert!(lost(&[], &there, gone.clone()).is_some());

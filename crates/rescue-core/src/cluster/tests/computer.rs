@@ -39,7 +39,7 @@ pub(super) struct Ledger {
     /// Merged portions that wait for the journal up to a record: who has asked, and the answer.
     pub(super) merges: Vec<(u64, Asker, wire::MergeAnswer)>,
     /// Counts the times that calls are recorded here.
-    pub(super) reign: u64,
+    pub(super) leadership: u64,
     pub(super) agreed: u64,
     pub(super) lease: Option<Instant>,
 }
@@ -69,7 +69,7 @@ impl Ledger {
     /// Nothing is recorded any more. Returns the portions that are not answered.
     pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
         self.sharing = None;
-        self.reign += 1;
+        self.leadership += 1;
         self.agreed = 0;
         self.unanswered.clear();
         std::mem::take(&mut self.merges)
@@ -209,7 +209,7 @@ impl Computer {
         };
         self.ledger = Ledger {
             mirror: own.state.clone(),
-            reign: self.ledger.reign + 1,
+            leadership: self.ledger.leadership + 1,
             ..Ledger::default()
         };
         self.member = member(&self.name, index, self.life, plan, &self.disk);

@@ -313,9 +313,9 @@ impl World {
                 value,
             } => self.notify(from, master, to, key, value),
             Event::Retry(from, master, to) => self.retry(from, master, to),
-            Event::TellAll(at, reign, master) => {
+            Event::TellAll(at, leadership, master) => {
                 let computer = &self.computers[at];
-                let present = computer.up && computer.ledger.reign == reign;
+                let present = computer.up && computer.ledger.leadership == leadership;
                 if present && master.is_none_or(|of| computer.master == Some(of)) {
                     (0..COMPUTERS).for_each(|to| self.tell_state(at, to));
                 }
@@ -552,8 +552,8 @@ impl World {
             Action::Lead { seq, held, state } => {
                 let computer = &mut self.computers[at];
                 computer.ledger.lead(seq, &held, state);
-                let reign = computer.ledger.reign;
-                self.after(50 * MS, Event::TellAll(at, reign, None));
+                let leadership = computer.ledger.leadership;
+                self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
             Action::Follow(records) => {
                 let computer = &mut self.computers[at];
@@ -586,14 +586,14 @@ impl World {
                 let master = self.masters;
                 let computer = &mut self.computers[at];
                 computer.master = Some(master);
-                let reign = computer.ledger.reign;
-                self.after(MASTER_STARTS, Event::TellAll(at, reign, Some(master)));
+                let leadership = computer.ledger.leadership;
+                self.after(MASTER_STARTS, Event::TellAll(at, leadership, Some(master)));
             }
             Action::EndMaster => {
                 let computer = &mut self.computers[at];
                 computer.master = None;
-                let reign = computer.ledger.reign;
-                self.after(50 * MS, Event::TellAll(at, reign, None));
+                let leadership = computer.ledger.leadership;
+                self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
             Action::ServeOwnOnly(own_only) => self.computers[at].own_only = own_only,
             Action::KeepAll { base, calls } => {

@@ -1,4 +1,4 @@
-//! Random times alone, with a leader that goes on, is replaced, forgets, and whose answers get lost.
+//! Random periods of being cut off, with a leader that continues, is replaced, forgets, and whose answers get lost.
 
 use super::super::{
     Changes, Verdict, WritesToSend,
@@ -264,7 +264,7 @@ fn play(seed: u64, counts: &mut Counts) {
             assert!(was_so, "seed {seed}: {call:?} was lost without a word");
         }
     }
-    // Where nobody else has written, all is as it was here.
+    // Where no other computer has written, all is as it was here.
     for key in KEYS {
         let this = Request::new(Method::DeleteParam, ["/here", key]);
         let about = written.iter().filter(|call| related(call, &this));
