@@ -305,7 +305,12 @@ impl Drain {
         }
         match done.result {
             Ok(Received::Held(state)) => self.resync(incarnation, version, *state),
-            Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
+            Ok(Received::Reply(raw)) => {
+                let (took, calls) = (sent.elapsed(), items.len());
+                let ledger = &self.link.ledger;
+                ledger.with_order(|order, _| order.master_answered(took, calls));
+                self.deliver(incarnation, items, raw);
+            }
             Err(error) => self.failed(items, &error),
         }
         // A master that ran a lost batch may have notified nodes, and the mirror does not know yet of what.

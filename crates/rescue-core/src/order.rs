@@ -48,7 +48,8 @@ pub const RECENT: Duration = Duration::from_millis(500);
 /// How long after such a notification the node is told the state again. Idle threads of rosmaster look for work every
 /// 100 ms, so by then a master without a backlog has sent everything.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
-/// Longest time of a master for one notification while many wait. A Python thread gives up its lock every 5 ms.
+/// Longest time that a master with enough CPU time takes for one notification while many wait. A Python thread gives up
+/// its lock every 5 ms.
 const MASTER_TAKES: Duration = Duration::from_millis(5);
 /// Longest backlog of the master for which rosrescue's notifications wait.
 const BACKLOG_MAX: Duration = Duration::from_secs(10);
@@ -172,6 +173,13 @@ impl Order {
                 self.repeats.add(until, port, subject.clone());
             }
         }
+    }
+
+    /// Notes that the master answered a batch of `calls` after `took`. A busy computer that delays its answers delays its
+    /// notifications as well.
+    pub fn master_answered(&mut self, took: Duration, calls: usize) {
+        let per_call = took / u32::try_from(calls.max(1)).unwrap_or(u32::MAX);
+        self.told.pace = per_call.max(self.told.pace * 7 / 8);
     }
 
     /// Notes that the master is gone and sends no more notifications.
@@ -314,13 +322,15 @@ struct Told {
     ends: Schedule<Subject>,
     /// When the master is expected to have sent everything.
     busy: Option<Instant>,
+    /// How long the master recently took for a call.
+    pace: Duration,
 }
 
 impl Told {
     /// Notes that the master has begun to notify this many nodes. Returns when it will be done.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
         self.forget(now);
-        let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
+        let takes = MASTER_TAKES.max(self.pace) * u32::try_from(nodes).unwrap_or(u32::MAX);
         let busy = self.busy.map_or(now, |busy| busy.max(now));
         let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MAX);
         self.busy = Some(busy);

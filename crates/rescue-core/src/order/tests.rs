@@ -259,6 +259,28 @@ fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     assert_eq!(port_of("http://a:1/"), A);
 }
 
+/// With 60 busy processes on two cores, a repeat came before four older values of the master.
+#[test]
+fn a_master_that_answers_slowly_is_given_time_for_its_notifications() {
+    let (mut order, now) = (Order::default(), Instant::now());
+    let slow = Duration::from_millis(80);
+    order.master_answered(2 * slow, 2);
+    order.told_by_master(now, &topic("/t"), 3);
+    let until = order.told.until(now, &topic("/t"));
+    assert_eq!(until, Some(now + 3 * slow + REPEAT_AFTER));
+    // One quick answer does not prove that the backlog is gone; twenty do.
+    order.master_answered(Duration::from_millis(1), 1);
+    assert!(order.told.pace > slow / 2);
+    for _ in 0..20 {
+        order.master_answered(Duration::from_millis(1), 1);
+    }
+    let mut quick = Order::default();
+    quick.told.pace = order.told.pace;
+    quick.told_by_master(now, &topic("/t"), 1);
+    let until = quick.told.until(now, &topic("/t")).unwrap();
+    assert!(until < now + 2 * MASTER_TAKES + REPEAT_AFTER);
+}
+
 #[test]
 fn a_parameter_that_is_set_again_and_again_takes_no_more_memory() {
     let (mut order, now) = (Order::default(), Instant::now());
