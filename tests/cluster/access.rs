@@ -204,7 +204,7 @@ async fn certificates_are_checked_on_both_sides() {
     for (options, said) in [
         (
             options(Credentials::default(), "https://127.0.0.1:1"),
-            "needs the certificate of its authority",
+            "needs the certificate of etcd's authority",
         ),
         (options(half, "https://127.0.0.1:1"), "needs its key"),
         (

@@ -102,6 +102,14 @@ impl CutOff {
         }
     }
 
+    /// Notes that the leader may make these calls of this computer once more. They do not count as others' changes in any
+    /// period.
+    pub fn expect_once_more(&mut self, calls: &[Request]) {
+        for time in &mut self.times {
+            time.changes.expect(calls.iter().cloned());
+        }
+    }
+
     /// Notes new records of the journal.
     pub fn note(&mut self, records: &[Record]) {
         for time in &mut self.times {
@@ -244,6 +252,36 @@ mod tests {
         assert_eq!(first(&cut_off), [set("/a", 1)]);
         cut_off.resumed();
         assert!(cut_off.is_empty());
+    }
+
+    /// The leader made the first period's write twice, because its first answer was lost.
+    #[test]
+    fn a_write_that_is_sent_again_is_no_change_of_others_in_later_periods() {
+        let mut cut_off = begun();
+        cut_off.add(&[change(5, set("/count", 1))], false);
+        cut_off.begin(base());
+        cut_off.add(&[change(6, set("/count", 2))], false);
+        cut_off
+            .first_mut()
+            .unwrap()
+            .changes
+            .expect([set("/count", 1)]);
+        cut_off.note(&[record(7, set("/count", 1))]);
+        cut_off.expect_once_more(&[set("/count", 1)]);
+        cut_off.note(&[record(8, set("/count", 1))]);
+        for time in &cut_off.times {
+            let merged = merge::merge(&time.changes, &base(), time.pending.calls());
+            assert!(merged.lost.is_empty(), "{:?}", merged.lost);
+        }
+        // The same by another node is a change.
+        let of_another = Request::new(
+            Method::SetParam,
+            [Value::from("/m"), "/count".into(), 1.into()],
+        );
+        cut_off.note(&[record(9, of_another)]);
+        let last = cut_off.times.back().unwrap();
+        let merged = merge::merge(&last.changes, &base(), last.pending.calls());
+        assert_eq!(merged.lost.len(), 1);
     }
 
     /// The first one's writes are on their way when the second begins.
