@@ -102,9 +102,8 @@ impl CutOff {
         }
     }
 
-    /// Notes that the leader may make these calls of this computer once more. They do not count as others' changes in any
-    /// period.
-    pub fn expect_once_more(&mut self, calls: &[Request]) {
+    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period.
+    pub fn expect_in_all(&mut self, calls: &[Request]) {
         for time in &mut self.times {
             time.changes.expect(calls.iter().cloned());
         }
@@ -261,13 +260,8 @@ mod tests {
         cut_off.add(&[change(5, set("/count", 1))], false);
         cut_off.begin(base());
         cut_off.add(&[change(6, set("/count", 2))], false);
-        cut_off
-            .first_mut()
-            .unwrap()
-            .changes
-            .expect([set("/count", 1)]);
+        cut_off.expect_in_all(&[set("/count", 1)]);
         cut_off.note(&[record(7, set("/count", 1))]);
-        cut_off.expect_once_more(&[set("/count", 1)]);
         cut_off.note(&[record(8, set("/count", 1))]);
         for time in &cut_off.times {
             let merged = merge::merge(&time.changes, &base(), time.pending.calls());

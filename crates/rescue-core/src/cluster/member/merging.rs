@@ -57,8 +57,6 @@ pub(super) struct Merging {
     untold: BTreeSet<String>,
     /// Whether the portion under way sets the parameters in [`Self::untold`] again.
     telling: bool,
-    /// Whether the portion under way was sent before.
-    was_sent: bool,
     /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
     unread: bool,
     /// The writes in `left` conflict with no change up to this record.
@@ -77,7 +75,6 @@ impl Merging {
             left: None,
             untold: BTreeSet::new(),
             telling: false,
-            was_sent: false,
             unread: false,
             judged: 0,
             sent: 0,
@@ -185,7 +182,6 @@ impl Member {
             }
             return;
         }
-        self.merging.was_sent = false;
         let ask = Ask {
             id: self.merging.id(),
             seq: self.merging.judged,
@@ -199,14 +195,8 @@ impl Member {
             self.merging.step = Step::Pause(now + AGAIN, Some(ask));
             return;
         };
-        // Without an answer, the journal may still contain the calls, each as often as it was sent.
-        match self.cut_off.first_mut() {
-            Some(time) if !self.merging.was_sent && !self.merging.telling => {
-                time.changes.expect(ask.calls.iter().cloned());
-            }
-            _ => self.cut_off.expect_once_more(&ask.calls),
-        }
-        self.merging.was_sent = true;
+        // Without an answer, the journal may still contain the calls, perhaps several times.
+        self.cut_off.expect_in_all(&ask.calls);
         self.merging.step = Step::Asked(ask.clone(), to.clone());
         self.merging.asked += 1;
         let number = self.merging.asked;

@@ -121,7 +121,7 @@ impl Changes {
             return;
         }
         for call in call.calls() {
-            if !self.own.take(call) {
+            if !self.own.has(call) {
                 ChangeSubject::of(call)
                     .into_iter()
                     .for_each(|it| self.add(it));
@@ -206,7 +206,7 @@ impl Changes {
     }
 }
 
-/// Calls of this computer. Each one can explain one change.
+/// Calls of this computer.
 #[derive(Clone, Debug, Default)]
 struct Own {
     /// The calls, by subject.
@@ -223,26 +223,20 @@ fn slot(call: &Request) -> String {
 
 impl Own {
     fn add(&mut self, call: Request) {
-        self.calls.entry(slot(&call)).or_default().push(call);
+        if !self.has(&call) {
+            self.calls.entry(slot(&call)).or_default().push(call);
+        }
     }
 
-    fn take(&mut self, call: &Request) -> bool {
+    /// Whether `call` is one of these. It may be in the journal several times, because it is sent again after a lost
+    /// answer.
+    fn has(&self, call: &Request) -> bool {
         if Mutant::GuessesByValues.lives() {
             let mut own = self.calls.values().flatten();
             return own.any(|of| of.params().get(1..) == call.params().get(1..));
         }
-        let slot = slot(call);
-        let Some(calls) = self.calls.get_mut(&slot) else {
-            return false;
-        };
-        let Some(at) = calls.iter().position(|of| of == call) else {
-            return false;
-        };
-        calls.remove(at);
-        if calls.is_empty() {
-            self.calls.remove(&slot);
-        }
-        true
+        let calls = self.calls.get(&slot(call));
+        calls.is_some_and(|calls| calls.contains(call))
     }
 
     fn calls(&self) -> impl Iterator<Item = &Request> {
