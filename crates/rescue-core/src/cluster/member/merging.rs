@@ -24,6 +24,9 @@ use crate::{
 const AGAIN: Duration = Duration::from_millis(100);
 /// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 const TELLER: &str = "/rosrescue";
+/// How often parameters are set again that others keep changing. Each of their changes notifies the nodes as well, and
+/// calls wait for the end of the merge.
+const ROUNDS_MAX: u32 = 3;
 /// The largest number of calls in one portion. Other writes pass between portions.
 const CALLS_MOST: usize = 100;
 /// The approximate largest size of one portion, in bytes.
@@ -57,6 +60,8 @@ pub(super) struct Merging {
     untold: BTreeSet<String>,
     /// Whether the portion under way sets the parameters in [`Self::untold`] again.
     telling: bool,
+    /// How often such a portion failed, because others changed a parameter meanwhile.
+    rounds: u32,
     /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
     unread: bool,
     /// The writes in `left` conflict with no change up to this record.
@@ -75,6 +80,7 @@ impl Merging {
             left: None,
             untold: BTreeSet::new(),
             telling: false,
+            rounds: 0,
             unread: false,
             judged: 0,
             sent: 0,
@@ -241,17 +247,21 @@ impl Member {
 
     /// Handles the answer to a portion that set parameters again.
     fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
+        let is_last = self.merging.rounds >= ROUNDS_MAX;
         let untold = &mut self.merging.untold;
         let before = untold.len();
         for (call, outcome) in ask.calls.iter().zip(outcomes) {
             // If it was changed meanwhile, nodes may have heard the new value before the lost one.
-            if !matches!(outcome, WriteOutcome::Lost { .. }) {
+            if is_last || !matches!(outcome, WriteOutcome::Lost { .. }) {
                 call.text(1).map(|key| untold.remove(key));
             }
         }
         match untold.len() == before - ask.calls.len() {
             true => self.next_portion(now),
-            false => self.merging.step = Step::Pause(now + AGAIN, None),
+            false => {
+                self.merging.rounds += 1;
+                self.merging.step = Step::Pause(now + AGAIN, None);
+            }
         }
     }
 
