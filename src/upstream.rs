@@ -390,6 +390,25 @@ fn is_local(stream: &TcpStream) -> io::Result<bool> {
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
 }
 
+/// Listens like a master, and connects to it: the listener, the accepted end of the sentinel, the connections, and the
+/// sentinel.
+#[cfg(test)]
+pub(crate) async fn test_master() -> (
+    tokio::net::TcpListener,
+    TcpStream,
+    std::sync::Arc<Upstream>,
+    std::sync::Arc<Sentinel>,
+) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let uri = format!("http://{}", listener.local_addr().unwrap());
+    let uri = MasterUri::parse(&uri).unwrap();
+    let name = HeaderValue::from_static("test");
+    let upstream = Upstream::new(uri, name, Duration::from_secs(1), 3);
+    let sentinel = upstream.connect_sentinel().await.unwrap();
+    let (accepted, _) = listener.accept().await.unwrap();
+    (listener, accepted, upstream.into(), sentinel.into())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

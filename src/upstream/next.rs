@@ -66,15 +66,13 @@ impl NextConnection {
 mod tests {
     use std::sync::Arc;
 
-    use hyper::{HeaderMap, StatusCode, header::HeaderValue};
-    use tokio::net::TcpListener;
+    use hyper::{HeaderMap, StatusCode};
 
     use super::*;
     use crate::{
         replay::Token,
-        ros_env::MasterUri,
         upstream::{
-            Upstream,
+            Upstream, test_master,
             verify::{self, Verification},
         },
     };
@@ -96,13 +94,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_master_that_closes_each_connection_has_accepted_the_next_before_it_is_needed() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let uri = format!("http://{}", listener.local_addr().unwrap());
-        let uri = MasterUri::parse(&uri).unwrap();
-        let name = HeaderValue::from_static("test");
-        let upstream = Arc::new(Upstream::new(uri, name, Duration::from_secs(1), 3));
-        let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
-        let (_sentinel, _) = listener.accept().await.unwrap();
+        let (listener, _sentinel, upstream, sentinel) = test_master().await;
         let after = async |reply, by| {
             upstream.set_verification(Some(by));
             let last = connect(upstream.clone()).await.unwrap();

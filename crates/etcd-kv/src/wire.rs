@@ -25,7 +25,7 @@ pub struct Txn {
     pub compare: Vec<(String, u64)>,
     /// Operations if the condition holds.
     pub success: Vec<TxnOp>,
-    /// Operations if it does not hold.
+    /// Operations if the condition is false.
     pub failure: Vec<TxnOp>,
 }
 

@@ -1,6 +1,7 @@
+//! The real queue, with a master that runs a call and dies before it answers.
+
 use bytes::Bytes;
-use hyper::header::HeaderValue;
-use tokio::{io::AsyncReadExt, net::TcpListener};
+use tokio::io::AsyncReadExt;
 
 use super::*;
 use crate::{
@@ -10,8 +11,7 @@ use crate::{
     health::port_of,
     lifecycle::Patience,
     order::{NextNotification as Notification, REPEAT_AFTER, Subject},
-    ros_env::MasterUri,
-    upstream::{Head, Upstream, verify::Verification},
+    upstream::{Head, test_master, verify::Verification},
     write_queue::write_queue,
     xmlrpc::Value,
 };
@@ -48,13 +48,7 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     ledger.succeed();
     let incarnation = ledger.serve();
 
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let uri = format!("http://{}", listener.local_addr().unwrap());
-    let uri = MasterUri::parse(&uri).unwrap();
-    let name = HeaderValue::from_static("test");
-    let upstream = Arc::new(Upstream::new(uri, name, Duration::from_secs(1), 3));
-    let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
-    let (_sentinel, _) = listener.accept().await.unwrap();
+    let (listener, _sentinel, upstream, sentinel) = test_master().await;
     upstream.set_verification(Some(Verification::Sentinel(sentinel)));
     let (gate_tx, gate) = gate();
     gate_tx.set(State::Open { incarnation });

@@ -66,10 +66,7 @@ impl Storage for SimFs {
 
     fn sync(&self, file: &SimFile) -> io::Result<()> {
         let mut world = self.0.lock().unwrap();
-        assert!(
-            !world.inodes[file.0].poisoned,
-            "a failed sync was tried again"
-        );
+        assert!(!world.inodes[file.0].poisoned, "a failed sync was repeated");
         if let Err(error) = world.whole_step() {
             world.inodes[file.0].poisoned = true;
             return Err(error);

@@ -98,7 +98,7 @@ fn a_compaction_that_cannot_keep_up_is_dropped_at_a_memory_limit() {
     }
     let error = store.finish_compaction(job.run()).unwrap_err();
     assert!(matches!(error, StoreError::Overtaken { .. }));
-    // No record is lost, and the compaction is not tried again at once.
+    // No record is lost, and the compaction is not repeated at once.
     assert!(store.unprotected().is_none() && !store.wants_compaction());
     drop(store);
     assert_eq!(open(&fs).unwrap().1.unwrap().records.len(), 20);

@@ -1,8 +1,8 @@
-//! Since when a master has answered nothing.
+//! Tells how long a master has been silent.
 
 use std::time::Instant;
 
-/// Counts the calls to a master that have not ended, and knows since when none has ended.
+/// Counts the calls to a master that are under way, and remembers since when none has ended.
 ///
 /// A slow call alone does not make a master silent: while other calls end, it is only busy.
 #[derive(Clone, Copy, Debug, Default)]
@@ -24,7 +24,7 @@ impl OpenCalls {
         self.silent_since = (self.calls > 0).then_some(now);
     }
 
-    /// Since when calls are under way and none has ended. None if no call is under way.
+    /// Since when calls are under way and none has ended. `None` if no call is under way.
     pub fn silent_since(&self) -> Option<Instant> {
         self.silent_since
     }

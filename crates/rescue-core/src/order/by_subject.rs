@@ -77,7 +77,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         self.exact.is_empty() && self.params.is_empty()
     }
 
-    /// Whether `subject` concerns any value.
+    /// Whether `subject` concerns anything in this collection.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
     }
