@@ -74,7 +74,9 @@ impl Replica {
     }
 
     async fn try_load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
-        let found = self.client.range(&self.keys.small(), self.limit).await?;
+        // A long journal takes many requests, so what is known is not read again.
+        let unknown = self.keys.small_after(known.seq);
+        let found = self.client.ranges(&unknown, self.limit).await?;
         let mut loaded = LoadedState {
             view: etcd::view_of(&found, &self.keys)?,
             checkpoint: None,

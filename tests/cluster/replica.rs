@@ -1,6 +1,10 @@
 //! The robot's state in etcd, written by one computer and read by another.
 
-use std::time::Instant;
+use std::{
+    io::{Read, Write},
+    net::TcpStream,
+    time::Instant,
+};
 
 use rosrescue::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent, Session},
@@ -128,6 +132,44 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
     leader.commit(&[record(7, 1)]).await;
     let more = follower.load(loaded.progress).await.unwrap();
     assert_eq!(more.records, [record(7, 1)]);
+}
+
+/// How many read requests the only member has answered.
+fn reads(servers: &Servers) -> u64 {
+    let address = servers.endpoints(0)[0].replace("http://", "");
+    let mut stream = TcpStream::connect(&address).unwrap();
+    let request = format!("GET /metrics HTTP/1.0\r\nHost: {address}\r\n\r\n");
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut page = String::new();
+    stream.read_to_string(&mut page).unwrap();
+    let line = page.lines().find(|line| {
+        line.starts_with("grpc_server_handled_total")
+            && line.contains("grpc_code=\"OK\",grpc_method=\"Range\"")
+    });
+    let count = line.and_then(|line| line.rsplit(' ').next());
+    count.unwrap().parse().unwrap()
+}
+
+/// While a computer merges what it wrote while cut off, it reads the journal again and again. With a long journal each
+/// reading took over 10 s on a busy computer.
+#[tokio::test]
+async fn what_is_known_of_a_long_journal_is_not_read_again() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    for seq in 1..=300 {
+        leader.commit(&[record(seq, 1)]).await;
+    }
+    let follower = replica(&servers);
+    let before = reads(&servers);
+    let known = follower.load(Progress::default()).await.unwrap();
+    let whole = reads(&servers) - before;
+    leader.commit(&[record(301, 1)]).await;
+    let before = reads(&servers);
+    let more = follower.load(known.progress).await.unwrap();
+    assert_eq!(more.records, [record(301, 1)]);
+    assert_eq!(more.view.guard(), leader.guard);
+    let rest = reads(&servers) - before;
+    assert!(rest <= 2 && whole > 5, "{whole} requests, then {rest}");
 }
 
 #[tokio::test]

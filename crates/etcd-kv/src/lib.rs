@@ -134,24 +134,39 @@ impl Client {
     /// [`EtcdError::Compacted`] if etcd has compacted that moment before all keys were read. Otherwise why they could
     /// not be read.
     pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
-        let mut found: Option<Found> = None;
-        let mut from = range.start.clone();
-        loop {
-            let revision = found.as_ref().map_or(0, |found| found.revision);
-            let request = wire::range(&(from..range.end.clone()), revision, PAGE);
-            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
-            let (revision, more, kvs) = page.read()?;
-            let found = found.get_or_insert(Found {
-                revision,
-                kvs: Vec::new(),
-            });
-            found.kvs.extend(kvs);
-            let Some(last) = found.kvs.last().filter(|_| more) else {
-                return Ok(found.clone());
-            };
-            // The next page begins with the first key after this one.
-            from = format!("{}\0", last.key);
+        self.ranges(std::slice::from_ref(range), limit).await
+    }
+
+    /// All keys in these ranges with their values, as of one moment. The ranges are read one after the other.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::range`].
+    pub async fn ranges(
+        &self,
+        ranges: &[Range<String>],
+        limit: Duration,
+    ) -> Result<Found, EtcdError> {
+        let mut revision = None;
+        let mut kvs: Vec<Kv> = Vec::new();
+        for range in ranges {
+            let mut from = range.start.clone();
+            loop {
+                let at = revision.unwrap_or_default();
+                let request = wire::range(&(from..range.end.clone()), at, PAGE);
+                let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
+                let (present, more, page) = page.read()?;
+                revision.get_or_insert(present);
+                kvs.extend(page);
+                let Some(last) = kvs.last().filter(|_| more) else {
+                    break;
+                };
+                // The next page begins with the first key after this one.
+                from = format!("{}\0", last.key);
+            }
         }
+        let revision = revision.unwrap_or_default();
+        Ok(Found { revision, kvs })
     }
 
     /// Creates a lease that ends by itself after about `ttl`, but after 2 s at the earliest. etcd then deletes the keys

@@ -89,6 +89,15 @@ impl Keys {
         self.0.clone()..format!("{}v", self.0)
     }
 
+    /// As [`Self::small`], without the journal up to record `seq`.
+    pub fn small_after(&self, seq: u64) -> [Range<String>; 2] {
+        let all = self.small();
+        [
+            all.start..self.journal(0),
+            self.journal(seq.saturating_add(1))..all.end,
+        ]
+    }
+
     /// The keys of the journal after record `seq`.
     pub fn journal_after(&self, seq: u64) -> Range<String> {
         self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)

@@ -186,3 +186,20 @@ fn the_journal_after_a_record_is_the_rest() {
     let [journal, _] = keys.behind(9);
     assert!(journal.contains(&keys.journal(9)) && !journal.contains(&keys.journal(10)));
 }
+
+#[test]
+fn the_rest_of_the_keys_lacks_only_the_known_journal() {
+    let keys = Keys::new("robot");
+    let rest = keys.small_after(7);
+    let has = |key: &String| rest.iter().any(|range| range.contains(key));
+    let others = [
+        keys.leader(),
+        keys.alive(),
+        keys.snapshot(),
+        keys.member("a"),
+    ];
+    assert!(others.iter().all(has));
+    assert!((1..8).all(|seq| !has(&keys.journal(seq))));
+    assert!([8, 9, u64::MAX].iter().all(|&seq| has(&keys.journal(seq))));
+    assert!(rest.iter().all(|range| keys.small().contains(&range.start)));
+}
