@@ -11,7 +11,7 @@ use super::{
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
 
-/// How often a read starts over because a snapshot was replaced meanwhile.
+/// How often a read starts over because etcd was compacted meanwhile.
 const ATTEMPTS: usize = 5;
 
 #[derive(Debug, Error)]
@@ -62,10 +62,7 @@ impl Replica {
         let mut attempt = 1;
         loop {
             match self.try_load(known).await {
-                // The leader has just written a snapshot, and deleted what this was about to read.
-                Err(ReplicaError::Journal(_) | ReplicaError::Etcd(EtcdError::Compacted { .. }))
-                    if attempt < ATTEMPTS =>
-                {
+                Err(ReplicaError::Etcd(EtcdError::Compacted { .. })) if attempt < ATTEMPTS => {
                     attempt += 1;
                 }
                 done => return done,
@@ -76,7 +73,7 @@ impl Replica {
     async fn try_load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
         // A long journal takes many requests, so what is known is not read again.
         let unknown = self.keys.small_after(known.seq);
-        let found = self.client.ranges(&unknown, self.limit).await?;
+        let found = self.client.ranges(&unknown, None, self.limit).await?;
         let mut loaded = LoadedState {
             view: etcd::view_of(&found, &self.keys)?,
             checkpoint: None,
@@ -91,7 +88,7 @@ impl Replica {
         let snapshot = found.kvs.iter().find(|kv| kv.key == snapshot);
         let manifest = snapshot.map(|kv| self.manifest(kv)).transpose()?;
         if let Some(manifest) = manifest.filter(|manifest| manifest.seq > known.seq) {
-            let bytes = self.assemble(&manifest).await?;
+            let bytes = self.assemble(&manifest, found.revision).await?;
             loaded.progress = Progress::after_snapshot(manifest.seq, bytes.len());
             loaded.checkpoint = Some(checkpoint(&bytes)?);
         }
@@ -101,12 +98,12 @@ impl Replica {
                 continue;
             };
             if let Some(manifest) = Manifest::read(&kv.value).filter(Manifest::is_state) {
-                let bytes = self.assemble(&manifest).await?;
+                let bytes = self.assemble(&manifest, found.revision).await?;
                 loaded.progress.take_state(seq, bytes.len());
                 loaded.checkpoint = Some(checkpoint(&bytes)?);
                 loaded.records.clear();
             } else {
-                let records = self.records(kv).await?;
+                let records = self.records(kv, found.revision).await?;
                 loaded
                     .records
                     .extend(loaded.progress.take(records, kv.value.len())?);
@@ -119,16 +116,16 @@ impl Replica {
         }
     }
 
-    /// Reads the records of a journal entry.
+    /// Reads the records of a journal entry that was read at `revision`.
     ///
     /// # Errors
     ///
     /// If they could not be read.
-    pub async fn records(&self, entry: &Kv) -> Result<Vec<Record>, ReplicaError> {
+    pub async fn records(&self, entry: &Kv, revision: u64) -> Result<Vec<Record>, ReplicaError> {
         let Some(manifest) = Manifest::read(&entry.value) else {
             return Ok(journal::records(&entry.key, &entry.value)?);
         };
-        let whole = self.assemble(&manifest).await?;
+        let whole = self.assemble(&manifest, revision).await?;
         Ok(journal::records(&entry.key, &whole)?)
     }
 
@@ -139,11 +136,11 @@ impl Replica {
         })
     }
 
-    async fn assemble(&self, manifest: &Manifest) -> Result<Vec<u8>, ReplicaError> {
-        let found = self
-            .client
-            .range(&self.keys.parts(manifest), self.limit)
-            .await?;
+    /// Reads the parts that `manifest` named at `revision`. The leader may have replaced them since.
+    async fn assemble(&self, manifest: &Manifest, revision: u64) -> Result<Vec<u8>, ReplicaError> {
+        let parts = [self.keys.parts(manifest)];
+        let found = self.client.ranges(&parts, Some(revision), self.limit);
+        let found = found.await?;
         let parts: Vec<_> = found.kvs.into_iter().map(|kv| kv.value).collect();
         Ok(manifest.assemble(&self.keys, &parts)?)
     }

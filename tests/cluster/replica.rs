@@ -122,7 +122,7 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
         for change in watch.next().await.unwrap() {
             if follower.keys.seq_of(&change.key).is_some() {
                 let kv = change.kv.unwrap();
-                let new = follower.records(&kv).await.unwrap();
+                let new = follower.records(&kv, change.revision).await.unwrap();
                 seen.extend(progress.take(new, kv.value.len()).unwrap());
             }
         }
@@ -222,6 +222,27 @@ async fn a_snapshot_replaces_the_journal_before_it() {
     let all = follower.client.range(&all, LIMIT).await.unwrap();
     let sizes: usize = all.kvs.iter().map(|kv| kv.value.len()).sum();
     assert!(sizes < 4 << 20, "{sizes}");
+}
+
+/// Otherwise a slow reader never gets to the end while others write.
+#[tokio::test]
+async fn a_reader_gets_the_parts_that_it_was_told_of_although_the_leader_has_replaced_them() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    let large = [record(1, 1 << 20)];
+    leader.commit(&large).await;
+    let follower = replica(&servers);
+    let journal = follower.keys.journal_after(0);
+    let found = follower.client.range(&journal, LIMIT).await.unwrap();
+    let state = Checkpoint {
+        seq: 1,
+        ..Checkpoint::default()
+    };
+    let term = leader.guard.leader;
+    let written = leader.replica.write_snapshot(term, &state).await.unwrap();
+    assert!(written.is_some());
+    let records = follower.records(&found.kvs[0], found.revision).await;
+    assert!(records.unwrap() == large);
 }
 
 #[tokio::test]

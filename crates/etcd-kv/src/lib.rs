@@ -134,10 +134,11 @@ impl Client {
     /// [`EtcdError::Compacted`] if etcd has compacted that moment before all keys were read. Otherwise why they could
     /// not be read.
     pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
-        self.ranges(std::slice::from_ref(range), limit).await
+        self.ranges(std::slice::from_ref(range), None, limit).await
     }
 
-    /// All keys in these ranges with their values, as of one moment. The ranges are read one after the other.
+    /// All keys in these ranges with their values, one range after the other, as they were at `revision`. `None` stands
+    /// for the present revision.
     ///
     /// # Errors
     ///
@@ -145,9 +146,9 @@ impl Client {
     pub async fn ranges(
         &self,
         ranges: &[Range<String>],
+        mut revision: Option<u64>,
         limit: Duration,
     ) -> Result<Found, EtcdError> {
-        let mut revision = None;
         let mut kvs: Vec<Kv> = Vec::new();
         for range in ranges {
             let mut from = range.start.clone();
