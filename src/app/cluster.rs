@@ -59,6 +59,9 @@ const LIMIT: Duration = Duration::from_secs(5);
 /// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
 
+/// Maximum number of the watch's messages that become one input.
+const WATCHED_MOST: usize = 64;
+
 /// Work whose result is an input.
 type Work = JoinSet<Input>;
 
@@ -81,7 +84,7 @@ pub(super) struct ClusterDriver {
     work: Work,
     /// Background work.
     beside: JoinSet<()>,
-    watch: Option<Watch>,
+    watch: Option<Watching>,
     /// The leader's keys as the watch delivered them.
     watched: View,
     duties: Option<MasterDuties>,
@@ -188,7 +191,8 @@ impl ClusterDriver {
                 let range = self.replica.keys.small();
                 let ttl = self.member.settings().ttl;
                 let watch = self.replica.client.watch(range, view.revision, ttl);
-                (self.watch, self.watched) = (Some(watch), view);
+                self.watch = Some(Watching::new(watch, self.trouble.clone()));
+                self.watched = view;
             }
             Action::Prepare { term, parts } => {
                 let replica = self.replica.clone();
@@ -367,6 +371,8 @@ impl ClusterDriver {
     /// The next input.
     async fn next(&mut self) -> Result<Input, ProcessError> {
         let wake = self.member.deadline();
+        // Inputs may be ready all the time. Requests that this thread runs as well must go on.
+        tokio::task::yield_now().await;
         loop {
             tokio::select! {
                 biased;
@@ -401,18 +407,11 @@ impl ClusterDriver {
     }
 
     /// Turns the watch's changes, or its end, into an input.
-    fn changed(&mut self, changes: Result<Vec<KeyChange>, WatchEnd>) -> Input {
-        let changes = match changes {
-            Ok(changes) => changes,
-            Err(end) => {
-                if let WatchEnd::Failed(error) = end {
-                    self.trouble.set(&error.into());
-                }
-                self.watch = None;
-                return Input::WatchEnded;
-            }
+    fn changed(&mut self, changes: Option<Vec<KeyChange>>) -> Input {
+        let Some(changes) = changes else {
+            self.watch = None;
+            return Input::WatchEnded;
         };
-        self.trouble.clear();
         let keys = self.replica.keys.clone();
         let (mut entries, mut heard) = (Vec::new(), Vec::new());
         for change in changes {
@@ -582,16 +581,66 @@ async fn failed(duties: &mut Option<MasterDuties>) -> ProcessError {
     }
 }
 
-async fn next_changes(watch: &mut Option<Watch>) -> Result<Vec<KeyChange>, WatchEnd> {
-    match watch {
-        Some(watch) => watch.next().await,
-        None => std::future::pending().await,
+/// A watch, read by a task of its own: what arrives while the member works becomes one input.
+struct Watching {
+    changes: mpsc::Receiver<Vec<KeyChange>>,
+    _task: AbortOnDropHandle<()>,
+}
+
+impl Watching {
+    fn new(mut watch: Watch, trouble: Arc<Trouble>) -> Self {
+        let (sender, changes) = mpsc::channel(WATCHED_MOST);
+        let task = tokio::spawn(async move {
+            loop {
+                match watch.next().await {
+                    Ok(changes) => {
+                        trouble.clear();
+                        if sender.send(changes).await.is_err() {
+                            return;
+                        }
+                    }
+                    Err(WatchEnd::Failed(error)) => return trouble.set(&error.into()),
+                    Err(WatchEnd::Compacted) => return,
+                }
+            }
+        });
+        let _task = AbortOnDropHandle::new(task);
+        Self { changes, _task }
     }
+}
+
+/// All changes that have arrived. `None` if the watch has ended. Cancel safe.
+async fn next_changes(watch: &mut Option<Watching>) -> Option<Vec<KeyChange>> {
+    let Some(watch) = watch else {
+        return std::future::pending().await;
+    };
+    let mut changes = Vec::new();
+    let count = watch.changes.recv_many(&mut changes, WATCHED_MOST).await;
+    (count > 0).then(|| changes.into_iter().flatten().collect())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn what_arrived_while_the_member_worked_is_one_input() {
+        let (sender, changes) = mpsc::channel(WATCHED_MOST);
+        let _task = AbortOnDropHandle::new(tokio::spawn(async {}));
+        let mut watch = Some(Watching { changes, _task });
+        let change = |revision| KeyChange {
+            key: String::new(),
+            revision,
+            kv: None,
+        };
+        let all = [1, 2, 3].map(change);
+        for change in all.clone() {
+            sender.send(vec![change]).await.unwrap();
+        }
+        drop(sender);
+        assert_eq!(next_changes(&mut watch).await.as_deref(), Some(&all[..]));
+        assert_eq!(next_changes(&mut watch).await, None);
+    }
 
     #[tokio::test]
     async fn work_that_panics_is_answered() {

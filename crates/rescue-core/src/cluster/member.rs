@@ -31,6 +31,8 @@ mod leaving;
 mod lost;
 mod merging;
 mod roles;
+#[cfg(test)]
+mod tests;
 mod types;
 
 use self::{chores::Chores, following::Reading, leaving::Release, lost::Lost, merging::Merging};

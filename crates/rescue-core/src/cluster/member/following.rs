@@ -118,16 +118,17 @@ impl Member {
     pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
         // First, because writes that this computer answered and lost came before the others' changes.
         self.see(now, view);
+        let progress = &mut self.journal.progress;
+        // All records at once, because each new state may take long.
+        let mut records = Vec::new();
         for entry in entries {
             let new = match entry {
-                Entry::Records { records, bytes } => {
-                    self.journal.progress.take(records, bytes).ok()
-                }
-                Entry::Apart(seq) if seq <= self.journal.progress.seq => continue,
+                Entry::Records { records, bytes } => progress.take(records, bytes).ok(),
+                Entry::Apart(seq) if seq <= progress.seq => continue,
                 Entry::Apart(_) => None,
             };
             match new {
-                Some(new) => self.follow(now, &new),
+                Some(new) => records.extend(new),
                 // A gap is filled by a separate read.
                 None => {
                     self.reading.load_by(now);
@@ -135,6 +136,7 @@ impl Member {
                 }
             }
         }
+        self.follow(now, &records);
         self.yield_to_others();
     }
 
