@@ -401,7 +401,14 @@ impl Machine {
         self.acknowledge(upto, actions);
         if self.role == Role::Alone && self.is_sole(now) {
             match leadership.caught_up {
-                true => self.become_role(Role::Leading, actions),
+                true => {
+                    if self.settings.alone == WhenAlone::Refuse {
+                        // The shell has stopped recording, and starts again after the journal's last record.
+                        self.hand_back(actions);
+                        self.stale = false;
+                    }
+                    self.become_role(Role::Leading, actions);
+                }
                 false => self.catch_up(actions),
             }
         }

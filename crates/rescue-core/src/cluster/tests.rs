@@ -78,6 +78,14 @@ fn no_schedule_of_failures_breaks_a_promise() {
     assert!(enough || schedules() < 20, "{totals:?}");
 }
 
+/// 9952: a leader with `--alone refuse` that etcd answered again waited for ever for records that it had given up.
+#[test]
+fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
+    for seed in [9952] {
+        play(seed).check();
+    }
+}
+
 /// Without any other failure, and with delays of at most 20 ms between computers.
 fn calm(seed: u64) -> World {
     let plan = Plan {

@@ -269,6 +269,42 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     assert!(machine.may_have_master());
 }
 
+/// With `--alone refuse` it recorded nothing while it was cut off, and starts again after the journal's last record.
+#[test]
+fn a_leader_that_refused_to_serve_alone_does_not_wait_for_records_that_it_gave_up() {
+    let (mut machine, now) = leading(WhenAlone::Refuse);
+    let (number, _) = sent(&machine.on(now, Input::Recorded(3)));
+    let late = now + TTL + PATIENCE;
+    wake_until(&mut machine, late);
+    assert_eq!(machine.role(), Role::Alone);
+    // The first record is in the journal.
+    let (revision, seq) = (2, 1);
+    let answer = EtcdAnswer::Applied { revision, seq };
+    let actions = machine.on(late, Input::Answer { number, answer });
+    let (number, _) = sent(&actions);
+    let (revision, seq) = (3, 1);
+    let answer = EtcdAnswer::Applied { revision, seq };
+    let actions = machine.on(late + ms(200), Input::Answer { number, answer });
+    let hands_back = Action::Yield {
+        committed: 1,
+        acknowledged: 1,
+    };
+    assert_eq!(actions, [hands_back, Action::Become(Role::Leading)]);
+    assert_eq!(machine.deadline(), Some(late + TTL / BEATS));
+    // It can hand over.
+    let (_, op) = sent(&machine.on(late + ms(200), Input::HandOver(String::new())));
+    assert!(
+        matches!(
+            op,
+            Op::Beat {
+                released: Some(_),
+                ..
+            }
+        ),
+        "{op:?}"
+    );
+}
+
 #[test]
 fn a_leader_that_etcd_answers_late_goes_on_as_if_nothing_had_been() {
     let (mut machine, now) = leading(WhenAlone::Serve);
