@@ -78,10 +78,11 @@ fn no_schedule_of_failures_breaks_a_promise() {
     assert!(enough || schedules() < 20, "{totals:?}");
 }
 
+/// 4465: a computer that is cut off shows what it answered early as a leader. The checker took that for the journal's.
 /// 9952: a leader with `--alone refuse` that etcd answered again waited for ever for records that it had given up.
 #[test]
 fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
-    for seed in [9952] {
+    for seed in [4465, 9952] {
         play(seed).check();
     }
 }

@@ -233,11 +233,12 @@ impl World {
         self.flush(at);
     }
 
-    /// Whether a leader shows what its journal may lack.
+    /// Whether a leader, or one that was cut off, shows what the journal may lack.
     pub(super) fn is_early(&self, at: usize) -> bool {
         let computer = &self.computers[at];
         let sharing = computer.ledger.sharing.as_ref();
-        sharing.is_some_and(|of| of.last() > computer.member.machine().committed())
+        let committed = computer.member.machine().committed();
+        sharing.is_some_and(|of| of.last() > committed) || computer.member.uncommitted() > 0
     }
 
     pub(super) fn value(&self, at: usize, key: usize) -> Option<i32> {
