@@ -24,7 +24,7 @@ use crate::{
 
 mod assemble;
 mod cluster;
-mod duty;
+mod context;
 mod earlier;
 mod life;
 mod notify;
@@ -32,8 +32,8 @@ mod startup;
 
 use self::{
     assemble::{Identity, assemble, last_master, server},
-    cluster::Member,
-    duty::Context,
+    cluster::ClusterDriver,
+    context::Context,
     startup::{begin, kernel_id},
 };
 
@@ -215,7 +215,7 @@ enum Runs {
     /// The only computer. `None` for an external master.
     Single(Option<Supervised>),
     /// One of several computers.
-    Member(Box<Member>),
+    Member(Box<ClusterDriver>),
 }
 
 impl Runs {
@@ -236,7 +236,7 @@ impl Runs {
             }
             return Ok((None, Self::Single(supervised)));
         };
-        let (others, member) = cluster::join(cluster::Given {
+        let (others, member) = cluster::join(cluster::ClusterSetup {
             config: cluster.clone(),
             context: context.clone(),
             rosmaster: supervised.rosmaster.clone(),
@@ -280,7 +280,7 @@ impl Runs {
 enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
-    Member(Box<Member>),
+    Member(Box<ClusterDriver>),
 }
 
 impl Begun {

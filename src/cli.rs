@@ -11,7 +11,7 @@ mod tools;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
-    cluster::{ClusterArgs, ClusterSync, Members, WhenCutOff},
+    cluster::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
     files::{
         CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, ReportArgs,
         RestoreArgs, VerifyArgs,

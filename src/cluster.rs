@@ -1,14 +1,14 @@
-//! Several computers: one leads, the others follow, and one of them takes over. The decisions are in
+//! Several computers: one leads, the others follow, and one of them takes over when it fails. The decisions are in
 //! [`rescue_core::cluster`].
 //!
 //! * [`etcd`]: etcd's JSON gateway.
 //! * [`survey`]: what is wrong with `--cluster`.
 //! * [`replica`]: the robot's state in etcd.
-//! * [`way`]: where calls go.
 
 pub mod etcd;
 pub mod replica;
 pub mod survey;
-pub mod way;
 
-pub use rescue_core::cluster::{displaced, journal, machine, merge, namesake};
+pub use rescue_core::cluster::{
+    cut_off, displaced, journal, machine, member, merge, namesake, outgoing, sharing, standing,
+};

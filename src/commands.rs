@@ -48,7 +48,7 @@ pub(crate) enum Exit {
 /// Why a command has no result.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub(crate) enum Failure {
+pub(crate) enum CommandFailure {
     /// The arguments make no sense. Exit status 2.
     #[error("{0}")]
     Usage(String),
@@ -66,7 +66,7 @@ pub(crate) enum Failure {
     Failed(String),
 }
 
-impl Failure {
+impl CommandFailure {
     fn status(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
@@ -105,7 +105,7 @@ pub fn run(tool: &Tool) -> ExitCode {
                 Tool::Wait(args) => wait::run(args).await,
             }
         }),
-        Err(error) => Err(Failure::Failed(format!("no runtime: {error}"))),
+        Err(error) => Err(CommandFailure::Failed(format!("no runtime: {error}"))),
     };
     match ended {
         Ok(exit) => ExitCode::from(exit as u8),
@@ -117,10 +117,10 @@ pub fn run(tool: &Tool) -> ExitCode {
 }
 
 /// Prints `result` as text or JSON. A reader that has closed the pipe, such as `head`, is not an error.
-fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), Failure> {
+fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), CommandFailure> {
     let text = if output.json {
         let json = serde_json::to_string_pretty(result);
-        plain_json(&json.map_err(|error| Failure::Failed(format!("no JSON: {error}")))?)
+        plain_json(&json.map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?)
     } else {
         plain(&result.to_string())
     };
@@ -128,11 +128,11 @@ fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(),
 }
 
 /// Prints `text`. Returns false if the reader has closed the pipe.
-fn print_line(text: &str) -> Result<bool, Failure> {
+fn print_line(text: &str) -> Result<bool, CommandFailure> {
     match writeln!(io::stdout(), "{text}") {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
-        Err(error) => Err(Failure::Failed(format!("cannot print: {error}"))),
+        Err(error) => Err(CommandFailure::Failed(format!("cannot print: {error}"))),
     }
 }
 

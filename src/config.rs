@@ -10,7 +10,7 @@ use ipnet::IpNet;
 use thiserror::Error;
 
 use crate::{
-    checkpoint::session::Restore,
+    checkpoint::session::RestorePolicy,
     cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, RestoreChoice, SyncPolicy},
     hide::Hide,
     lifecycle::Probing,
@@ -82,7 +82,7 @@ pub struct Config {
     pub checkpoint: PathBuf,
     /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
     pub checkpoint_is_given: bool,
-    pub restore: Restore,
+    pub restore: RestorePolicy,
     /// Maximum space for kept checkpoints, in bytes.
     pub history: u64,
     /// When the journal is synced to the disk.
@@ -280,9 +280,9 @@ impl Config {
             master,
             reads,
             restore: match args.restore {
-                RestoreChoice::Auto => Restore::Auto,
-                RestoreChoice::Always => Restore::Always,
-                RestoreChoice::Never => Restore::Never,
+                RestoreChoice::Auto => RestorePolicy::Auto,
+                RestoreChoice::Always => RestorePolicy::Always,
+                RestoreChoice::Never => RestorePolicy::Never,
             },
             history: args.history << 20,
             sync: args.sync,

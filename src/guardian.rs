@@ -32,7 +32,7 @@ pub mod handover;
 pub mod restart;
 
 use crate::limit::rarely;
-use restart::{End, Next, Restarts};
+use restart::{End, NextStart, Restarts};
 
 /// The running program, even after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
@@ -70,8 +70,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         let end = worker.run_until_end(&signals, |signal| restarts.stop(signal));
         let (pause, again_and_again) =
             match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
-                Next::Exit(status) => return Ok(status),
-                Next::Restart {
+                NextStart::Exit(status) => return Ok(status),
+                NextStart::Restart {
                     pause,
                     again_and_again,
                 } => (pause, again_and_again),

@@ -26,23 +26,21 @@ use std::{
 use tokio::sync::{Notify, watch};
 
 use self::activity::{Activity, Noticed};
-pub(crate) use self::{
-    durability::Mark,
-    shared::{Change, Source},
-};
+pub(crate) use self::durability::Mark;
 use self::{
     durability::Whole,
     journal::Journal,
-    late::Behind,
+    late::LateState,
     pending::PendingWrites,
     shared::{Agreed, Shared},
 };
 use crate::{
     checkpoint::{
-        format::{Entry, Session},
+        format::{RecordContent, Session},
         store::Store,
     },
     cli::SyncPolicy,
+    cluster::sharing::Source,
     health::port_of,
     master::{Master, Method, Request},
     order::Order,
@@ -122,7 +120,7 @@ struct Inner {
     /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
     /// The state of a late incarnation once it has answered its outstanding calls.
-    behind: Option<Behind>,
+    behind: Option<LateState>,
     /// The incarnation that answered calls last.
     served: Option<u64>,
     /// Whether the mirror comes from a checkpoint and no master has been compared with it. A living
@@ -294,7 +292,7 @@ impl Ledger {
                 }
             }
             if answered.executed {
-                entries.push(Entry::call(answered.call.clone().into()));
+                entries.push(RecordContent::call(answered.call.clone().into()));
                 sources.push(source);
             }
         }
@@ -319,7 +317,7 @@ impl Ledger {
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
-        inner.append(vec![Entry::call(call.clone().into())]);
+        inner.append(vec![RecordContent::call(call.clone().into())]);
         drop(inner);
         self.write_soon();
     }
@@ -491,7 +489,7 @@ impl Inner {
                 true => 0,
                 false => self.cluster_seq(),
             };
-            let entry = Entry::Session(self.session.clone());
+            let entry = RecordContent::Session(self.session.clone());
             self.append(vec![entry]);
         }
     }
@@ -525,12 +523,12 @@ impl Inner {
     }
 
     /// Passes `entries` to the journal. A failure is kept in the store, and does not fail the call.
-    fn append(&mut self, entries: Vec<Entry>) {
+    fn append(&mut self, entries: Vec<RecordContent>) {
         self.append_from(entries, &[]);
     }
 
     /// Like [`Self::append`], with the source of each call. Missing sources stand for this computer.
-    fn append_from(&mut self, entries: Vec<Entry>, sources: &[&Source]) {
+    fn append_from(&mut self, entries: Vec<RecordContent>, sources: &[&Source]) {
         // The session's record comes first, because it names the incarnation of the following entries.
         self.write_session();
         self.share(&entries, sources);

@@ -22,10 +22,10 @@ use tokio::sync::Notify;
 use tracing::Instrument;
 
 use self::{
-    client::Sign,
+    client::Reaction,
     health_check::CheckResult,
     identify::{IDENTIFY_AFTER, New},
-    liveness::Liveness,
+    liveness::LivenessEvidence,
     notifications::Notifications,
     removed::Removed,
     served::Served,
@@ -34,7 +34,7 @@ use self::{
 use crate::{
     gate::{self, State},
     health::{Repeats, Unreachable, port_of},
-    ledger::{Ledger, activity::Change},
+    ledger::{Ledger, activity::NotifyingChange},
     limit::rarely,
     order::Subject,
     resolver,
@@ -64,7 +64,7 @@ pub struct Nodes {
     timeout: Duration,
     pub(super) notifications: Notifications,
     visits: Visits,
-    liveness: Liveness,
+    liveness: LivenessEvidence,
     new: New,
     unreachable: Mutex<Unreachable>,
     /// Ports of nodes that answer other calls but not `paramUpdate`.
@@ -99,7 +99,7 @@ impl Nodes {
             timeout,
             notifications: Notifications::default(),
             visits: Visits::default(),
-            liveness: Liveness::default(),
+            liveness: LivenessEvidence::default(),
             new: New::default(),
             unreachable: Mutex::default(),
             mute: Mutex::default(),
@@ -228,7 +228,7 @@ impl Drop for CheckUnderWay {
 pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
-    let mut repeats = Repeats::<Change>::default();
+    let mut repeats = Repeats::<NotifyingChange>::default();
     let mut gate = nodes.gate.clone();
     // When to send what the absent master may not have sent, and whether that is done.
     let (mut owed_at, mut owed_told) = (None, false);
@@ -277,7 +277,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     }
 }
 
-fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
+fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<NotifyingChange>) {
     let outbox = nodes
         .ledger
         .with_activity(|_, activity| activity.take_outbox());
@@ -333,12 +333,12 @@ pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     topics
 }
 
-fn tell(nodes: &Arc<Nodes>, change: Change) {
+fn tell(nodes: &Arc<Nodes>, change: NotifyingChange) {
     match change {
-        Change::Param(api, key) => {
+        NotifyingChange::Param(api, key) => {
             notifications::tell(nodes, &api, Subject::Param(key.to_string()));
         }
-        Change::Topic(topic) => {
+        NotifyingChange::Topic(topic) => {
             notifications::notify_subscribers(nodes, &topic);
         }
     }
@@ -360,12 +360,12 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
         tokio::spawn(async move {
             let outcome = health_check::visit(&nodes, port).await;
             match outcome.sign {
-                Sign::Alive => say(&outcome, "an unreachable node answers again"),
-                Sign::Dead if !outcome.removed.is_empty() => say(
+                Reaction::Alive => say(&outcome, "an unreachable node answers again"),
+                Reaction::Dead if !outcome.removed.is_empty() => say(
                     &outcome,
                     "unregistered a dead node: its port refuses connections",
                 ),
-                Sign::Dead | Sign::Silent => {}
+                Reaction::Dead | Reaction::Silent => {}
             }
         });
     }

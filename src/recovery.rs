@@ -23,7 +23,7 @@ use tracing::Instrument;
 use self::{
     examine::{Examination, ExamineError, Examiner, Manner, Prepared},
     master_process::MasterProcess,
-    reporting::{Outage, Said},
+    reporting::{LastMessage, Outage},
 };
 use crate::{
     gate::State,
@@ -34,7 +34,7 @@ use crate::{
     process::{self, ProcessError, effort, listeners::Holder},
     status::{
         Board,
-        report::{AWAY, Outcome, STARTED},
+        report::{AWAY, RecoveryOutcome, STARTED},
     },
     upstream::{ConnectError, VerifyError, sentinel::Sentinel, verify},
     wait,
@@ -84,7 +84,7 @@ pub(crate) struct Driver {
     timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
-    said: Option<Said>,
+    said: Option<LastMessage>,
 }
 
 impl Driver {
@@ -425,7 +425,7 @@ impl Driver {
             Done::Examined(sentinel, Ok(_)) if !sentinel.is_open() => Some(Input::ConnectionLost),
             Done::Examined(sentinel, Ok(examination)) => {
                 let outcome = examination.outcome;
-                if outcome == Outcome::Resumed {
+                if outcome == RecoveryOutcome::Resumed {
                     // Another program may have written to the master directly.
                     self.examiner.ledger.doubt();
                 } else {

@@ -12,7 +12,7 @@ use std::{
 use tokio::task::block_in_place;
 use tokio_util::sync::CancellationToken;
 
-use crate::nodes::client::{self, Sign};
+use crate::nodes::client::{self, Reaction};
 use crate::{
     gate,
     ledger::Ledger,
@@ -179,7 +179,7 @@ async fn living_rosout(roscore: &Roscore) -> Option<u32> {
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
     match client::ask_for(&api, &master::get_pid(), roscore.node_timeout).await {
-        (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
+        (Reaction::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }
 }

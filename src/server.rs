@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::{Notify, Semaphore};
 
 use self::{
-    access::{Access, Said},
+    access::{AccessRules, LastLogged},
     answers::Answers,
     calls::Calls,
     clients::Clients,
@@ -34,9 +34,9 @@ pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
     /// The networks that may call and make changes.
-    pub(crate) access: Access,
+    pub(crate) access: AccessRules,
     /// When each refused address was last logged.
-    pub(crate) refused: Mutex<Said>,
+    pub(crate) refused: Mutex<LastLogged>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
     /// Signals that a request from this rosrescue has arrived here: the master's address leads back to it.

@@ -37,7 +37,7 @@ pub enum Mode {
 
 /// State of the checkpoint's disk, as the checkpointer sees it.
 #[derive(Clone, Copy, Debug)]
-pub struct Disk {
+pub struct DiskStatus {
     /// Whether changes are recorded, and when this last changed.
     pub protected: bool,
     pub since: Instant,
@@ -47,7 +47,7 @@ pub struct Disk {
     pub free: Option<u64>,
 }
 
-impl Disk {
+impl DiskStatus {
     /// When recording stopped. The failure itself is a little older.
     fn unprotected_since(&self) -> Instant {
         match self.protected {
@@ -82,7 +82,7 @@ pub struct Facts {
     /// Whether the master of `proxy` runs on this computer and accepts connections from other
     /// computers.
     pub(crate) master_is_open: bool,
-    pub disk: Disk,
+    pub disk: DiskStatus,
     /// The facts about the other computers. `None` without `--cluster`.
     pub cluster: Option<cluster::ClusterFacts>,
 }
@@ -168,7 +168,7 @@ impl Facts {
             guarded: Guarded::Nobody,
             bypassing: Vec::new(),
             master_is_open: false,
-            disk: Disk {
+            disk: DiskStatus {
                 protected: true,
                 since: started,
                 compacted: None,

@@ -18,7 +18,7 @@ use tokio::{
     time::Instant,
 };
 
-use self::batch::{Answer, Condition, Item};
+use self::batch::{CallAnswer, Item, Precondition};
 pub(crate) use self::drain::Drain;
 use crate::{
     cluster::merge::wire::{self, Ask},
@@ -60,32 +60,34 @@ impl WriteQueue {
     }
 
     /// Like [`Self::call`], but drops the call if `condition` no longer holds when its turn comes.
-    pub async fn call_if(&self, call: Request, condition: Condition) -> Option<Reply> {
+    pub async fn call_if(&self, call: Request, condition: Precondition) -> Option<Reply> {
         self.call_own(call, Some(condition)).await
     }
 
     /// Makes the calls of `ask`, except those that conflict with changes by other computers. `None` if there is no
     /// answer.
-    pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::Answer> {
+    pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::MergeAnswer> {
         let (item, answered, judged) = merge::item(ask);
         self.items.send(item).await.ok()?;
         let reply = match answered.await.ok()?.0 {
-            Answer::Made(reply) => reply,
+            CallAnswer::Made(reply) => reply,
             // A reply that cannot be decoded comes from a master that could not encode it.
-            Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).unwrap_or(Reply::Value(Value::Nil)),
-            Answer::Close | Answer::Elsewhere => return None,
+            CallAnswer::Raw(raw) => {
+                xmlrpc::decode_reply(&raw.body).unwrap_or(Reply::Value(Value::Nil))
+            }
+            CallAnswer::Close | CallAnswer::Elsewhere => return None,
         };
         Some(judged.answer(&reply))
     }
 
-    async fn call_own(&self, call: Request, condition: Option<Condition>) -> Option<Reply> {
+    async fn call_own(&self, call: Request, condition: Option<Precondition>) -> Option<Reply> {
         let (mut item, answered) = Item::new(None, Some(Arc::new(call)));
         item.condition = condition;
         self.items.send(item).await.ok()?;
         match answered.await.ok()?.0 {
-            Answer::Made(reply) => Some(reply),
-            Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
-            Answer::Close | Answer::Elsewhere => None,
+            CallAnswer::Made(reply) => Some(reply),
+            CallAnswer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
+            CallAnswer::Close | CallAnswer::Elsewhere => None,
         }
     }
 

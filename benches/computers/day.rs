@@ -18,10 +18,10 @@ use std::{
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use rosrescue::{
-    checkpoint::format::{Checkpoint, Entry, Record},
+    checkpoint::format::{Checkpoint, Record, RecordContent},
     cluster::{
         journal::{self, Keys},
-        machine::{Answer, Op, Settings},
+        machine::{EtcdAnswer, Op, Settings},
         replica::Replica,
     },
     master::{Master, Request},
@@ -152,7 +152,7 @@ impl Robot<'_> {
             .run(settings, &claim, None)
             .await
             .expect("an answer");
-        let Answer::Applied { revision, .. } = answer else {
+        let EtcdAnswer::Applied { revision, .. } = answer else {
             panic!("{answer:?}");
         };
         self.term = revision;
@@ -297,7 +297,7 @@ fn record(seq: u64) -> Record {
     let params = params!["/robot_state", key, seq as f64 * 0.1];
     Record {
         seq,
-        entry: Entry::call(Call::new("setParam", params)),
+        entry: RecordContent::call(Call::new("setParam", params)),
     }
 }
 
@@ -327,7 +327,7 @@ fn state(nodes: usize) -> Checkpoint {
         }
     }
     for seq in 0..u64::from(PARAMS) {
-        if let Entry::Call { call, .. } = record(seq).entry {
+        if let RecordContent::Call { call, .. } = record(seq).entry {
             master.apply(&Request::from(call));
         }
     }

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use rosrescue::checkpoint::format::{self, Checkpoint, Entry, Record};
+use rosrescue::checkpoint::format::{self, Checkpoint, Record, RecordContent};
 use rosrescue::checkpoint::session::{Rebuilt, rebuild};
 use rosrescue::checkpoint::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::master::Master;
@@ -121,11 +121,11 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         .expect("cannot write what was loaded");
     let call = Call::new("deleteParam", vec!["/n".into(), "/p".into()]);
     let entries = [
-        Entry::Call {
+        RecordContent::Call {
             call,
             pending: true,
         },
-        Entry::Session(expected.session.clone()),
+        RecordContent::Session(expected.session.clone()),
     ];
     store.append(&entries).expect("cannot append records to it");
     drop(store);

@@ -1,4 +1,4 @@
-//! Creates the parts of the program from its settings and the state that it starts with.
+//! Creates the context of the program from its settings and the state that it starts with.
 
 use std::{
     sync::Arc,
@@ -9,7 +9,7 @@ use hyper::header::HeaderValue;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
-use super::{duty::Context, startup::Beginning};
+use super::{context::Context, startup::Beginning};
 use crate::{
     checkpoint::{format::Session, store::history},
     clock,
@@ -23,7 +23,7 @@ use crate::{
     ros_env::MasterUri,
     server::{
         Server,
-        access::Access,
+        access::AccessRules,
         answers::Answers,
         body,
         calls::Calls,
@@ -190,7 +190,7 @@ pub(super) fn server(
         context.ledger.clone(),
         context.gate.clone(),
     );
-    let access = Access::new(config.allow.clone(), config.allow_write.clone());
+    let access = AccessRules::new(config.allow.clone(), config.allow_write.clone());
     if !config.allow.is_empty() || !config.allow_write.is_empty() {
         tracing::info!("{access}");
     }

@@ -1,139 +1,102 @@
-//! This computer as one of several: the shell around [`Machine`], which decides who leads.
-//!
-//! One task holds what the journal in etcd says, and brings the ledger there while another computer leads. While
-//! this one has the master, it gives the ledger's changes to the journal.
+//! Runs this computer as one of several: passes events to [`Member`], which decides, and carries out its actions.
 
-mod background;
-mod cut_off;
 mod facts;
-mod handover;
 mod join;
-mod merging;
-mod outgoing;
-mod reading;
-mod roles;
+mod kept;
+mod report;
 mod survey;
+mod trouble;
 
 use std::{
     collections::VecDeque,
-    pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
 };
 
+use bytes::Bytes;
 use tokio::{
-    sync::{mpsc, watch},
+    sync::{mpsc, oneshot, watch},
     task::JoinSet,
 };
 use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
-pub(super) use self::join::{Given, join};
-use self::{
-    background::{Background, Trouble},
-    cut_off::CutOff,
-    facts::Known,
-    handover::HANDOVER_LIMIT,
-    outgoing::Outgoing,
-};
-use super::{RunError, duty::Duty};
+pub(super) use self::join::{ClusterSetup, join};
+use self::{facts::Known, kept::Kept, trouble::Trouble};
+use super::{RunError, context::MasterDuties, life};
 use crate::{
-    checkpoint::format::{Entry, Record},
-    cluster::{
-        displaced::DisplacedLately,
-        etcd::{Change, Watch, WatchEnd},
-        journal::Progress,
-        machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
-        namesake,
-        replica::{Loaded, Replica, ReplicaError},
-        way::{Place, Way},
+    checkpoint::{
+        format::Checkpoint,
+        session::{self, Decision, RestorePolicy, SessionEvidence},
     },
+    cluster::{
+        etcd::{self, Etcd, KeyChange, Kv, Watch, WatchEnd},
+        journal::{self, Keys, Manifest, Put},
+        machine::{EtcdAnswer, Op, Settings, View},
+        member::{Action, Entry, Heard, Input, Member, PROBES, Read},
+        merge::{
+            Verdict,
+            wire::{self, Ask},
+        },
+        replica::{LoadedState, Replica},
+        standing::{Place, Standing},
+    },
+    gate::State,
     limit::rarely,
     master::{Master, Request},
     process::ProcessError,
     recovery::master_process::MasterProcess,
+    ros_env::MasterUri,
     server::others::{Forwarded, Handover},
-    upstream::peer::Peers,
+    status::cluster::MemberFacts,
+    upstream::{Head, peer::Peers},
     wait,
+    write_queue::WriteQueue,
+    xmlrpc,
 };
 
-/// Pause before etcd is asked again for what it did not give.
+/// Time limit for work in the background.
+const LIMIT: Duration = Duration::from_secs(5);
+/// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
 
-type Loading = Pin<Box<dyn Future<Output = Result<Loaded, ReplicaError>> + Send>>;
-type Flag = Pin<Box<dyn Future<Output = bool> + Send>>;
-type Deciding = Pin<Box<dyn Future<Output = Input> + Send>>;
-type Merging = Pin<Box<dyn Future<Output = u64> + Send>>;
+/// Maximum number of the watch's messages that become one input.
+const WATCHED_MOST: usize = 64;
 
-/// See the [module](self).
-pub(super) struct Member {
-    given: Given,
-    settings: Settings,
-    machine: Machine,
+/// Work whose result is an input.
+type Work = JoinSet<Input>;
+
+/// Passes events to this computer's [`Member`], and carries out its actions.
+pub(super) struct ClusterDriver {
+    setup: ClusterSetup,
+    member: Member,
     replica: Replica,
-    way: watch::Sender<Way>,
-    /// Who leads, also while calls wait.
-    leads: watch::Sender<Way>,
+    standing: watch::Sender<Standing>,
+    /// The place in the journal up to which the mirror is current.
+    place: watch::Sender<Place>,
     peers: Arc<Peers>,
     /// Writes of this computer that a leader has not answered yet.
     forwarded: Arc<Forwarded>,
-    /// How far the mirror holds the journal.
-    followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
-    /// When the machine is started, even if etcd's state has not been read.
-    start_by: Option<Instant>,
-    /// Inputs that are to be taken next.
+    /// The caller that waits for a handover.
+    handover: Option<oneshot::Sender<Result<String, String>>>,
+    /// The next inputs.
     inbox: VecDeque<Input>,
-    /// Requests of the machine.
-    requests: JoinSet<Input>,
-    view: View,
-    watch: Option<Watch>,
-    loading: Option<Loading>,
-    load_at: Option<Instant>,
-    /// Whether etcd's state has been read.
-    loaded: bool,
-    /// The machine waits for the journal up to here.
-    wanted: Option<u64>,
-    /// How far the machine knows that it has been read.
-    reported: u64,
-    /// The journal's state, and how far it has been read.
-    held: Master,
-    displaced: DisplacedLately,
-    progress: Progress,
-    outgoing: Outgoing,
-    duty: Option<Duty>,
-    /// Processes that are being ended.
+    work: Work,
+    /// Background work.
+    beside: JoinSet<()>,
+    watch: Option<Watching>,
+    /// The leader's keys as the watch delivered them.
+    watched: View,
+    duties: Option<MasterDuties>,
+    /// Processes that are being stopped.
     endings: JoinSet<()>,
-    cut_off: Option<CutOff>,
-    /// The writes of the oldest time alone are being sent. Gives how many did not hold.
-    merging: Option<Merging>,
-    /// The ledger's state wins over the journal's if this computer leads next.
-    ours: bool,
-    /// Who led before, and when it was heard of last.
-    before: Option<(String, Instant)>,
-    /// It has given up leading by itself.
-    was_released: bool,
-    /// This process has claimed with success.
-    led: bool,
-    /// Where another computer of this name is.
-    namesake: Option<String>,
-    /// Looks for one since etcd's state has been read.
-    namesakes: Option<namesake::Watch>,
-    /// Whether the session in etcd continues, while that is found out.
-    deciding: Option<Deciding>,
-    probe: Option<Flag>,
-    probe_at: Option<Instant>,
-    /// Who waits for this computer to give up leading, and until when.
-    released: Option<Handover>,
-    release_by: Option<Instant>,
-    /// rosrescue stops, and rosout first.
-    ending_roscore: Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
+    kept: Kept,
     trouble: Arc<Trouble>,
     known: Known,
-    background: Background,
 }
 
-impl Member {
-    /// Takes part until `stop`.
+impl ClusterDriver {
+    /// Runs until `stop`.
     ///
     /// # Errors
     ///
@@ -142,234 +105,518 @@ impl Member {
         mut self: Box<Self>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, RunError> {
-        self.try_endpoints();
-        loop {
-            while let Some(input) = self.inbox.pop_front() {
-                self.take(input).await;
+        self.beside
+            .spawn(survey::try_endpoints(self.replica.clone()));
+        let mut stopped = false;
+        let mut input = Input::Begin;
+        let result = loop {
+            if let Some(end) = self.take(input).await {
+                break end;
             }
-            self.catch_up();
-            self.tend().await;
-            if !self.inbox.is_empty() {
-                continue;
-            }
-            let end = match self.namesake.take() {
-                Some(uri) => Some(Some(self.namesake_at(uri))),
-                None => self.next(&stop).await,
+            input = match self.inbox.pop_front() {
+                Some(input) => input,
+                None => tokio::select! {
+                    biased;
+                    () = stop.cancelled(), if !stopped => {
+                        stopped = true;
+                        Input::Stop
+                    }
+                    next = self.next() => match next {
+                        Ok(input) => input,
+                        Err(error) => break Err(error.into()),
+                    },
+                },
             };
-            if let Some(result) = end {
-                self.give_up_duty().await;
-                self.given.halt.cancel();
-                while self.endings.join_next().await.is_some() {}
-                return result.map_or(Ok(None), Err);
-            }
-        }
+        };
+        self.setup.context.ledger.leave();
+        self.end_master().await;
+        self.setup.context.gate_tx.set(State::Elsewhere);
+        self.setup.halt.cancel();
+        while self.endings.join_next().await.is_some() {}
+        result.map(|()| None)
     }
 
-    async fn take(&mut self, input: Input) {
+    /// Passes an input to the member, and carries out its actions. Returns the result when the member ends.
+    async fn take(&mut self, input: Input) -> Option<Result<(), RunError>> {
         let now = Instant::now();
-        if !matches!(input, Input::Wake | Input::View(_) | Input::Followed(_)) {
+        if !matches!(input, Input::Wake | Input::Watched { .. }) {
             tracing::trace!(?input, "cluster");
         }
-        let actions = self.machine.on(now, input);
-        self.given.context.ledger.set_lease(self.machine.lease(now));
+        for heard in input.heard() {
+            self.known.heard(heard);
+        }
+        let actions = self.member.on(now, input);
+        let lease = self.member.machine().lease(now);
+        self.setup.context.ledger.set_lease(lease);
         for action in actions {
-            if !matches!(action, Action::Send { .. } | Action::Acknowledge(_)) {
-                tracing::debug!(?action, "cluster");
+            match action {
+                Action::End => return Some(Ok(())),
+                Action::EndForNamesake(uri) => return Some(Err(self.namesake_at(uri))),
+                action => self.carry_out(action).await,
             }
-            self.carry_out(action).await;
         }
-        for change in self.outgoing.committed(self.machine.committed()) {
-            self.hold(change);
-        }
+        let place = self.member.place();
+        self.place
+            .send_if_modified(|before| std::mem::replace(before, place) != place);
+        self.show();
+        None
     }
 
     async fn carry_out(&mut self, action: Action) {
+        let context = &self.setup.context;
+        let ledger = &context.ledger;
         match action {
-            Action::Send { number, op } => self.send(number, op),
-            Action::CatchUp(seq) => self.wanted = Some(seq),
-            Action::Become(role) => self.become_role(role).await,
-            Action::Acknowledge(seq) => self.given.context.ledger.agree(seq),
-            Action::Yield {
-                committed,
-                acknowledged,
-            } => self.give_back(committed, acknowledged).await,
-            Action::Released => {
-                if let Some((_, tell)) = self.released.take() {
-                    let _ = tell.send(Ok(self.settings.name.clone()));
-                }
-                self.release_by = None;
+            Action::Send {
+                number,
+                op,
+                entry,
+                term,
+                parts,
+            } => self.send(number, op, entry, term, parts),
+            Action::Load(known) => {
+                let replica = self.replica.clone();
+                let trouble = self.trouble.clone();
+                self.spawn(Input::Loaded(None), async move {
+                    let loaded = trouble.of(replica.load(known).await);
+                    Input::Loaded(loaded.and_then(|loaded| read(&replica.keys, loaded)))
+                });
             }
+            Action::Watch(view) => {
+                if view.leader.is_none() {
+                    self.beside.spawn(survey::look_for_typo(
+                        self.replica.clone(),
+                        self.setup.config.robot.clone(),
+                    ));
+                }
+                let range = self.replica.keys.small();
+                let ttl = self.member.settings().ttl;
+                let watch = self.replica.client.watch(range, view.revision, ttl);
+                self.watch = Some(Watching::new(watch, self.trouble.clone()));
+                self.watched = view;
+            }
+            Action::Prepare { term, parts } => {
+                let replica = self.replica.clone();
+                self.spawn(Input::Prepared(None), async move {
+                    let prepared = replica.prepare(term, &parts).await;
+                    if let Err(error) = &prepared {
+                        rarely!(warn, %error, "a large write is not in etcd yet; retrying");
+                        tokio::time::sleep(AGAIN).await;
+                    }
+                    Input::Prepared(prepared.ok())
+                });
+            }
+            Action::Decide { seq, state, closed } => {
+                let evidence = SessionEvidence {
+                    same_boot: self.setup.restored,
+                    closed,
+                    node_alive: false,
+                };
+                let goes_on = true;
+                let otherwise = Input::Decided { seq, goes_on };
+                self.spawn(otherwise, decide(seq, state, self.setup.restore, evidence));
+            }
+            Action::Stand(standing) => {
+                tracing::debug!(?standing, "calls");
+                self.standing.send_replace(standing);
+            }
+            Action::Leave => ledger.leave(),
+            Action::Lead { seq, held, state } => {
+                if let Some(state) = state {
+                    // Only if this computer still has the master.
+                    let _ = ledger.follow_state(state);
+                }
+                ledger.lead(seq, &held);
+            }
+            Action::Follow(records) => drop(ledger.follow(&records)),
+            Action::FollowState(state) => {
+                if ledger.with_mirror(|mirror| *mirror != state) {
+                    let _ = ledger.follow_state(state);
+                }
+            }
+            Action::Acknowledge(seq) => ledger.agree(seq),
+            Action::TakeAsState => {
+                let state = ledger.take_as_state();
+                self.inbox.push_front(Input::AsState(state));
+            }
+            Action::AskForwarded => {
+                let calls = self.forwarded.writes();
+                self.inbox.push_front(Input::Forwarded(calls));
+            }
+            Action::TellDisplaced(nodes) => {
+                ledger.with_activity(|_, activity| activity.restore_displaced(nodes));
+            }
+            Action::Term(term) => ledger.update_session(|session| session.term = term),
+            Action::BeginMaster(cause) => {
+                let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);
+                let cause = report::cause(cause);
+                self.duties = Some(context.begin(process, Some(self.setup.rosout), cause));
+            }
+            Action::EndMaster => self.end_master().await,
+            Action::StandIn => context.gate_tx.set(State::StandingIn),
+            Action::TurnAway => context.gate_tx.set(State::Elsewhere),
+            Action::ServeOwnOnly(own_only) => context.nodes.set_alone(own_only),
+            Action::KeepAll { base, calls } => {
+                self.kept.replace(&context.checkpoint, base, calls).await;
+            }
+            Action::Keep(calls) => {
+                self.kept.add(calls).await;
+                if self.kept.has_outgrown()
+                    && let Some((base, calls)) = self.member.kept()
+                {
+                    let path = &self.setup.context.checkpoint;
+                    self.kept.replace(path, base.clone(), calls).await;
+                }
+            }
+            Action::KeepNothing => self.kept.remove(&context.checkpoint).await,
+            Action::Merge { number, ask, to } => {
+                let (peers, queue) = (self.peers.clone(), context.write_queue.clone());
+                let answer = None;
+                let otherwise = Input::Merged { number, answer };
+                self.spawn(otherwise, async move {
+                    let answer = merge(ask, to, peers, queue).await;
+                    Input::Merged { number, answer }
+                });
+            }
+            Action::Report(outcomes) => report::report(&self.setup.hide, outcomes),
+            Action::Probe { number, uri, term } => {
+                let leads = false;
+                let otherwise = Input::Probed { number, leads };
+                let pause = self.member.settings().ttl / PROBES;
+                let peer = MasterUri::parse(&uri).ok().map(|uri| self.peers.at(&uri));
+                self.spawn(otherwise, async move {
+                    let asked = async { peer?.leads(term).await.then_some(()) };
+                    let leads = tokio::time::timeout(pause, asked).await;
+                    let leads = matches!(leads, Ok(Some(())));
+                    Input::Probed { number, leads }
+                });
+            }
+            Action::Say => {
+                let key = self.replica.keys.member(&self.member.settings().name);
+                let value = serde_json::to_vec(&self.member.says()).unwrap_or_default();
+                let put = Put { key, value };
+                self.beside.spawn(say(self.replica.client.clone(), put));
+            }
+            Action::WriteSnapshot {
+                term,
+                progress,
+                state,
+                displaced,
+            } => {
+                let replica = self.replica.clone();
+                let checkpoint = Checkpoint {
+                    seq: progress.seq,
+                    snapshot: state.snapshot(),
+                    displaced,
+                    ..Checkpoint::default()
+                };
+                self.spawn(Input::SnapshotWritten(None), async move {
+                    let written = replica.write_snapshot(term, &checkpoint).await;
+                    if let Err(error) = &written {
+                        rarely!(warn, %error, "the snapshot in etcd could not be written; retrying");
+                    }
+                    let bytes = written.ok().flatten();
+                    Input::SnapshotWritten(bytes.map(|bytes| (progress, bytes)))
+                });
+            }
+            Action::Forget(revision) => {
+                let client = self.replica.client.clone();
+                self.beside.spawn(async move {
+                    if let Err(error) = client.compact(revision, LIMIT).await {
+                        tracing::debug!(%error, "compaction of etcd");
+                    }
+                });
+            }
+            Action::HandedOver(result) => {
+                let name = self.member.settings().name.clone();
+                if let Some(tell) = self.handover.take() {
+                    let _ = tell.send(result.map(|()| name));
+                }
+            }
+            Action::EndRosout => {
+                let ended = self.duties.as_mut().map(MasterDuties::end_roscore);
+                self.spawn(Input::RosoutEnded, async move {
+                    if let Some(ended) = ended {
+                        ended.await;
+                    }
+                    Input::RosoutEnded
+                });
+            }
+            Action::Tell(news) => self.tell(news),
+            Action::End | Action::EndForNamesake(_) => {}
         }
     }
 
-    fn send(&mut self, number: u64, op: Op) {
-        let entry = match &op {
-            Op::Beat { seq, .. } => match self.outgoing.entry(&self.replica.keys, *seq) {
-                Ok(entry) => entry,
-                Err(error) => {
-                    rarely!(error, %error, "the journal cannot be written; please report this line");
-                    let answer = Answer::Silence;
-                    return self.inbox.push_back(Input::Answer { number, answer });
-                }
-            },
-            _ => None,
-        };
-        let (replica, settings) = (self.replica.clone(), self.settings.clone());
+    /// Starts `work`. If it panics, its result is `otherwise`, because the member waits for every result.
+    fn spawn(&mut self, otherwise: Input, work: impl Future<Output = Input> + Send + 'static) {
+        self.work.spawn(answered(otherwise, work));
+    }
+
+    fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {
+        let (replica, settings) = (self.replica.clone(), self.member.settings().clone());
         let trouble = self.trouble.clone();
-        let parts = match (&entry, self.machine.term()) {
-            (Some(_), Some(term)) => Some((term, self.outgoing.missing_parts(&replica.keys))),
-            _ => None,
-        };
-        let run = async move {
+        let answer = EtcdAnswer::Silence;
+        let otherwise = Input::Answer { number, answer };
+        self.spawn(otherwise, async move {
             let run = async {
-                if let Some((term, parts)) = parts.filter(|(_, parts)| !parts.is_empty()) {
+                if !parts.is_empty() {
                     replica.prepare(term, &parts).await?;
                 }
                 replica.run(&settings, &op, entry.as_ref()).await
             };
-            match run.await {
-                Ok(answer) => {
-                    trouble.clear();
-                    answer
-                }
-                Err(error) => {
-                    trouble.set(&error);
-                    Answer::Silence
-                }
-            }
-        };
-        self.requests.spawn(answered(number, run));
-    }
-
-    /// The next event; an end if there is one.
-    async fn next(&mut self, stop: &CancellationToken) -> Option<Option<RunError>> {
-        let stopping = self.release_by.is_some() && self.released.is_none();
-        let wake = [
-            self.machine.deadline(),
-            self.load_at.filter(|_| self.loading.is_none()),
-            self.probe_at.filter(|_| self.probe.is_none()),
-            self.release_by,
-            self.start_by,
-            self.background.due(),
-        ];
-        let wake = wake.into_iter().flatten().min().map(Into::into);
-        tokio::select! {
-            biased;
-            () = stop.cancelled(), if !stopping => return self.begin_stop(),
-            error = failed(&mut self.duty) => return Some(Some(error.into())),
-            Some(done) = self.requests.join_next() => self.inbox.extend(done),
-            () = self.given.context.ledger.shared.notified() => self.take_changes().await,
-            done = wait::for_some(self.outgoing.preparing.as_mut()) => self.prepared(done),
-            changes = next_changes(&mut self.watch) => self.changed(changes),
-            loaded = wait::for_some(self.loading.as_mut()) => {
-                self.loading = None;
-                self.have_loaded(loaded);
-            }
-            decided = wait::for_some(self.deciding.as_mut()) => {
-                self.deciding = None;
-                self.inbox.push_back(decided);
-            }
-            leads = wait::for_some(self.probe.as_mut()) => {
-                self.probe = None;
-                self.inbox.push_back(Input::Peer(leads));
-            }
-            Some(handover) = self.handovers.recv() => self.hand_over(handover),
-            lost = wait::for_some(self.merging.as_mut()) => self.merged(lost).await,
-            Some(done) = self.background.tasks.join_next() => self.done(done.ok().flatten()),
-            Some(_) = self.endings.join_next() => {}
-            () = wait::for_some(self.ending_roscore.as_mut()) => {
-                self.ending_roscore = None;
-                if self.machine.role() != Role::Leading {
-                    return Some(None);
-                }
-                self.begin_release(String::new());
-            }
-            () = wait::until(wake) => {
-                if self.release_by.is_some_and(|by| by <= Instant::now()) {
-                    self.release_by = None;
-                    match self.released.take() {
-                        Some((_, tell)) => {
-                            let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
-                            let _ = tell.send(Err(why));
-                        }
-                        None if stop.is_cancelled() => return Some(None),
-                        None => {}
-                    }
-                }
-                if self.start_by.is_some_and(|by| by <= Instant::now()) {
-                    self.start();
-                }
-                self.inbox.push_back(Input::Wake);
-            }
-        }
-        let stopped = stop.is_cancelled() && self.may_stop();
-        stopped.then_some(None)
-    }
-
-    /// Brings the state that is held of the journal forward by `records`.
-    fn hold_records(&mut self, records: &[Record]) {
-        let now = Instant::now();
-        for request in calls(records) {
-            self.displaced.note(now, &self.held, &request);
-            self.held.apply_telling(&request, &mut ());
-        }
-    }
-
-    /// Says who leads. Calls of nodes wait as long as what was answered before them, alone, is on its way.
-    fn set_way(&self, way: Way) {
-        let leads = matches!(way, Way::Leader { .. } | Way::Here { term: Some(_) });
-        let owes = self.cut_off.is_some();
-        self.leads.send_replace(way.clone());
-        let way = match leads && owes {
-            true => Way::Nobody { known: true },
-            false => way,
-        };
-        self.way.send_if_modified(|now| {
-            let changes = *now != way;
-            if changes {
-                tracing::debug!(?way, "calls");
-                *now = way;
-            }
-            changes
+            let answer = trouble.of(run.await).unwrap_or(EtcdAnswer::Silence);
+            Input::Answer { number, answer }
         });
     }
-}
 
-/// The answer of a request to etcd. The machine waits for each: one that panics is given up, as if etcd were silent.
-async fn answered(number: u64, run: impl Future<Output = Answer> + Send + 'static) -> Input {
-    let run = AbortOnDropHandle::new(tokio::spawn(run));
-    let answer = run.await.unwrap_or_else(|error| {
-        tracing::error!(%error, "a request to etcd was not finished; please report this line");
-        Answer::Silence
-    });
-    Input::Answer { number, answer }
-}
+    /// The next input.
+    async fn next(&mut self) -> Result<Input, ProcessError> {
+        let wake = self.member.deadline();
+        // Inputs may be ready all the time. Requests that this thread runs as well must go on.
+        tokio::task::yield_now().await;
+        loop {
+            tokio::select! {
+                biased;
+                error = failed(&mut self.duties) => return Err(error),
+                Some(Ok(done)) = self.work.join_next() => return Ok(done),
+                () = self.setup.context.ledger.shared.notified() => {
+                    return Ok(Input::Recorded(self.setup.context.ledger.take_changes()));
+                }
+                changes = next_changes(&mut self.watch) => return Ok(self.changed(changes)),
+                Some((to, tell)) = self.handovers.recv() => match self.handover {
+                    // Only one handover runs at a time.
+                    Some(_) => drop(tell.send(Err("a handover is already under way".to_owned()))),
+                    None => {
+                        self.handover = Some(tell);
+                        let refused = self.known.successor(&to).err();
+                        return Ok(Input::HandOver { to, refused });
+                    }
+                },
+                Some(_) = self.beside.join_next() => {}
+                Some(_) = self.endings.join_next() => {}
+                () = wait::until(wake.map(Into::into)) => return Ok(Input::Wake),
+            }
+        }
+    }
 
-fn apply(state: &mut Master, records: &[Record]) {
-    for request in calls(records) {
-        state.apply_telling(&request, &mut ());
+    async fn end_master(&mut self) {
+        if let Some(duties) = self.duties.take() {
+            let ending = duties.end().await;
+            self.endings.spawn(ending);
+        }
+        self.setup.context.ledger.end_injection();
+    }
+
+    /// Turns the watch's changes, or its end, into an input.
+    fn changed(&mut self, changes: Option<Vec<KeyChange>>) -> Input {
+        let Some(changes) = changes else {
+            self.watch = None;
+            return Input::WatchEnded;
+        };
+        let keys = self.replica.keys.clone();
+        let (mut entries, mut heard) = (Vec::new(), Vec::new());
+        for change in changes {
+            if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
+                self.trouble.set(&error.into());
+            }
+            heard.extend(said(
+                &keys,
+                &change.key,
+                change.revision,
+                change.kv.as_ref(),
+            ));
+            let seq = keys.seq_of(&change.key);
+            if let (Some(kv), Some(seq)) = (change.kv, seq) {
+                entries.push(entry(seq, &kv));
+            }
+        }
+        let view = self.watched.clone();
+        Input::Watched {
+            view,
+            entries,
+            heard,
+        }
+    }
+
+    /// The error of a computer whose name is taken.
+    fn namesake_at(&self, uri: String) -> RunError {
+        let Settings { name, uri: own, .. } = self.member.settings();
+        let name = name.clone();
+        match uri == *own {
+            true => RunError::Double { name, uri },
+            false => RunError::Namesake {
+                name,
+                uri,
+                own: own.clone(),
+            },
+        }
     }
 }
 
-fn calls(records: &[Record]) -> impl Iterator<Item = Request> {
-    records.iter().filter_map(|record| match &record.entry {
-        Entry::Call { call, .. } => Some(Request::from(call.clone())),
-        Entry::Session(_) => None,
+/// Converts what was read from etcd.
+fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
+    let members = loaded.members.iter();
+    let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));
+    let heard = heard.collect();
+    let state = match loaded.checkpoint {
+        None => None,
+        Some(checkpoint) => match Master::from_snapshot(checkpoint.snapshot) {
+            Ok(state) => Some((state, checkpoint.displaced)),
+            Err(error) => {
+                tracing::error!(%error, "the state in etcd is invalid; please report this");
+                return None;
+            }
+        },
+    };
+    Some(Read {
+        view: loaded.view,
+        state,
+        records: loaded.records,
+        progress: loaded.progress,
+        heard,
     })
 }
 
-async fn failed(duty: &mut Option<Duty>) -> ProcessError {
-    match duty {
-        Some(duty) => duty.failed().await,
+/// A member entry, if `key` is one.
+fn said(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
+    let name = key.strip_prefix(&keys.member(""))?.to_owned();
+    let said = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
+    Some(Heard {
+        name,
+        said,
+        revision,
+    })
+}
+
+/// The journal entry that ends with record `seq`.
+fn entry(seq: u64, kv: &Kv) -> Entry {
+    let bytes = kv.value.len();
+    match (
+        Manifest::read(&kv.value),
+        journal::records(&kv.key, &kv.value),
+    ) {
+        (None, Ok(records)) => Entry::Records { records, bytes },
+        _ => Entry::Apart(seq),
+    }
+}
+
+/// Finds out whether the session in etcd continues.
+async fn decide(
+    seq: u64,
+    state: Master,
+    restore: RestorePolicy,
+    evidence: SessionEvidence,
+) -> Input {
+    let node_alive = session::depends_on_nodes(restore, evidence)
+        && life::any_alive(&state, evidence.same_boot).await;
+    let evidence = SessionEvidence {
+        node_alive,
+        ..evidence
+    };
+    let goes_on = match session::decide(restore, evidence) {
+        Decision::Restore(why) => {
+            tracing::info!(why, "the session in etcd continues: {}", state.counts());
+            true
+        }
+        Decision::Fresh(why) => {
+            tracing::info!(why, "a new session begins; the one in etcd is over");
+            false
+        }
+    };
+    Input::Decided { seq, goes_on }
+}
+
+/// Sends writes that were answered while cut off to the leader at an address, or to this computer.
+async fn merge(
+    ask: Ask,
+    to: Option<(String, u64)>,
+    peers: Arc<Peers>,
+    queue: WriteQueue,
+) -> Option<wire::MergeAnswer> {
+    let Some((uri, term)) = to else {
+        return queue.merge(ask).await;
+    };
+    let uri = MasterUri::parse(&uri).ok()?;
+    let leader = peers.at(&uri);
+    let send = async |call: Request| {
+        let body = Bytes::from(xmlrpc::encode_call(&call.into()));
+        let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
+        xmlrpc::decode_reply(&raw.body).ok()
+    };
+    let reply = send(ask.to_request()).await?;
+    let count = ask.calls.len();
+    match wire::MergeAnswer::read(&reply, count) {
+        Some(answer) => Some(answer),
+        // An earlier version, which does not know this method.
+        None => {
+            let reply = send(Request::multicall(ask.calls)).await;
+            reply.map(|reply| wire::MergeAnswer::of(&vec![Verdict::Runs; count], &reply))
+        }
+    }
+}
+
+/// Writes this computer's entry among the members.
+async fn say(client: Etcd, put: Put) {
+    let said = async {
+        let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;
+        client.put_with_lease(&put, lease, LIMIT).await
+    };
+    if let Err(error) = said.await {
+        tracing::debug!(%error, "the entry among the members");
+    }
+}
+
+/// The result of `work`, or `otherwise` if it panics, because the member waits for every result.
+async fn answered(otherwise: Input, work: impl Future<Output = Input> + Send + 'static) -> Input {
+    let work = AbortOnDropHandle::new(tokio::spawn(work));
+    work.await.unwrap_or_else(|error| {
+        tracing::error!(%error, "a task for the cluster panicked; please report this line");
+        otherwise
+    })
+}
+
+async fn failed(duties: &mut Option<MasterDuties>) -> ProcessError {
+    match duties {
+        Some(duties) => duties.failed().await,
         None => std::future::pending().await,
     }
 }
 
-async fn next_changes(watch: &mut Option<Watch>) -> Result<Vec<Change>, WatchEnd> {
-    match watch {
-        Some(watch) => watch.next().await,
-        None => std::future::pending().await,
+/// A watch, read by a task of its own: what arrives while the member works becomes one input.
+struct Watching {
+    changes: mpsc::Receiver<Vec<KeyChange>>,
+    _task: AbortOnDropHandle<()>,
+}
+
+impl Watching {
+    fn new(mut watch: Watch, trouble: Arc<Trouble>) -> Self {
+        let (sender, changes) = mpsc::channel(WATCHED_MOST);
+        let task = tokio::spawn(async move {
+            loop {
+                match watch.next().await {
+                    Ok(changes) => {
+                        trouble.clear();
+                        if sender.send(changes).await.is_err() {
+                            return;
+                        }
+                    }
+                    Err(WatchEnd::Failed(error)) => return trouble.set(&error.into()),
+                    Err(WatchEnd::Compacted) => return,
+                }
+            }
+        });
+        let _task = AbortOnDropHandle::new(task);
+        Self { changes, _task }
     }
+}
+
+/// All changes that have arrived. `None` if the watch has ended. Cancel safe.
+async fn next_changes(watch: &mut Option<Watching>) -> Option<Vec<KeyChange>> {
+    let Some(watch) = watch else {
+        return std::future::pending().await;
+    };
+    let mut changes = Vec::new();
+    let count = watch.changes.recv_many(&mut changes, WATCHED_MOST).await;
+    (count > 0).then(|| changes.into_iter().flatten().collect())
 }
 
 #[cfg(test)]
@@ -377,17 +624,36 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_request_that_panics_is_answered() {
-        let answered = answered(7, async { panic!("on purpose") }).await;
-        let expected = |input: &Input| {
-            matches!(
-                input,
-                Input::Answer {
-                    number: 7,
-                    answer: Answer::Silence
-                }
-            )
+    async fn what_arrived_while_the_member_worked_is_one_input() {
+        let (sender, changes) = mpsc::channel(WATCHED_MOST);
+        let _task = AbortOnDropHandle::new(tokio::spawn(async {}));
+        let mut watch = Some(Watching { changes, _task });
+        let change = |revision| KeyChange {
+            key: String::new(),
+            revision,
+            kv: None,
         };
-        assert!(expected(&answered), "{answered:?}");
+        let all = [1, 2, 3].map(change);
+        for change in all.clone() {
+            sender.send(vec![change]).await.unwrap();
+        }
+        drop(sender);
+        assert_eq!(next_changes(&mut watch).await.as_deref(), Some(&all[..]));
+        assert_eq!(next_changes(&mut watch).await, None);
+    }
+
+    #[tokio::test]
+    async fn work_that_panics_is_answered() {
+        let answer = EtcdAnswer::Silence;
+        let otherwise = Input::Answer { number: 7, answer };
+        let answered = answered(otherwise, async { panic!("on purpose") }).await;
+        let expected = matches!(
+            answered,
+            Input::Answer {
+                number: 7,
+                answer: EtcdAnswer::Silence
+            }
+        );
+        assert!(expected, "{answered:?}");
     }
 }

@@ -7,7 +7,7 @@ use tokio::task::JoinSet;
 use crate::{
     health::port_of,
     master::{self, Master},
-    nodes::client::{self, Sign},
+    nodes::client::{self, Reaction},
     resolver,
 };
 
@@ -25,7 +25,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
         let (api, call) = (port.to_owned(), call.clone());
         questions.spawn(async move {
             (same_boot || resolver::is_elsewhere(&api, LIFE_SIGN).await)
-                && client::ask(&api, &call, LIFE_SIGN).await == Sign::Alive
+                && client::ask(&api, &call, LIFE_SIGN).await == Reaction::Alive
         });
     }
     while let Some(alive) = questions.join_next().await {

@@ -11,7 +11,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::duty::Context;
+use super::context::Context;
 use crate::{
     gate::State,
     guardian::handover::{self, Guard},

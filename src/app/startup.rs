@@ -12,7 +12,7 @@ use crate::{
     checkpoint::{
         folder,
         format::Session,
-        session::{self, Decision, Evidence, Rebuilt},
+        session::{self, Decision, Rebuilt, SessionEvidence},
         store::{self, OpenError, Store, history},
     },
     clock,
@@ -98,7 +98,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         let session = session.unwrap_or_default();
         let same_boot = session.boot_id == boot_id;
         died = same_boot && !session.closed;
-        let mut evidence = Evidence {
+        let mut evidence = SessionEvidence {
             same_boot,
             closed: session.closed,
             node_alive: false,

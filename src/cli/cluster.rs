@@ -19,7 +19,7 @@ pub struct ClusterArgs {
     /// robot's name, as in http://a:2379,http://b:2379,http://c:2379/ROBOT
     #[arg(long, env = "ROSRESCUE_CLUSTER", value_name = "URLS")]
     #[arg(value_parser = members)]
-    pub cluster: Option<Members>,
+    pub cluster: Option<ClusterArg>,
     /// Address where the other computers reach this one, HOST or HOST:PORT [default: that of its ROS_MASTER_URI]
     #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST", help_heading = COMPUTERS)]
     #[arg(requires = "cluster")]
@@ -83,14 +83,14 @@ pub enum WhenCutOff {
 
 /// The parsed value of `--cluster`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Members {
+pub struct ClusterArg {
     /// The etcd endpoints, each `http://HOST:PORT` or `https://HOST:PORT`, all with the same scheme.
     pub endpoints: Vec<String>,
     pub robot: String,
 }
 
 /// Parses `http://A:2379,http://B:2379,http://C:2379/ROBOT`. Endpoints without a scheme get that of the first one.
-fn members(text: &str) -> Result<Members, String> {
+fn members(text: &str) -> Result<ClusterArg, String> {
     let mut first = None;
     let mut robot = ROBOT;
     let mut endpoints = Vec::new();
@@ -128,7 +128,7 @@ fn members(text: &str) -> Result<Members, String> {
         }
         endpoints.push(format!("{scheme}://{authority}"));
     }
-    Ok(Members {
+    Ok(ClusterArg {
         endpoints,
         robot: name(robot).map_err(|why| format!("`{robot}` is not a valid robot name: {why}"))?,
     })
@@ -186,7 +186,7 @@ mod tests {
                 "r",
             ),
         ] {
-            let expected = Members {
+            let expected = ClusterArg {
                 endpoints: endpoints.iter().map(|url| (*url).to_owned()).collect(),
                 robot: robot.to_owned(),
             };

@@ -6,15 +6,16 @@ use std::{
     time::Duration,
 };
 
-pub use etcd_kv::{
-    Access, Change, EtcdError, Found, Kv, Options, Status, Tls, Tried, Watch, WatchEnd,
-};
 use etcd_kv::{Client, Txn, TxnOp};
+pub use etcd_kv::{
+    Credentials, EtcdError, Found, KeyChange, Kv, MemberStatus, Options, Tls, Tried, Watch,
+    WatchEnd,
+};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::{
     journal::{Keys, Put},
-    machine::{Alive, Answer, Guard, Leader, Op, Settings, View},
+    machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
 };
 
 /// Maximum number of robots that [`Etcd::robots`] lists.
@@ -39,7 +40,7 @@ impl Etcd {
     ///
     /// # Errors
     ///
-    /// As [`Client::new`].
+    /// The errors of [`Client::new`].
     pub fn new(options: &Options) -> Result<Self, EtcdError> {
         Client::new(options).map(Self)
     }
@@ -48,7 +49,7 @@ impl Etcd {
     ///
     /// # Errors
     ///
-    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
+    /// Why etcd gave no answer. The state machine gets [`EtcdAnswer::Silence`] for it.
     pub async fn run(
         &self,
         keys: &Keys,
@@ -56,14 +57,14 @@ impl Etcd {
         op: &Op,
         entry: Option<&Put>,
         limit: Duration,
-    ) -> Result<Answer, EtcdError> {
+    ) -> Result<EtcdAnswer, EtcdError> {
         let (txn, seq) = transaction(keys, settings, op, entry);
         let done = self.txn(&txn, limit).await?;
         if done.succeeded && done.gets.is_empty() {
             let revision = done.revision;
-            return Ok(Answer::Applied { revision, seq });
+            return Ok(EtcdAnswer::Applied { revision, seq });
         }
-        view(keys, done.revision, done.gets.iter().flatten()).map(Answer::Is)
+        view(keys, done.revision, done.gets.iter().flatten()).map(EtcdAnswer::Is)
     }
 
     /// Writes `puts` one after the other, each only if `leader` still has this term. Returns whether it had.
@@ -168,7 +169,7 @@ impl Etcd {
 ///
 /// # Errors
 ///
-/// If they are not what rosrescue writes there.
+/// If rosrescue did not write them.
 pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
     view(keys, found.revision, found.kvs.iter())
 }
@@ -177,8 +178,8 @@ pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
 ///
 /// # Errors
 ///
-/// If the key is not what rosrescue writes there.
-pub fn absorb(change: &Change, view: &mut View, keys: &Keys) -> Result<(), EtcdError> {
+/// If rosrescue did not write the key.
+pub fn absorb(change: &KeyChange, view: &mut View, keys: &Keys) -> Result<(), EtcdError> {
     view.revision = view.revision.max(change.revision);
     absorb_key(view, keys, &change.key, change.kv.as_ref())
 }
@@ -256,7 +257,7 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
         };
         write_json(keys.alive(), &value)
     };
-    let txn = |guard: &Guard, changes: Vec<TxnOp>| Txn {
+    let txn = |guard: &RevisionGuard, changes: Vec<TxnOp>| Txn {
         compare: vec![(keys.leader(), guard.leader), (keys.alive(), guard.alive)],
         success: changes,
         failure: both(keys),

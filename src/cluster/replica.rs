@@ -7,11 +7,11 @@ use thiserror::Error;
 use super::{
     etcd::{self, Etcd, EtcdError, Kv},
     journal::{self, JournalError, Keys, Manifest, Progress, Put},
-    machine::{Answer, Op, Settings, View},
+    machine::{EtcdAnswer, Op, Settings, View},
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
 
-/// How often a read starts over because a snapshot was replaced meanwhile.
+/// How often a read starts over because etcd was compacted meanwhile.
 const ATTEMPTS: usize = 5;
 
 #[derive(Debug, Error)]
@@ -32,7 +32,7 @@ pub enum ReplicaError {
 
 /// The part of the state in etcd that was not known yet.
 #[derive(Debug)]
-pub struct Loaded {
+pub struct LoadedState {
     /// The keys `leader` and `alive`, read at the same moment.
     pub view: View,
     /// The snapshot that the records follow. `None` if they follow the known state.
@@ -58,14 +58,11 @@ impl Replica {
     /// # Errors
     ///
     /// Why the state is unknown.
-    pub async fn load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
+    pub async fn load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
         let mut attempt = 1;
         loop {
             match self.try_load(known).await {
-                // The leader has just written a snapshot, and deleted what this was about to read.
-                Err(ReplicaError::Journal(_) | ReplicaError::Etcd(EtcdError::Compacted { .. }))
-                    if attempt < ATTEMPTS =>
-                {
+                Err(ReplicaError::Etcd(EtcdError::Compacted { .. })) if attempt < ATTEMPTS => {
                     attempt += 1;
                 }
                 done => return done,
@@ -73,9 +70,11 @@ impl Replica {
         }
     }
 
-    async fn try_load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
-        let found = self.client.range(&self.keys.small(), self.limit).await?;
-        let mut loaded = Loaded {
+    async fn try_load(&self, known: Progress) -> Result<LoadedState, ReplicaError> {
+        // A long journal takes many requests, so what is known is not read again.
+        let unknown = self.keys.small_after(known.seq);
+        let found = self.client.ranges(&unknown, None, self.limit).await?;
+        let mut loaded = LoadedState {
             view: etcd::view_of(&found, &self.keys)?,
             checkpoint: None,
             records: Vec::new(),
@@ -89,7 +88,7 @@ impl Replica {
         let snapshot = found.kvs.iter().find(|kv| kv.key == snapshot);
         let manifest = snapshot.map(|kv| self.manifest(kv)).transpose()?;
         if let Some(manifest) = manifest.filter(|manifest| manifest.seq > known.seq) {
-            let bytes = self.assemble(&manifest).await?;
+            let bytes = self.assemble(&manifest, found.revision).await?;
             loaded.progress = Progress::after_snapshot(manifest.seq, bytes.len());
             loaded.checkpoint = Some(checkpoint(&bytes)?);
         }
@@ -99,12 +98,12 @@ impl Replica {
                 continue;
             };
             if let Some(manifest) = Manifest::read(&kv.value).filter(Manifest::is_state) {
-                let bytes = self.assemble(&manifest).await?;
+                let bytes = self.assemble(&manifest, found.revision).await?;
                 loaded.progress.take_state(seq, bytes.len());
                 loaded.checkpoint = Some(checkpoint(&bytes)?);
                 loaded.records.clear();
             } else {
-                let records = self.records(kv).await?;
+                let records = self.records(kv, found.revision).await?;
                 loaded
                     .records
                     .extend(loaded.progress.take(records, kv.value.len())?);
@@ -117,16 +116,16 @@ impl Replica {
         }
     }
 
-    /// Reads the records of a journal entry.
+    /// Reads the records of a journal entry that was read at `revision`.
     ///
     /// # Errors
     ///
-    /// Why they cannot be read.
-    pub async fn records(&self, entry: &Kv) -> Result<Vec<Record>, ReplicaError> {
+    /// If they could not be read.
+    pub async fn records(&self, entry: &Kv, revision: u64) -> Result<Vec<Record>, ReplicaError> {
         let Some(manifest) = Manifest::read(&entry.value) else {
             return Ok(journal::records(&entry.key, &entry.value)?);
         };
-        let whole = self.assemble(&manifest).await?;
+        let whole = self.assemble(&manifest, revision).await?;
         Ok(journal::records(&entry.key, &whole)?)
     }
 
@@ -137,11 +136,11 @@ impl Replica {
         })
     }
 
-    async fn assemble(&self, manifest: &Manifest) -> Result<Vec<u8>, ReplicaError> {
-        let found = self
-            .client
-            .range(&self.keys.parts(manifest), self.limit)
-            .await?;
+    /// Reads the parts that `manifest` named at `revision`. The leader may have replaced them since.
+    async fn assemble(&self, manifest: &Manifest, revision: u64) -> Result<Vec<u8>, ReplicaError> {
+        let parts = [self.keys.parts(manifest)];
+        let found = self.client.ranges(&parts, Some(revision), self.limit);
+        let found = found.await?;
         let parts: Vec<_> = found.kvs.into_iter().map(|kv| kv.value).collect();
         Ok(manifest.assemble(&self.keys, &parts)?)
     }
@@ -161,13 +160,13 @@ impl Replica {
     ///
     /// # Errors
     ///
-    /// Why etcd gave no answer. The state machine gets [`Answer::Silence`] for it.
+    /// Why etcd gave no answer. The state machine gets [`EtcdAnswer::Silence`] for it.
     pub async fn run(
         &self,
         settings: &Settings,
         op: &Op,
         entry: Option<&Put>,
-    ) -> Result<Answer, ReplicaError> {
+    ) -> Result<EtcdAnswer, ReplicaError> {
         Ok(self
             .client
             .run(&self.keys, settings, op, entry, self.limit)

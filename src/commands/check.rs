@@ -15,17 +15,17 @@ use std::{convert::Infallible, fmt, time::Duration};
 
 use serde::Serialize;
 
-use self::facts::Facts;
-use super::{Exit, Failure, counted, print};
+use self::facts::SetupFacts;
+use super::{CommandFailure, Exit, counted, print};
 use crate::{cli::CheckArgs, ros_env::MasterUri};
 
-pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     let master = args.master.as_deref().map(MasterUri::parse).transpose();
-    let master = master.map_err(|error| Failure::Usage(format!("--master: {error}")))?;
+    let master = master.map_err(|error| CommandFailure::Usage(format!("--master: {error}")))?;
     if args.live {
         return finish(args, links::look(args).await?);
     }
-    let facts = Facts::gather(args, master);
+    let facts = SetupFacts::gather(args, master);
     let slow = async {
         tokio::time::sleep(Duration::from_secs(1)).await;
         eprintln!("still checking: looking up unknown names takes long");
@@ -40,7 +40,7 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     finish(args, findings)
 }
 
-fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, Failure> {
+fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, CommandFailure> {
     let report = Report::new(findings);
     print(&report, &args.output)?;
     Ok(match report.problems {

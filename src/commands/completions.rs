@@ -2,10 +2,10 @@
 
 use clap::CommandFactory;
 
-use super::{Exit, Failure, print_line};
+use super::{CommandFailure, Exit, print_line};
 use crate::cli::{Cli, CompletionsArgs};
 
-pub(super) async fn run(args: &CompletionsArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &CompletionsArgs) -> Result<Exit, CommandFailure> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut Cli::command(), "rosrescue", &mut script);
     print_line(String::from_utf8_lossy(&script).trim_end())?;

@@ -4,13 +4,13 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::{Exit, Failure, files, live::Live, print, running::Running};
+use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
 use crate::{
     checkpoint::compare::{Difference, compare},
     cli::DiffArgs,
 };
 
-pub(super) async fn run(args: &DiffArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &DiffArgs) -> Result<Exit, CommandFailure> {
     let a = files::read(&args.a, &args.read).await?;
     let (b, state, names) = match &args.b {
         Some(b) => {

@@ -22,14 +22,14 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 
 use self::{
-    calls::{Api, Callers, Calls},
-    node::Node,
-    robot::Robot,
+    calls::{Api, CallResults, Callers},
+    node::DrillNode,
+    robot::RobotState,
     target::Target,
     topics::Topic,
-    verdict::{Verdict, names},
+    verdict::{DrillVerdict, names},
 };
-use super::{Exit, Failure, counted, print, running::Running};
+use super::{CommandFailure, Exit, counted, print, running::Running};
 use crate::{
     checkpoint::store::history,
     cli::{DrillArgs, Victim},
@@ -46,7 +46,7 @@ const TOPICS: usize = 3;
 /// Longest time for cleaning up.
 const TIDY_LIMIT: Duration = Duration::from_secs(15);
 
-pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &DrillArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
     let name = format!("{PREFIX}{}", std::process::id());
     let api = Api {
@@ -58,8 +58,8 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
     if !args.no_kill {
         agree(args, &target).await?;
     }
-    let node = Node::start(name).await;
-    let node = node.map_err(|error| Failure::Failed(format!("cannot listen: {error}")))?;
+    let node = DrillNode::start(name).await;
+    let node = node.map_err(|error| CommandFailure::Failed(format!("cannot listen: {error}")))?;
     let mut drill = Drill {
         args,
         target,
@@ -69,7 +69,7 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
     };
     let signals = [SignalKind::interrupt(), SignalKind::terminate()].map(signal);
     let [Ok(mut interrupt), Ok(mut terminate)] = signals else {
-        return Err(Failure::Failed("cannot receive signals".to_owned()));
+        return Err(CommandFailure::Failed("cannot receive signals".to_owned()));
     };
     let stop = CancellationToken::new();
     let ended = tokio::select! {
@@ -82,7 +82,7 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
     let tidied = drill.tidy_up().await;
     let mut verdict = match ended {
         Ok(verdict) => verdict,
-        Err(failure) => return tidied.map_err(Failure::Failed).and(Err(failure)),
+        Err(failure) => return tidied.map_err(CommandFailure::Failed).and(Err(failure)),
     };
     if let Err(why) = tidied {
         verdict.passed = false;
@@ -96,12 +96,12 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
     })
 }
 
-fn interrupted() -> Failure {
-    Failure::Failed("interrupted: no verdict. The drill has cleaned up".to_owned())
+fn interrupted() -> CommandFailure {
+    CommandFailure::Failed("interrupted: no verdict. The drill has cleaned up".to_owned())
 }
 
 /// Says what will be killed, and asks for consent.
-async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
+async fn agree(args: &DrillArgs, target: &Target) -> Result<(), CommandFailure> {
     target.require_this_computer().await?;
     let kill = if args.hang { Victim::Master } else { args.kill };
     let victims = names(&target.victims(kill).await?);
@@ -115,7 +115,7 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
         return Ok(());
     }
     if !std::io::stdin().is_terminal() {
-        return Err(Failure::Usage(
+        return Err(CommandFailure::Usage(
             "cannot ask here: run the drill with --yes, at a terminal, or with --no-kill"
                 .to_owned(),
         ));
@@ -126,25 +126,25 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
     let read = std::io::stdin().read_line(&mut answer);
     match read.is_ok() && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
         true => Ok(()),
-        false => Err(Failure::Failed("killed nothing".to_owned())),
+        false => Err(CommandFailure::Failed("killed nothing".to_owned())),
     }
 }
 
 struct Drill<'a> {
     args: &'a DrillArgs,
     target: Target,
-    node: Node,
+    node: DrillNode,
     topics: Vec<Topic>,
     /// The task of the callers, while they run.
-    calls: Option<JoinHandle<Calls>>,
+    calls: Option<JoinHandle<CallResults>>,
 }
 
 impl Drill<'_> {
     /// Waits for the callers to end, and returns what they found.
-    async fn calls(&mut self) -> Calls {
+    async fn calls(&mut self) -> CallResults {
         let calls = match &mut self.calls {
             Some(calls) => calls.await.unwrap_or_default(),
-            None => Calls::default(),
+            None => CallResults::default(),
         };
         self.calls = None;
         calls
@@ -155,16 +155,22 @@ impl Drill<'_> {
     }
 
     /// Runs the whole drill, without [`Self::tidy_up`].
-    async fn run(&mut self, status: &Status, stop: &CancellationToken) -> Result<Verdict, Failure> {
+    async fn run(
+        &mut self,
+        status: &Status,
+        stop: &CancellationToken,
+    ) -> Result<DrillVerdict, CommandFailure> {
         let start = Instant::now();
         eprintln!("watching normal operation, and finding topics with messages");
         let api = self.target.api.clone();
         self.remove_left_behind().await?;
-        let before = Robot::read(&api).await.map_err(Failure::Failed)?;
+        let before = RobotState::read(&api)
+            .await
+            .map_err(CommandFailure::Failed)?;
         // Subscribes to all parameters: changes by others are not failures of rosrescue.
         let subscribe = [self.node.api.as_str().into(), "/".into()];
         let subscribed = api.call("subscribeParam", &subscribe).await;
-        subscribed.map_err(Failure::Failed)?;
+        subscribed.map_err(CommandFailure::Failed)?;
         let callers = Callers {
             api: api.clone(),
             node_api: self.node.api.clone(),
@@ -175,7 +181,9 @@ impl Drill<'_> {
         self.calls = Some(tokio::spawn(callers.run(stop.clone())));
         self.choose_topics().await?;
         sleep(BEFORE).await;
-        let meanwhile = Robot::read(&api).await.map_err(Failure::Failed)?;
+        let meanwhile = RobotState::read(&api)
+            .await
+            .map_err(CommandFailure::Failed)?;
         for topic in &self.topics {
             topic.begin();
         }
@@ -191,9 +199,9 @@ impl Drill<'_> {
         let updates = self.node.heard.updates();
         let (now, watched) = (Instant::now(), self.topics.iter());
         let topics = watched.map(|topic| topic.report(now, &updates)).collect();
-        let after = Robot::read(&api).await;
+        let after = RobotState::read(&api).await;
         let (nodes, facts) = before.counts();
-        let mut verdict = Verdict {
+        let mut verdict = DrillVerdict {
             passed: false,
             uri: self.target.running.address.to_string(),
             version: status.version.clone(),
@@ -208,7 +216,7 @@ impl Drill<'_> {
         };
         let difference = match after {
             Ok(after) => before.compare(&meanwhile, &after, &self.node.heard.changed()),
-            Err(why) => robot::Difference {
+            Err(why) => robot::DrillDifference {
                 lost: vec![format!("cannot read the state at the end: {why}")],
                 new: Vec::new(),
             },
@@ -219,24 +227,27 @@ impl Drill<'_> {
     }
 
     /// Subscribes to the topics to watch.
-    async fn choose_topics(&mut self) -> Result<(), Failure> {
+    async fn choose_topics(&mut self) -> Result<(), CommandFailure> {
         let api = self.target.api.clone();
         if !self.args.topic.is_empty() {
             for topic in &self.args.topic {
                 let name = format!("/{}", topic.trim_start_matches('/'));
                 let topic = Topic::subscribe(&api, &self.node, &name).await;
-                let topic = topic.map_err(Failure::Failed)?;
+                let topic = topic.map_err(CommandFailure::Failed)?;
                 let published = topic.has_publishers();
                 self.topics.push(topic);
                 if !published {
                     let what = format!("--topic: no node publishes {name}");
-                    return Err(Failure::Usage(what));
+                    return Err(CommandFailure::Usage(what));
                 }
             }
             return Ok(());
         }
         let mut found = Vec::new();
-        for name in topics::candidates(&api).await.map_err(Failure::Failed)? {
+        for name in topics::candidates(&api)
+            .await
+            .map_err(CommandFailure::Failed)?
+        {
             match Topic::subscribe(&api, &self.node, &name).await {
                 Ok(topic) => found.push(topic),
                 Err(why) => {
@@ -259,12 +270,12 @@ impl Drill<'_> {
     }
 
     /// Deletes the parameters of earlier drills that were killed. The next health check removes their registrations.
-    async fn remove_left_behind(&self) -> Result<(), Failure> {
+    async fn remove_left_behind(&self) -> Result<(), CommandFailure> {
         let api = &self.target.api;
         let keys = api
             .call("getParamNames", &[])
             .await
-            .map_err(Failure::Failed)?;
+            .map_err(CommandFailure::Failed)?;
         for key in keys.as_array().unwrap_or_default() {
             let pid = key.as_str().and_then(|key| key.strip_prefix(PREFIX));
             let pid = pid.and_then(|pid| pid.parse().ok());

@@ -8,12 +8,12 @@ use std::{
 };
 
 use super::{
-    Failure,
+    CommandFailure,
     running::{Running, is_here},
 };
 use crate::{
     checkpoint::{
-        format::{Entry, Session},
+        format::{RecordContent, Session},
         session,
         store::{self, OpenError, history},
     },
@@ -78,13 +78,13 @@ async fn of_running() -> Option<PathBuf> {
 }
 
 /// The checkpoint that `file` stands for: a path, or a name or number from the history.
-pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
+pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, CommandFailure> {
     match fs::canonicalize(file) {
         Ok(path) => return Ok(path),
         Err(error) if error.kind() == io::ErrorKind::NotFound => {}
         Err(error) => {
             let why = format!("cannot read `{}`: {error}", file.display());
-            return Err(Failure::Usage(why));
+            return Err(CommandFailure::Usage(why));
         }
     }
     let present = present(place).await;
@@ -95,7 +95,7 @@ pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf,
         is_meant.then(|| kept.path.clone())
     };
     listed.iter().enumerate().find_map(named).ok_or_else(|| {
-        Failure::Usage(format!(
+        CommandFailure::Usage(format!(
             "there is no file `{wanted}`, and no checkpoint with that name or number beside `{}`. `rosrescue history` \
              lists the checkpoints",
             present.display()
@@ -135,19 +135,19 @@ pub(super) fn list(present: &Path) -> Vec<Listed> {
 }
 
 /// Reads the checkpoint at `path`, damaged or not.
-pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
+pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
     let shown = path.display();
     let metadata = fs::metadata(path)
-        .map_err(|error| Failure::Usage(format!("cannot read `{shown}`: {error}")))?;
+        .map_err(|error| CommandFailure::Usage(format!("cannot read `{shown}`: {error}")))?;
     if metadata.is_dir() {
         let why = format!("`{shown}` is a folder: give the checkpoint file in it");
-        return Err(Failure::Usage(why));
+        return Err(CommandFailure::Usage(why));
     }
     if metadata.len() > LARGE && io::stderr().is_terminal() {
         eprintln!("reading `{shown}`, {} …", size(metadata.len()));
     }
     let loaded = store::read(path).map_err(|error| {
-        Failure::Usage(match error {
+        CommandFailure::Usage(match error {
             OpenError::NotACheckpoint { .. } => format!("`{shown}` is not a rosrescue checkpoint"),
             OpenError::NewerVersion { version, .. } => format!(
                 "`{shown}` has checkpoint format {version} of a newer rosrescue: use that one"
@@ -155,12 +155,12 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
             other => other.without_advice(),
         })
     })?;
-    let gone = || Failure::Usage(format!("there is no file `{shown}` any more"));
+    let gone = || CommandFailure::Usage(format!("there is no file `{shown}` any more"));
     let loaded = loaded.ok_or_else(gone)?;
     let snapshot_seq = loaded.checkpoint.as_ref().map(|checkpoint| checkpoint.seq);
     let entries = loaded.records.iter().map(|record| match &record.entry {
-        Entry::Call { call, .. } => call.method.clone(),
-        Entry::Session(_) => "session".to_owned(),
+        RecordContent::Call { call, .. } => call.method.clone(),
+        RecordContent::Session(_) => "session".to_owned(),
     });
     let journal = entries.collect();
     let mut damage = loaded.damage;
@@ -187,7 +187,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
 }
 
 /// Reads the checkpoint that `file` stands for. Refuses a damaged one without `--damaged`.
-pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure> {
+pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, CommandFailure> {
     let opened = open(&find(file, &args.place).await?)?;
     let path = opened.path.display();
     if !opened.exact && !args.damaged {
@@ -195,7 +195,7 @@ pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure
             .damage
             .first()
             .map_or("records are missing", String::as_str);
-        return Err(Failure::Usage(format!(
+        return Err(CommandFailure::Usage(format!(
             "`{path}` is damaged: {why}. `rosrescue verify` shows the readable part, and --damaged uses it"
         )));
     }

@@ -6,13 +6,13 @@ use serde::Serialize;
 use tokio::time::{Instant, sleep};
 
 use super::{
-    Exit, Failure, print,
+    CommandFailure, Exit, print,
     running::{ANSWER_LIMIT, Running},
 };
 use crate::{
     cli::HandoverArgs,
     cluster::machine::Role,
-    status::computers::{Computers, Leader},
+    status::computers::{Computers, LeaderStatus},
     xmlrpc::{Reply, Value},
 };
 
@@ -43,7 +43,12 @@ struct Outcome {
 }
 
 impl Outcome {
-    fn new(running: &Running, from: &Leader, to: Option<&Leader>, wanted: Option<&str>) -> Self {
+    fn new(
+        running: &Running,
+        from: &LeaderStatus,
+        to: Option<&LeaderStatus>,
+        wanted: Option<&str>,
+    ) -> Self {
         let to = to.map(|to| to.name.clone());
         let is_meant = |to: &String| wanted.map_or(*to != from.name, |wanted| to == wanted);
         Self {
@@ -82,7 +87,7 @@ impl fmt::Display for Outcome {
     }
 }
 
-pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
     let before = computers(&running).await?;
     let wanted = match args.to.as_deref() {
@@ -107,9 +112,9 @@ pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, Failure> {
     })
 }
 
-async fn computers(running: &Running) -> Result<Computers, Failure> {
+async fn computers(running: &Running) -> Result<Computers, CommandFailure> {
     running.status().await?.cluster.ok_or_else(|| {
-        Failure::Failed(format!(
+        CommandFailure::Failed(format!(
             "the rosrescue at {} runs without --cluster: there is no other \
              computer to hand over to",
             running.address
@@ -118,10 +123,10 @@ async fn computers(running: &Running) -> Result<Computers, Failure> {
 }
 
 /// The name of the computer that `--to` stands for.
-fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, Failure> {
+fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, CommandFailure> {
     now.find(given).ok_or_else(|| {
         let names: Vec<_> = now.computers.iter().map(|of| &*of.name).collect();
-        Failure::Usage(format!(
+        CommandFailure::Usage(format!(
             "--to: no computer of this robot is called `{given}`, or more than one is; there are {}",
             names.join(", ")
         ))
@@ -129,26 +134,27 @@ fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, Failure> {
 }
 
 /// The present leader. Fails if there is none to hand over from.
-fn leader(now: &Computers) -> Result<&Leader, Failure> {
+fn leader(now: &Computers) -> Result<&LeaderStatus, CommandFailure> {
     if now.role == Role::Alone {
-        return Err(Failure::Failed(format!(
+        return Err(CommandFailure::Failed(format!(
             "{} is cut off from the others: ask another computer, with --uri",
             now.name
         )));
     }
     now.leads().ok_or_else(|| {
-        Failure::Failed(
+        CommandFailure::Failed(
             "no computer leads now, so none can hand over; see `rosrescue status`".to_owned(),
         )
     })
 }
 
 /// Asks the leader to hand over.
-async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<(), Failure> {
+async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<(), CommandFailure> {
     let limit =
         Duration::try_from_secs_f64(timeout).map_or(ANSWER_LIMIT, |limit| limit.max(ANSWER_LIMIT));
     let params = [CALLER, wanted.unwrap_or_default()].map(Value::from);
-    let refused = |why: &str| Failure::Failed(format!("the leader refused the handover: {why}"));
+    let refused =
+        |why: &str| CommandFailure::Failed(format!("the leader refused the handover: {why}"));
     match running.call(METHOD, params.into(), limit).await? {
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(1), ..] => Ok(()),
@@ -163,10 +169,10 @@ async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<()
 /// Waits for a leader other than `from`. Returns the present leader when the time is over.
 async fn next_leader(
     running: &Running,
-    from: &Leader,
+    from: &LeaderStatus,
     start: Instant,
     timeout: f64,
-) -> Result<Option<Leader>, Failure> {
+) -> Result<Option<LeaderStatus>, CommandFailure> {
     let mut said = start;
     loop {
         let now = computers(running).await?;
@@ -193,7 +199,7 @@ mod tests {
         let running = Running {
             address: crate::ros_env::MasterUri::parse("http://pc-2:1").unwrap(),
         };
-        let of = |name: &str| Leader {
+        let of = |name: &str| LeaderStatus {
             name: name.to_owned(),
             uri: String::new(),
             version: String::new(),
@@ -236,11 +242,11 @@ mod tests {
         let now = Computers::from(&facts);
         assert_eq!(meant(&now, "pc-3").unwrap(), "pc-3");
         let unknown = meant(&now, "pc-4").expect_err("unknown");
-        assert!(matches!(&unknown, Failure::Usage(why) if why.contains("pc-1, pc-2, pc-3")));
+        assert!(matches!(&unknown, CommandFailure::Usage(why) if why.contains("pc-1, pc-2, pc-3")));
         facts.role = Role::Alone;
-        assert!(matches!(with(&facts), Err(Failure::Failed(_))));
+        assert!(matches!(with(&facts), Err(CommandFailure::Failed(_))));
         facts.role = Role::Following;
         facts.leaderless = Some(std::time::Instant::now());
-        assert!(matches!(with(&facts), Err(Failure::Failed(_))));
+        assert!(matches!(with(&facts), Err(CommandFailure::Failed(_))));
     }
 }

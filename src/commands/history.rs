@@ -5,17 +5,17 @@ use std::fmt;
 use serde::Serialize;
 
 use super::{
-    Exit, Failure,
+    CommandFailure, Exit,
     files::{self, size},
     print,
 };
 use crate::{
     cli::HistoryArgs,
     clock,
-    recovery::report_file::{self, Kept},
+    recovery::report_file::{self, ReportRecord},
 };
 
-pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
     let present = files::present(&args.place).await;
     let reports = report_file::read(&present);
     let rows = files::list(&present)
@@ -77,7 +77,7 @@ struct Rescue {
 }
 
 impl Rescue {
-    fn of(name: &str, reports: &[Kept]) -> Option<Self> {
+    fn of(name: &str, reports: &[ReportRecord]) -> Option<Self> {
         let number: u64 = name.strip_prefix("rescue-")?.parse().ok()?;
         let mut reports = reports.iter().map(|kept| &kept.report);
         let report = reports.find(|report| report.number == number)?;

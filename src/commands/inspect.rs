@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, fmt};
 use serde::Serialize;
 
 use super::{
-    Exit, Failure,
+    CommandFailure, Exit,
     files::{self, Opened, size},
     print,
 };
@@ -18,7 +18,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-pub(super) async fn run(args: &InspectArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &InspectArgs) -> Result<Exit, CommandFailure> {
     let present;
     let file = match &args.file {
         Some(file) => file,

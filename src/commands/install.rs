@@ -17,10 +17,10 @@ use std::{
 use clap::{CommandFactory, FromArgMatches};
 use serde::Serialize;
 
-use self::units::{MARK, Robot};
+use self::units::{MARK, UnitSettings};
 use super::{
-    Exit, Failure,
-    check::units::{self as others, Kind},
+    CommandFailure, Exit,
+    check::units::{self as others, UnitKind},
     print,
 };
 use crate::{
@@ -60,12 +60,12 @@ struct Plan {
     obstacles: Vec<String>,
 }
 
-pub(super) async fn run(args: &InstallArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
     carry_out(&install(args, &place)?, &place, &args.scope)
 }
 
-pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, Failure> {
+pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
     carry_out(&uninstall(&place), &place, &args.scope)
 }
@@ -78,21 +78,22 @@ struct Place {
 }
 
 impl Place {
-    fn of(args: &ScopeArgs) -> Result<Self, Failure> {
+    fn of(args: &ScopeArgs) -> Result<Self, CommandFailure> {
         let (user, units) = (args.user, PathBuf::from("/etc/systemd/system"));
         if !user {
             return Ok(Self { user, units });
         }
         if rustix::process::geteuid().is_root() && std::env::var_os("SUDO_USER").is_some() {
             let text = "--user: run it as yourself, without sudo";
-            return Err(Failure::Usage(text.to_owned()));
+            return Err(CommandFailure::Usage(text.to_owned()));
         }
         let folder = |name: &str| {
             let folder = std::env::var_os(name).map(PathBuf::from);
             folder.filter(|folder| folder.is_absolute())
         };
         let config = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
-        let config = config.ok_or_else(|| Failure::Usage("--user: HOME is not set".to_owned()))?;
+        let config =
+            config.ok_or_else(|| CommandFailure::Usage("--user: HOME is not set".to_owned()))?;
         let units = config.join("systemd/user");
         Ok(Self { user, units })
     }
@@ -145,7 +146,7 @@ impl Place {
     }
 }
 
-fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
+fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -168,14 +169,15 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
         if !on_path(caller.get("PATH").map_or("", String::as_str)) {
             let text = "found no rosmaster on the PATH or in /opt/ros: install ROS 1 or source its setup.bash, then \
                         run this again";
-            return Err(Failure::Failed(text.to_owned()));
+            return Err(CommandFailure::Failed(text.to_owned()));
         }
         settings.extend(given(&PATHS));
     }
     let run_as = account(args, place, &caller)?;
     let program = std::env::current_exe();
-    let program = program
-        .map_err(|error| Failure::Failed(format!("cannot find this program's file: {error}")))?;
+    let program = program.map_err(|error| {
+        CommandFailure::Failed(format!("cannot find this program's file: {error}"))
+    })?;
 
     let mut plan = Plan::default();
     if let Some(user) = &run_as
@@ -194,7 +196,7 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
         files.each_ref().map(|path| fs::read_to_string(path).ok());
     let old = dropin.unwrap_or_default();
     let all_disabled = [&disabled[..], &units::disabled(&old)].concat();
-    let robot = Robot {
+    let robot = UnitSettings {
         program: &program,
         command,
         run_as: run_as.as_deref(),
@@ -293,7 +295,7 @@ fn uninstall(place: &Place) -> Plan {
 }
 
 /// Shows the plan, asks, and makes the changes.
-fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Failure> {
+fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
     if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
         print(plan, &args.output)?;
         return Ok(if plan.obstacles.is_empty() {
@@ -304,7 +306,7 @@ fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Failu
     }
     if !place.user && !rustix::process::geteuid().is_root() {
         let words: Vec<_> = std::env::args().skip(1).collect();
-        return Err(Failure::Usage(format!(
+        return Err(CommandFailure::Usage(format!(
             "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
             words.join(" ")
         )));
@@ -313,14 +315,14 @@ fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Failu
         print(plan, &args.output)?;
     } else if args.output.json || !io::stdin().is_terminal() {
         let text = "cannot ask here: look at the changes with --dry-run, then make them with --yes";
-        return Err(Failure::Usage(text.to_owned()));
+        return Err(CommandFailure::Usage(text.to_owned()));
     } else {
         eprint!("{plan}\nMake these changes? [y/N] ");
         let _ = io::stderr().flush();
         let mut answer = String::new();
         let _ = io::stdin().read_line(&mut answer);
         if !["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
-            return Err(Failure::Failed("changed nothing".to_owned()));
+            return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
     }
     for change in &plan.changes {
@@ -341,24 +343,24 @@ impl Plan {
         let all = place.other_units().into_iter();
         for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {
             match kind {
-                Kind::Roscore if !service.runs_rosmaster => self.obstacles.push(format!(
+                UnitKind::Roscore if !service.runs_rosmaster => self.obstacles.push(format!(
                     "{name} starts a master at port 11311, which rosrescue needs: give the master another port, as \
                      in `rosmaster --core -p 11312`, then run this again"
                 )),
-                Kind::Roscore => {
+                UnitKind::Roscore => {
                     self.notes.push(format!(
                         "{name} starts a master: rosrescue replaces it, and uninstall enables it again"
                     ));
                     disabled.push(name);
                 }
-                Kind::Roslaunch => {
+                UnitKind::Roslaunch => {
                     self.notes.push(format!(
                         "{name} runs roslaunch. It will start after rosrescue. Add `--wait` to its roslaunch, so \
                          that it never starts a master (robot_upstart: `rosrun robot_upstart install --wait …`)"
                     ));
                     before.push(name);
                 }
-                Kind::Rosrescue => {}
+                UnitKind::Rosrescue => {}
             }
         }
         (disabled, before)
@@ -395,13 +397,13 @@ impl Plan {
 }
 
 impl Change {
-    fn make(&self) -> Result<(), Failure> {
+    fn make(&self) -> Result<(), CommandFailure> {
         match self {
             Self::Write { path, text } => {
                 let folder = path.parent().unwrap_or(path);
                 let written = fs::create_dir_all(folder).and_then(|()| fs::write(path, text));
                 written.map_err(|error| {
-                    Failure::Failed(format!("cannot write {}: {error}", path.display()))
+                    CommandFailure::Failed(format!("cannot write {}: {error}", path.display()))
                 })
             }
             Self::Remove { path } => {
@@ -414,18 +416,18 @@ impl Change {
                     let _ = fs::remove_dir(folder);
                 }
                 removed.map_err(|error| {
-                    Failure::Failed(format!("cannot remove {}: {error}", path.display()))
+                    CommandFailure::Failed(format!("cannot remove {}: {error}", path.display()))
                 })
             }
             Self::Run { command } => {
                 let said = command.join(" ");
                 match run_command(command, Stdio::inherit()) {
                     Ok(status) if status.success() => Ok(()),
-                    Ok(status) => Err(Failure::Failed(format!(
+                    Ok(status) => Err(CommandFailure::Failed(format!(
                         "`{said}` failed ({status}): see above, or `journalctl -u rosrescue`. `rosrescue uninstall` \
                          undoes what was done"
                     ))),
-                    Err(error) => Err(Failure::Failed(format!("`{said}`: {error}"))),
+                    Err(error) => Err(CommandFailure::Failed(format!("`{said}`: {error}"))),
                 }
             }
         }
@@ -496,13 +498,13 @@ fn named_user(args: &InstallArgs, caller: &BTreeMap<String, String>) -> Option<S
 }
 
 /// The name of the user who runs this process.
-fn own_name() -> Result<String, Failure> {
+fn own_name() -> Result<String, CommandFailure> {
     let output = system::Command::new("id").arg("-un").output();
     let name = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
-    let name = name.map_err(|error| Failure::Failed(format!("id: {error}")))?;
+    let name = name.map_err(|error| CommandFailure::Failed(format!("id: {error}")))?;
     Some(name)
         .filter(|name| !name.is_empty())
-        .ok_or_else(|| Failure::Failed("this user has no name: use --run-as".to_owned()))
+        .ok_or_else(|| CommandFailure::Failed("this user has no name: use --run-as".to_owned()))
 }
 
 /// The user that runs the service. `None` for a user's own service. A dry run needs no sudo.
@@ -510,21 +512,21 @@ fn account(
     args: &InstallArgs,
     place: &Place,
     caller: &BTreeMap<String, String>,
-) -> Result<Option<String>, Failure> {
+) -> Result<Option<String>, CommandFailure> {
     if place.user {
         return Ok(None);
     }
     let Some(user) = named_user(args, caller) else {
         return match args.scope.dry_run {
             true => own_name().map(Some),
-            false => Err(Failure::Usage(
+            false => Err(CommandFailure::Usage(
                 "name the user that runs the service, as in --run-as robot: without sudo, install cannot know it"
                     .to_owned(),
             )),
         };
     };
     let nobody = || {
-        Failure::Usage(format!(
+        CommandFailure::Usage(format!(
             "--run-as: there is no user `{user}` on this computer"
         ))
     };
@@ -533,7 +535,7 @@ fn account(
     }
     let getent = ["getent", "passwd", &user].map(str::to_owned);
     let status = run_command(&getent, Stdio::null());
-    let status = status.map_err(|error| Failure::Failed(format!("getent: {error}")))?;
+    let status = status.map_err(|error| CommandFailure::Failed(format!("getent: {error}")))?;
     status
         .success()
         .then_some(Some(user.clone()))
@@ -563,8 +565,11 @@ struct Service {
 }
 
 /// Parses a service's command. The service gets none of the caller's ROSRESCUE_ variables.
-fn read_service(words: &[String], settings: &BTreeMap<String, String>) -> Result<Service, Failure> {
-    let usage = |why: String| Failure::Usage(format!("`{}`: {why}", words.join(" ")));
+fn read_service(
+    words: &[String],
+    settings: &BTreeMap<String, String>,
+) -> Result<Service, CommandFailure> {
+    let usage = |why: String| CommandFailure::Usage(format!("`{}`: {why}", words.join(" ")));
     let command = Cli::command()
         .mut_args(|option| option.env(None::<&str>))
         .mut_subcommands(|command| command.mut_args(|option| option.env(None::<&str>)));

@@ -5,7 +5,7 @@ use std::{fmt::Display, time::Duration};
 use hyper::header::HeaderValue;
 use tokio::{net::TcpStream, time::timeout};
 
-use super::{Failure, running::Running};
+use super::{CommandFailure, running::Running};
 use crate::{
     master::{Master, Request},
     replay::Token,
@@ -28,10 +28,10 @@ pub(super) struct Live {
 }
 
 impl Live {
-    pub(super) async fn connect(running: &Running) -> Result<Self, Failure> {
+    pub(super) async fn connect(running: &Running) -> Result<Self, CommandFailure> {
         let address = &running.address;
         let uri = address.to_string();
-        let nobody = |why: String| Failure::Nobody {
+        let nobody = |why: String| CommandFailure::Nobody {
             uri: uri.clone(),
             why,
         };
@@ -45,7 +45,7 @@ impl Live {
             Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,
             // The backlog of a stopped rosrescue is full, so it accepts no connection.
             Err(_) => {
-                return Err(Failure::Silent {
+                return Err(CommandFailure::Silent {
                     uri,
                     why: format!("no connection in {} s", CONNECT_LIMIT.as_secs()),
                 });
@@ -56,12 +56,13 @@ impl Live {
 
     /// Reads the master's state. Parameter subscriptions cannot be read. They are taken from `previous` for nodes whose
     /// address is the same.
-    pub(super) async fn state(&mut self, previous: &Master) -> Result<Master, Failure> {
+    pub(super) async fn state(&mut self, previous: &Master) -> Result<Master, CommandFailure> {
         // No master has this token.
         let token = Token::new("", 0);
         let uri = self.uri.clone();
-        let failed =
-            |why: &dyn Display| Failure::Failed(format!("cannot read the master at {uri}: {why}"));
+        let failed = |why: &dyn Display| {
+            CommandFailure::Failed(format!("cannot read the master at {uri}: {why}"))
+        };
         let read = async {
             let first = inspect::first(&mut self.connection, &token).await;
             let first = first.map_err(|error| failed(&error))?;
@@ -82,10 +83,11 @@ impl Live {
     pub(super) async fn make(
         &mut self,
         calls: Vec<Request>,
-    ) -> Result<Vec<Option<String>>, Failure> {
+    ) -> Result<Vec<Option<String>>, CommandFailure> {
         let count = calls.len();
-        let failed =
-            |why: String| Failure::Failed(format!("the calls to {} failed: {why}", self.uri));
+        let failed = |why: String| {
+            CommandFailure::Failed(format!("the calls to {} failed: {why}", self.uri))
+        };
         let call = Request::multicall(calls).into();
         let reply = timeout(ANSWER_LIMIT, self.connection.call(&call)).await;
         let reply =
@@ -137,6 +139,6 @@ mod tests {
             port: address.port(),
         };
         let connected = Live::connect(&Running { address }).await;
-        assert!(matches!(connected, Err(Failure::Silent { .. })));
+        assert!(matches!(connected, Err(CommandFailure::Silent { .. })));
     }
 }

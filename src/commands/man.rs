@@ -4,10 +4,10 @@ use std::fs;
 
 use clap::CommandFactory;
 
-use super::{Exit, Failure, print_line};
+use super::{CommandFailure, Exit, print_line};
 use crate::cli::{Cli, ManArgs};
 
-pub(super) async fn run(args: &ManArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &ManArgs) -> Result<Exit, CommandFailure> {
     let mut command = Cli::command();
     // Gives the pages names such as `rosrescue-core`.
     command.build();
@@ -15,13 +15,15 @@ pub(super) async fn run(args: &ManArgs) -> Result<Exit, Failure> {
         None => {
             let mut page = Vec::new();
             let written = clap_mangen::Man::new(command).render(&mut page);
-            written.map_err(|error| Failure::Failed(format!("no page: {error}")))?;
+            written.map_err(|error| CommandFailure::Failed(format!("no page: {error}")))?;
             print_line(String::from_utf8_lossy(&page).trim_end())?;
         }
         Some(folder) => {
             let written =
                 fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(command, folder));
-            written.map_err(|error| Failure::Failed(format!("{}: {error}", folder.display())))?;
+            written.map_err(|error| {
+                CommandFailure::Failed(format!("{}: {error}", folder.display()))
+            })?;
         }
     }
     Ok(Exit::Good)

@@ -7,7 +7,7 @@ use std::{
 
 use serde::Serialize;
 
-use super::{Exit, Failure, files, print};
+use super::{CommandFailure, Exit, files, print};
 use crate::{
     checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
     cli::ParamsArgs,
@@ -15,7 +15,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {
     let opened = files::read(&args.file, &args.read).await?;
     let mut tree = opened.state.params().clone();
     let mut left_out = Vec::new();
@@ -31,11 +31,11 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
             }
         }
         let (yaml, not_carried) =
-            for_rosparam(&tree).map_err(|error| Failure::Failed(error.to_string()))?;
+            for_rosparam(&tree).map_err(|error| CommandFailure::Failed(error.to_string()))?;
         left_out.extend(not_carried);
         match io::stdout().write_all(&yaml) {
             Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-                return Err(Failure::Failed(format!("cannot print: {error}")));
+                return Err(CommandFailure::Failed(format!("cannot print: {error}")));
             }
             _ => {}
         }

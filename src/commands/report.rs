@@ -1,9 +1,9 @@
 //! `rosrescue report`: prints the report of a rescue, from the files beside the checkpoint.
 
-use super::{Exit, Failure, files, print};
+use super::{CommandFailure, Exit, files, print};
 use crate::{cli::ReportArgs, recovery::report_file};
 
-pub(super) async fn run(args: &ReportArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &ReportArgs) -> Result<Exit, CommandFailure> {
     let present = files::present(&args.place).await;
     let mut reports: Vec<_> = report_file::read(&present)
         .into_iter()
@@ -18,7 +18,7 @@ pub(super) async fn run(args: &ReportArgs) -> Result<Exit, Failure> {
             .iter()
             .map(|report| report.number.to_string())
             .collect();
-        return Err(Failure::Failed(match numbers.as_slice() {
+        return Err(CommandFailure::Failed(match numbers.as_slice() {
             [] => format!("there is no report beside {}", present.display()),
             all => format!(
                 "there is no report of that rescue; there are {}",

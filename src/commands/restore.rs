@@ -9,11 +9,11 @@ use std::{
 
 use serde::Serialize;
 
-use super::{Exit, Failure, files, live::Live, print, running::Running};
+use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
 use crate::{
     checkpoint::{
         format::shown,
-        putback::{LeftOut, Params},
+        putback::{LeftOut, ParamChanges},
     },
     cli::RestoreArgs,
     hide::Hide,
@@ -26,11 +26,11 @@ use crate::{
 const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 
-pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
     let file = files::read(&args.file, &args.read).await?;
     let mut live = Live::connect(&Running::find(&args.target)?).await?;
     let now = live.state(&file.state).await?;
-    let params = Params::between(file.state.params(), now.params(), args.exact);
+    let params = ParamChanges::between(file.state.params(), now.params(), args.exact);
     let mut restored = Restored {
         file: file.path.display().to_string(),
         master: live.uri.clone(),
@@ -45,13 +45,13 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
     }
     if does {
         if !(args.yes || agreed(json)?) {
-            return Err(Failure::Failed("changed nothing".to_owned()));
+            return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
         restored.failed = set(&params, &mut live).await?;
         // If the master refused calls, its messages explain the rest.
         if restored.failed.is_empty() {
             let now = live.state(&file.state).await?;
-            let left = Params::between(file.state.params(), now.params(), args.exact);
+            let left = ParamChanges::between(file.state.params(), now.params(), args.exact);
             let changed = left
                 .set
                 .iter()
@@ -78,21 +78,21 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
 }
 
 /// Asks at the terminal. Fails without asking if the output is `json`.
-fn agreed(json: bool) -> Result<bool, Failure> {
+fn agreed(json: bool) -> Result<bool, CommandFailure> {
     if json || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         let why = "cannot ask here: --plan shows the changes, --yes makes them";
-        return Err(Failure::Usage(why.to_owned()));
+        return Err(CommandFailure::Usage(why.to_owned()));
     }
     eprint!("Set these parameters? [y/N] ");
     let _ = io::stderr().flush();
     let mut answer = String::new();
     let read = io::stdin().read_line(&mut answer);
-    read.map_err(|error| Failure::Failed(format!("no answer: {error}")))?;
+    read.map_err(|error| CommandFailure::Failed(format!("no answer: {error}")))?;
     Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
 }
 
 /// Sets and deletes parameters. Returns the refused calls with their reasons.
-async fn set(params: &Params, live: &mut Live) -> Result<Vec<String>, Failure> {
+async fn set(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, CommandFailure> {
     let set = params.set.iter().map(|(name, _, value)| {
         let params = [Value::from(CALLER_ID), name.as_str().into(), value.clone()];
         let call = Request::new(Method::SetParam, params);
@@ -146,7 +146,7 @@ struct Plan {
 }
 
 impl Plan {
-    fn of(params: &Params, hide: &Hide) -> Self {
+    fn of(params: &ParamChanges, hide: &Hide) -> Self {
         let set = params.set.iter().map(|(name, was, is)| Set {
             name: name.clone(),
             from: was.as_ref().map(|was| shown(&hide.mask(name, was))),

@@ -16,7 +16,7 @@ use tokio::{
     time::{Instant, timeout, timeout_at},
 };
 
-use super::Failure;
+use super::CommandFailure;
 use crate::{
     cli::TargetArgs,
     resolver,
@@ -38,9 +38,10 @@ pub(super) struct Running {
 
 impl Running {
     /// The rosrescue that `target` stands for.
-    pub(super) fn find(target: &TargetArgs) -> Result<Self, Failure> {
+    pub(super) fn find(target: &TargetArgs) -> Result<Self, CommandFailure> {
         let of = |variable: &str, uri: &str| {
-            MasterUri::parse(uri).map_err(|error| Failure::Usage(format!("{variable}: {error}")))
+            MasterUri::parse(uri)
+                .map_err(|error| CommandFailure::Usage(format!("{variable}: {error}")))
         };
         let address = match (&target.uri, std::env::var("ROS_MASTER_URI")) {
             (Some(uri), _) => of("--uri", uri)?,
@@ -54,7 +55,7 @@ impl Running {
     }
 
     /// Gets the page at `path`.
-    pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), Failure> {
+    pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), CommandFailure> {
         let request = Request::get(path)
             .header(HOST, self.address.authority())
             .header(ACCEPT, "text/plain, application/json");
@@ -63,7 +64,7 @@ impl Running {
     }
 
     /// Gets the status.
-    pub(super) async fn status(&self) -> Result<Status, Failure> {
+    pub(super) async fn status(&self) -> Result<Status, CommandFailure> {
         /// The field that all versions have.
         #[derive(Deserialize)]
         struct Versioned {
@@ -77,14 +78,15 @@ impl Running {
         })?;
         let Versioned { schema, version } = versioned;
         if schema > SCHEMA {
-            return Err(Failure::Failed(format!(
+            return Err(CommandFailure::Failed(format!(
                 "the rosrescue at {at} is version {version}, newer than this one ({}): use its own \
                  command",
                 env!("CARGO_PKG_VERSION")
             )));
         }
-        serde_json::from_slice(&json)
-            .map_err(|error| Failure::Failed(format!("cannot read the status of {at}: {error}")))
+        serde_json::from_slice(&json).map_err(|error| {
+            CommandFailure::Failed(format!("cannot read the status of {at}: {error}"))
+        })
     }
 
     /// Makes a call within `limit`, and returns the answer.
@@ -93,7 +95,7 @@ impl Running {
         method: &str,
         params: Vec<Value>,
         limit: Duration,
-    ) -> Result<Reply, Failure> {
+    ) -> Result<Reply, CommandFailure> {
         let body = xmlrpc::encode_call(&Call::new(method, params));
         let request = Request::post("/RPC2")
             .header(CONTENT_TYPE, "text/xml")
@@ -105,8 +107,8 @@ impl Running {
             .map_err(|error| self.nobody(format!("it gives no answer to calls: {error}")))
     }
 
-    fn nobody(&self, why: String) -> Failure {
-        Failure::Nobody {
+    fn nobody(&self, why: String) -> CommandFailure {
+        CommandFailure::Nobody {
             uri: self.address.to_string(),
             why,
         }
@@ -116,7 +118,7 @@ impl Running {
         &self,
         request: hyper::http::Result<Request<Full<Bytes>>>,
         limit: Duration,
-    ) -> Result<(StatusCode, Bytes), Failure> {
+    ) -> Result<(StatusCode, Bytes), CommandFailure> {
         let deadline = Instant::now() + limit;
         let connect = async {
             let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
@@ -132,8 +134,8 @@ impl Running {
         }
     }
 
-    fn silent(&self, why: String) -> Failure {
-        Failure::Silent {
+    fn silent(&self, why: String) -> CommandFailure {
+        CommandFailure::Silent {
             uri: self.address.to_string(),
             why,
         }

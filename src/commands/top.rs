@@ -13,7 +13,7 @@ use tokio::{
 };
 
 use super::{
-    Exit, Failure, plain, plain_json, print_line,
+    CommandFailure, Exit, plain, plain_json, print_line,
     running::Running,
     terminal::{self, Terminal},
 };
@@ -239,7 +239,7 @@ impl fmt::Display for Top {
 struct Ends(Vec<Signal>);
 
 impl Ends {
-    fn new() -> Result<Self, Failure> {
+    fn new() -> Result<Self, CommandFailure> {
         let kinds = [
             SignalKind::interrupt(),
             SignalKind::terminate(),
@@ -248,7 +248,7 @@ impl Ends {
         let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>();
         signals
             .map(Self)
-            .map_err(|error| Failure::Failed(format!("no signals: {error}")))
+            .map_err(|error| CommandFailure::Failed(format!("no signals: {error}")))
     }
 
     async fn come(&mut self) {
@@ -263,7 +263,7 @@ impl Ends {
     }
 }
 
-pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
     // Before the terminal is taken over, so that an error is printed normally.
     let mut status = running.status().await;
@@ -272,7 +272,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
     }
     let mut ends = Ends::new()?;
     let mut resized = signal(SignalKind::window_change())
-        .map_err(|error| Failure::Failed(format!("no signals: {error}")))?;
+        .map_err(|error| CommandFailure::Failed(format!("no signals: {error}")))?;
     let terminal = match args.json {
         true => None,
         false => Terminal::enter(),
@@ -298,7 +298,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
                 shown = match args.json {
                     true => serde_json::to_string(&top)
                         .map(|json| plain_json(&json))
-                        .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?,
+                        .map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?,
                     false => plain(&top.to_string()),
                 };
                 None

@@ -4,10 +4,10 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::{Exit, Failure, files, print};
+use super::{CommandFailure, Exit, files, print};
 use crate::{cli::VerifyArgs, master::Counts};
 
-pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, CommandFailure> {
     let opened = files::open(&files::find(&args.file, &args.place).await?)?;
     let verified = Verified {
         file: opened.path.display().to_string(),

@@ -6,13 +6,13 @@ use serde::Serialize;
 use tokio::time::{Instant, sleep_until};
 
 use super::{
-    Exit, Failure, print,
+    CommandFailure, Exit, print,
     running::{ANSWER_LIMIT, Running},
 };
 use crate::{
     cli::{For, WaitArgs},
     master::Method,
-    status::{condition::Name, summary::Status},
+    status::{condition::ConditionName, summary::Status},
     xmlrpc::{Reply, Value},
 };
 
@@ -46,7 +46,7 @@ impl fmt::Display for Waited {
     }
 }
 
-pub(super) async fn run(args: &WaitArgs) -> Result<Exit, Failure> {
+pub(super) async fn run(args: &WaitArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
     let start = Instant::now();
     let deadline = (args.timeout > 0.0)
@@ -87,11 +87,11 @@ pub(super) async fn run(args: &WaitArgs) -> Result<Exit, Failure> {
 async fn missing(
     running: &Running,
     wanted: &[For],
-) -> Result<(Vec<String>, Option<String>), Failure> {
+) -> Result<(Vec<String>, Option<String>), CommandFailure> {
     let all = || wanted.iter().map(ToString::to_string).collect();
     let status = match running.status().await {
         Ok(status) => status,
-        Err(nobody @ (Failure::Nobody { .. } | Failure::Silent { .. })) => {
+        Err(nobody @ (CommandFailure::Nobody { .. } | CommandFailure::Silent { .. })) => {
             return Ok((all(), Some(nobody.to_string())));
         }
         Err(failure) => return Err(failure),
@@ -109,7 +109,7 @@ async fn missing(
 async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
     match wanted {
         For::Answered => status.ready,
-        For::Master => status.open || status.condition.name == Name::Following,
+        For::Master => status.open || status.condition.name == ConditionName::Following,
         For::Protected => status.condition.is_protected(),
         For::Node(name) => {
             let params = ["/rosrescue_wait", name].map(Value::from);

@@ -46,7 +46,7 @@ impl fmt::Display for End {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Next {
+pub enum NextStart {
     /// rosrescue ends with this status.
     Exit(i32),
     /// Another worker is started.
@@ -96,7 +96,7 @@ impl Restarts {
     /// Before any worker has answered calls, an exit status is an error of the start, such as a missing rosmaster.
     /// Later the same error may be temporary. A worker that has answered calls is replaced at once, because calls wait.
     /// Only workers that fail earlier could keep the processor busy without use, so they are delayed.
-    pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
+    pub fn ended(&mut self, end: End, served: bool, now: Instant) -> NextStart {
         self.served |= served;
         self.failures = match served {
             true => 0,
@@ -105,15 +105,15 @@ impl Restarts {
         match end {
             _ if self.died_stopping(end) && !self.cleaning => {
                 self.cleaning = true;
-                Next::Restart {
+                NextStart::Restart {
                     pause: Duration::ZERO,
                     again_and_again: false,
                 }
             }
-            _ if self.stop.is_some() => Next::Exit(end.status()),
-            End::Code(0) => Next::Exit(0),
-            End::Code(code) if code != PANIC && !self.served => Next::Exit(code),
-            _ => Next::Restart {
+            _ if self.stop.is_some() => NextStart::Exit(end.status()),
+            End::Code(0) => NextStart::Exit(0),
+            End::Code(code) if code != PANIC && !self.served => NextStart::Exit(code),
+            _ => NextStart::Restart {
                 pause: self.pause(),
                 again_and_again: self.died(now) > AT_ONCE,
             },
@@ -146,7 +146,7 @@ mod tests {
 
     const KILLED: End = End::Signal(9);
 
-    const AT_ONCE: Next = Next::Restart {
+    const AT_ONCE: NextStart = NextStart::Restart {
         pause: Duration::ZERO,
         again_and_again: false,
     };
@@ -156,8 +156,8 @@ mod tests {
         let mut restarts = Restarts::default();
         let now = Instant::now();
         let mut die = |served| match restarts.ended(KILLED, served, now) {
-            Next::Restart { pause, .. } => pause.as_millis(),
-            Next::Exit(status) => panic!("exit {status}"),
+            NextStart::Restart { pause, .. } => pause.as_millis(),
+            NextStart::Exit(status) => panic!("exit {status}"),
         };
         let pauses: Vec<_> = (0..12).map(|_| die(false)).collect();
         let expected = [0, 0, 0, 0, 0, 500, 1000, 2000, 4000, 8000, 10_000, 10_000];
@@ -171,11 +171,11 @@ mod tests {
         let mut restarts = Restarts::default();
         let start = Instant::now();
         let mut die = |at| match restarts.ended(KILLED, true, start + Duration::from_secs(at)) {
-            Next::Restart {
+            NextStart::Restart {
                 pause,
                 again_and_again,
             } => (pause.is_zero(), again_and_again),
-            Next::Exit(status) => panic!("exit {status}"),
+            NextStart::Exit(status) => panic!("exit {status}"),
         };
         // This takes longer than a minute.
         for number in 0..40 {
@@ -188,11 +188,11 @@ mod tests {
     fn errors_of_the_start_end_it_and_later_ones_do_not() {
         let now = Instant::now();
         let mut restarts = Restarts::default();
-        assert_eq!(restarts.ended(End::Code(1), false, now), Next::Exit(1));
+        assert_eq!(restarts.ended(End::Code(1), false, now), NextStart::Exit(1));
         assert_eq!(restarts.ended(KILLED, false, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(PANIC), false, now), AT_ONCE);
         // No worker has answered calls yet.
-        assert_eq!(restarts.ended(End::Code(2), false, now), Next::Exit(2));
+        assert_eq!(restarts.ended(End::Code(2), false, now), NextStart::Exit(2));
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(1), false, now), AT_ONCE);
     }
@@ -201,23 +201,23 @@ mod tests {
     fn a_stop_ends_it_with_the_status_of_the_worker() {
         let now = Instant::now();
         let mut restarts = Restarts::default();
-        assert_eq!(restarts.ended(End::Code(0), true, now), Next::Exit(0));
+        assert_eq!(restarts.ended(End::Code(0), true, now), NextStart::Exit(0));
         restarts.stop(15);
         for (end, status) in [
             (End::Code(0), 0),
             (End::Code(130), 130),
             (End::Signal(15), 143),
         ] {
-            assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
+            assert_eq!(restarts.ended(end, true, now), NextStart::Exit(status));
         }
         // The worker that was to stop has left its master running. So may its successor, but only
         // once.
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
-        assert_eq!(restarts.ended(KILLED, true, now), Next::Exit(137));
+        assert_eq!(restarts.ended(KILLED, true, now), NextStart::Exit(137));
         let mut restarts = Restarts::default();
         restarts.stop(15);
         let panicked = End::Code(PANIC);
         assert_eq!(restarts.ended(panicked, true, now), AT_ONCE);
-        assert_eq!(restarts.ended(panicked, true, now), Next::Exit(PANIC));
+        assert_eq!(restarts.ended(panicked, true, now), NextStart::Exit(PANIC));
     }
 }

@@ -28,7 +28,7 @@ const NODES: usize = 1024;
 
 /// A change for which a master may send a late notification.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Change {
+pub enum NotifyingChange {
     /// The publishers of a topic changed.
     Topic(String),
     /// A parameter changed, for the subscriber at an address. The key ends in a slash.
@@ -48,11 +48,11 @@ pub struct Owed {
 
 /// Notifications collected since the outbox was last taken.
 #[derive(Debug, Default)]
-pub struct Outbox {
+pub struct OwedNotifications {
     /// Nodes that must shut down because another node has their name.
     pub displaced: Vec<Displaced>,
     /// Changes that a master also sends notifications for, perhaps late.
-    pub changes: IndexSet<Change>,
+    pub changes: IndexSet<NotifyingChange>,
 }
 
 /// Numbers of the last calls that changed a node's registrations. Numbers only grow, so an equal number means no
@@ -114,7 +114,7 @@ pub struct Activity {
     restored: Vec<Displaced>,
     /// Whether changes are collected that a master notifies nodes of.
     notifying: bool,
-    outbox: Outbox,
+    outbox: OwedNotifications,
 }
 
 /// A notification that rosrescue must send because there is no master: receiver, subject, and call.
@@ -216,7 +216,7 @@ impl Activity {
         let before = outbox.len();
         for topic in noticed.topics {
             if notifying && outbox.changes.len() < NOTICES {
-                outbox.changes.insert(Change::Topic(topic.clone()));
+                outbox.changes.insert(NotifyingChange::Topic(topic.clone()));
             }
             self.topics.insert(topic, noted);
         }
@@ -224,7 +224,7 @@ impl Activity {
             if notifying && outbox.changes.len() < NOTICES {
                 outbox
                     .changes
-                    .insert(Change::Param(to.clone(), key.clone()));
+                    .insert(NotifyingChange::Param(to.clone(), key.clone()));
             }
             self.params.insert((to, key), noted);
         }
@@ -370,7 +370,7 @@ impl Activity {
         std::mem::replace(&mut self.notifying, notifying) != notifying
     }
 
-    pub fn take_outbox(&mut self) -> Outbox {
+    pub fn take_outbox(&mut self) -> OwedNotifications {
         std::mem::take(&mut self.outbox)
     }
 
@@ -411,9 +411,9 @@ impl Activity {
     pub fn repeat_changes(&mut self, now: Instant) {
         let recent = |noted: &Noted| is_recent(noted.at, now);
         let topics = self.topics.iter().filter(|(_, noted)| recent(noted));
-        let topics = topics.map(|(topic, _)| Change::Topic(topic.clone()));
+        let topics = topics.map(|(topic, _)| NotifyingChange::Topic(topic.clone()));
         let params = self.params.iter().filter(|(_, noted)| recent(noted));
-        let params = params.map(|((api, key), _)| Change::Param(api.clone(), key.clone()));
+        let params = params.map(|((api, key), _)| NotifyingChange::Param(api.clone(), key.clone()));
         self.outbox.changes.extend(topics.chain(params));
     }
 
@@ -459,7 +459,7 @@ impl Activity {
     }
 }
 
-impl Outbox {
+impl OwedNotifications {
     fn len(&self) -> usize {
         self.displaced.len() + self.changes.len()
     }

@@ -2,10 +2,11 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::{Ledger, Mark, Source, delivery::Delivery};
+use super::{Ledger, Mark, delivery::Delivery};
 use crate::{
-    checkpoint::format::Entry,
-    master::{Kind, Method, Request},
+    checkpoint::format::RecordContent,
+    cluster::sharing::Source,
+    master::{Kind, Method, Request, is_success},
     order::Concern,
     replay,
     xmlrpc::{Reply, Value},
@@ -82,6 +83,17 @@ impl Ledger {
         drop(inner);
         let delivery = number.map(|number| Delivery::new(self, number));
         (!refused).then_some((reply, mark, delivery))
+    }
+
+    /// The answer to a parameter subscription that exists already, on any computer. Only the node itself ends it, so
+    /// the call changes nothing for the leader either.
+    pub(crate) fn answer_if_subscribed(&self, call: &Request) -> Option<Reply> {
+        let mirror = &mut self.lock().mirror;
+        let there = *call.method() == Method::SubscribeParam
+            && !mirror.would_change(call)
+            && mirror.fits(call, ANSWER_MOST);
+        let reply = there.then(|| mirror.apply_telling(call, &mut ()))?;
+        is_success(&reply).then_some(reply)
     }
 
     /// The master's predicted answer to this call.
@@ -166,7 +178,7 @@ impl Ledger {
         // Outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
-        let entries = writes.iter().map(|&call| Entry::Call {
+        let entries = writes.iter().map(|&call| RecordContent::Call {
             call: call.clone().into(),
             pending: true,
         });

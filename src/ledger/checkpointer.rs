@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{
     Ledger,
-    journal::{DISK_PATIENCE, Seen},
+    journal::{DISK_PATIENCE, StoreState},
 };
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
@@ -191,7 +191,7 @@ impl Checkpointer {
         let Some(seen) = self.ledger.seen_store() else {
             return false;
         };
-        let Seen {
+        let StoreState {
             seq, journal_bytes, ..
         } = seen;
         let unprotected = seen.unprotected.is_some();

@@ -8,7 +8,7 @@ use tokio::sync::watch;
 use super::{Inner, Ledger};
 use crate::{
     master::{Master, Request},
-    order::{Next, Order, heard_by_read},
+    order::{NextNotification, Order, heard_by_read},
 };
 
 /// An answer on its way to its caller. It is dropped once it was written or cannot be written any more.
@@ -121,7 +121,7 @@ impl Ledger {
     }
 
     /// The next notification for the node at `port`, or how long to wait for it.
-    pub(crate) fn next_notification(&self, port: &str) -> Next {
+    pub(crate) fn next_notification(&self, port: &str) -> NextNotification {
         self.with_order(|order, mirror| order.next(Instant::now(), port, mirror))
     }
 

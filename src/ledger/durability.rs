@@ -13,7 +13,7 @@ use tokio::{
 
 use super::{
     Inner, Ledger,
-    journal::{self, DISK_PATIENCE, Journal, SILENT, Seen},
+    journal::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
     shared::Agreed,
 };
 use crate::checkpoint::{
@@ -108,7 +108,7 @@ impl Ledger {
         }
     }
 
-    fn worker(&self) -> Option<Arc<journal::Shared>> {
+    fn worker(&self) -> Option<Arc<journal::StoreQueue>> {
         self.lock().journal.as_ref().map(Journal::worker)
     }
 
@@ -186,7 +186,7 @@ impl Ledger {
     }
 
     /// The store's state after its last job. `None` without a store.
-    pub(crate) fn seen_store(&self) -> Option<Seen> {
+    pub(crate) fn seen_store(&self) -> Option<StoreState> {
         Some(self.lock().journal.as_ref()?.seen())
     }
 

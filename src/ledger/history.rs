@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::{Ledger, journal::Seen};
+use super::{Ledger, journal::StoreState};
 use crate::{checkpoint::store::history, limit::Limit};
 
 pub(crate) struct Rescues {
@@ -31,8 +31,9 @@ impl Rescues {
             return;
         }
         // Spares a full or broken disk unnecessary writes.
-        let fits = |store: &Seen| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
-        let Some(Seen { path, .. }) = self.ledger.seen_store().filter(fits) else {
+        let fits =
+            |store: &StoreState| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
+        let Some(StoreState { path, .. }) = self.ledger.seen_store().filter(fits) else {
             tracing::debug!(
                 "not keeping the state of this rescue: not enough space, or no working disk"
             );

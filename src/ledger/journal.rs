@@ -12,7 +12,7 @@ use tokio::sync::{oneshot, watch};
 
 use crate::{
     checkpoint::{
-        format::{Checkpoint, Entry},
+        format::{Checkpoint, RecordContent},
         store::Store,
     },
     cli::SyncPolicy,
@@ -32,7 +32,7 @@ type Job = Box<dyn FnOnce(&mut Store) + Send>;
 
 /// The ledger's access to the store. No method waits for the disk.
 pub(super) struct Journal {
-    shared: Arc<Shared>,
+    shared: Arc<StoreQueue>,
     /// Number of the last entry, recorded or not.
     seq: u64,
     /// Whether entries are passed to the store. After a silence of the disk they are not, until the next complete
@@ -41,10 +41,10 @@ pub(super) struct Journal {
 }
 
 /// The store and its queue of jobs.
-pub(super) struct Shared {
+pub(super) struct StoreQueue {
     jobs: Mutex<VecDeque<Job>>,
     store: Mutex<Store>,
-    seen: Mutex<Seen>,
+    seen: Mutex<StoreState>,
     /// The last record that answers need not wait for.
     durable: watch::Sender<u64>,
     sync: SyncPolicy,
@@ -52,7 +52,7 @@ pub(super) struct Shared {
 
 /// The store's state after its last job.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Seen {
+pub(crate) struct StoreState {
     pub path: PathBuf,
     /// Number of the last entry, recorded or not.
     pub seq: u64,
@@ -70,7 +70,7 @@ pub(crate) struct Seen {
     gaps_over: u64,
 }
 
-impl Shared {
+impl StoreQueue {
     /// Runs all jobs, unless another thread is doing so. Takes as long as the disk does.
     pub(super) fn work(&self) {
         loop {
@@ -98,7 +98,7 @@ impl Shared {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn seen(&self) -> MutexGuard<'_, Seen> {
+    fn seen(&self) -> MutexGuard<'_, StoreState> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -136,12 +136,12 @@ impl Journal {
     /// `sync`.
     pub(super) fn new(store: Store, durable: watch::Sender<u64>, sync: SyncPolicy) -> Self {
         let seq = store.seq();
-        let seen = Seen {
+        let seen = StoreState {
             path: store.path().to_owned(),
             unprotected: store.unprotected().map(str::to_owned),
-            ..Seen::default()
+            ..StoreState::default()
         };
-        let shared = Shared {
+        let shared = StoreQueue {
             jobs: Mutex::default(),
             store: Mutex::new(store),
             seen: Mutex::new(seen),
@@ -157,7 +157,7 @@ impl Journal {
     }
 
     /// The handle with which a thread runs the jobs.
-    pub(super) fn worker(&self) -> Arc<Shared> {
+    pub(super) fn worker(&self) -> Arc<StoreQueue> {
         Arc::clone(&self.shared)
     }
 
@@ -167,7 +167,7 @@ impl Journal {
     }
 
     /// The store's state after its last job.
-    pub(super) fn seen(&self) -> Seen {
+    pub(super) fn seen(&self) -> StoreState {
         self.shared.seen().clone()
     }
 
@@ -177,7 +177,7 @@ impl Journal {
     }
 
     /// Records `entries`. A failure is kept in the store.
-    pub(super) fn append(&mut self, entries: Vec<Entry>) {
+    pub(super) fn append(&mut self, entries: Vec<RecordContent>) {
         self.seq += entries.len() as u64;
         if !self.gives {
             return self.shared.reach(self.seq);

@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// The state of a late master once it has answered its outstanding calls.
-pub(super) struct Behind {
+pub(super) struct LateState {
     state: Master,
     /// Number of pending writes that it will have run by then.
     ran: usize,
@@ -46,7 +46,7 @@ impl Ledger {
     /// `tells` are the subjects that these calls may notify nodes of.
     pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
         let mut inner = self.lock();
-        inner.behind = Some(Behind {
+        inner.behind = Some(LateState {
             state: inner.mirror.clone(),
             ran: inner.pending.calls().len(),
             tells,
@@ -114,7 +114,7 @@ impl Ledger {
 
 /// The subjects that the master notifies nodes of when it runs `writes`, each with its number of nodes. `None` if it
 /// would notify nodes of one subject more than once.
-fn once(behind: &Behind, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
+fn once(behind: &LateState, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
     let mut heard = BySubject::default();
     for subject in &behind.tells {
         heard.add(subject, ());

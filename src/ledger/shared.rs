@@ -1,97 +1,28 @@
 //! Replication: the writes that the other computers get from this one, and those that this one gets from the leader.
 
-use std::{collections::VecDeque, sync::Arc, time::Instant};
+use std::time::Instant;
 
 use tokio::sync::watch;
 
 use super::{Inner, Ledger, Superseded};
 use crate::{
-    checkpoint::format::{self, Entry, Record},
-    cluster::merge::{self, Changes, Subject, Verdict},
+    checkpoint::format::{Record, RecordContent},
+    cluster::{
+        merge::Verdict,
+        sharing::{Change, Sharing, Source},
+    },
     master::{Master, Request},
 };
 
-/// Maximum number of changes that are remembered for computers that were cut off.
-const RECENT_MOST: usize = 4096;
-/// Maximum number of bytes of these changes, approximately.
-const RECENT_BYTES_MOST: usize = 4 << 20;
-
-/// The role of this ledger among the robot's computers.
+/// Which computer's writes the ledger holds.
 #[derive(Debug)]
 pub(super) enum Shared {
     /// This is the only computer.
     Nobody,
     /// Another computer has the master. Only its records are applied and recorded.
     Elsewhere,
-    /// This computer has the master, and the other computers get its writes.
-    Here {
-        /// Number of the last write.
-        last: Agreed,
-        changes: Vec<Change>,
-        recent: Recent,
-    },
-}
-
-/// The origin of a recorded call.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) enum Source {
-    /// A node of this computer, or rosrescue itself.
-    #[default]
-    Here,
-    /// Another computer forwarded the call. It repeats the call elsewhere if it gets no answer.
-    Forwarded,
-    /// A computer that was cut off sent the writes that it had answered meanwhile, all under this name.
-    Merge(Arc<str>),
-}
-
-/// Recent changes, oldest first.
-#[derive(Debug, Default)]
-pub(super) struct Recent {
-    /// Number of the record after which all changes are in the list.
-    after: u64,
-    changes: VecDeque<(u64, Source, Vec<Subject>)>,
-    bytes: usize,
-}
-
-impl Recent {
-    /// Creates an empty list for all changes after record `seq`.
-    fn from(seq: u64) -> Self {
-        Self {
-            after: seq,
-            ..Self::default()
-        }
-    }
-
-    fn add(&mut self, seq: u64, source: &Source, call: &Request) {
-        let subjects: Vec<_> = call.calls().into_iter().flat_map(Subject::of).collect();
-        self.bytes += bytes_of(&subjects);
-        self.changes.push_back((seq, source.clone(), subjects));
-        while (self.changes.len() > RECENT_MOST || self.bytes > RECENT_BYTES_MOST)
-            && let Some((seq, _, subjects)) = self.changes.pop_front()
-        {
-            self.after = seq;
-            self.bytes -= bytes_of(&subjects);
-        }
-    }
-
-    /// The changes after record `seq`, without those that `merge` made. `None` if some of them were dropped.
-    fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
-        if seq < self.after {
-            return None;
-        }
-        let later = self.changes.iter().filter(|(of, ..)| *of > seq);
-        let theirs = later
-            .filter(|(_, source, _)| !matches!(source, Source::Merge(name) if **name == *merge));
-        let mut changes = Changes::default();
-        for subject in theirs.flat_map(|(.., subjects)| subjects) {
-            changes.add(subject.clone());
-        }
-        Some(changes)
-    }
-}
-
-fn bytes_of(subjects: &[Subject]) -> usize {
-    subjects.iter().map(Subject::size).sum()
+    /// Ours: the others are given them.
+    Here { times_led: u64, sharing: Sharing },
 }
 
 /// A position in the journal that all computers share: how often this computer has begun a term, and the number of a
@@ -102,31 +33,13 @@ pub(crate) struct Agreed {
     seq: u64,
 }
 
-/// A change that the other computers must get.
-#[derive(Clone, Debug)]
-pub(crate) enum Change {
-    Call(Record, Source),
-    /// Record `seq` replaced the whole state.
-    State {
-        seq: u64,
-        state: Box<Master>,
-    },
-}
-
-impl Change {
-    /// Number of the change in the shared journal.
-    pub(crate) fn seq(&self) -> u64 {
-        match self {
-            Self::Call(record, _) => record.seq,
-            Self::State { seq, .. } => *seq,
-        }
-    }
-}
-
 impl Shared {
     pub(super) fn last(&self) -> Option<Agreed> {
         match self {
-            Self::Here { last, .. } => Some(*last),
+            Self::Here { times_led, sharing } => Some(Agreed {
+                times_led: *times_led,
+                seq: sharing.last(),
+            }),
             _ => None,
         }
     }
@@ -154,11 +67,8 @@ impl Ledger {
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let times_led = self.agreed.borrow().times_led;
-        inner.shared = Shared::Here {
-            last: Agreed { times_led, seq },
-            changes: Vec::new(),
-            recent: Recent::from(seq),
-        };
+        let sharing = Sharing::after(seq);
+        inner.shared = Shared::Here { times_led, sharing };
         if inner.mirror != *held {
             inner.share_state();
         }
@@ -176,7 +86,7 @@ impl Ledger {
     /// Takes the changes that the other computers have not got yet.
     pub(crate) fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {
-            Shared::Here { changes, .. } => std::mem::take(changes),
+            Shared::Here { sharing, .. } => sharing.take(),
             _ => Vec::new(),
         }
     }
@@ -184,14 +94,11 @@ impl Ledger {
     /// Takes the same changes as a single one: the state that they have led to. `None` if this computer does not have
     /// the master.
     pub(crate) fn take_as_state(&self) -> Option<Change> {
-        let mut inner = self.lock();
-        let state = Box::new(inner.mirror.clone());
-        let Shared::Here { last, changes, .. } = &mut inner.shared else {
-            return None;
-        };
-        changes.clear();
-        let seq = last.seq;
-        Some(Change::State { seq, state })
+        let inner = &mut *self.lock();
+        match &mut inner.shared {
+            Shared::Here { sharing, .. } => Some(sharing.take_as_state(&inner.mirror)),
+            _ => None,
+        }
     }
 
     /// Judges `calls`, which a computer answered while it was cut off, as if they were made now. The computer sends
@@ -199,13 +106,10 @@ impl Ledger {
     /// changes after that were dropped.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
-        let Shared::Here { recent, .. } = &inner.shared else {
-            return None;
-        };
-        let changes = recent.since(seq, merge)?;
-        let calls = calls.iter();
-        let verdicts = calls.map(|call| merge::judge(&changes, &inner.mirror, call));
-        Some(verdicts.collect())
+        match &inner.shared {
+            Shared::Here { sharing, .. } => sharing.judge(&inner.mirror, seq, merge, calls),
+            _ => None,
+        }
     }
 
     /// The last record of this term that the other computers have or do not need.
@@ -274,9 +178,10 @@ impl Ledger {
         if !inner.is_elsewhere() {
             return Err(Superseded);
         }
-        let entries: Vec<Entry> = records.iter().map(|record| record.entry.clone()).collect();
+        let entries: Vec<RecordContent> =
+            records.iter().map(|record| record.entry.clone()).collect();
         for entry in &entries {
-            if let Entry::Call { call, .. } = entry {
+            if let RecordContent::Call { call, .. } = entry {
                 inner
                     .mirror
                     .apply_telling(&Request::from(call.clone()), &mut ());
@@ -317,47 +222,23 @@ impl Inner {
     }
 
     /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
-    pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
-        let Shared::Here {
-            last,
-            changes,
-            recent,
-        } = &mut self.shared
-        else {
+    pub(super) fn share(&mut self, entries: &[RecordContent], sources: &[&Source]) {
+        let Shared::Here { sharing, .. } = &mut self.shared else {
             return;
         };
         for (index, entry) in entries.iter().enumerate() {
-            let Entry::Call { call, .. } = entry else {
-                continue;
-            };
-            let source = sources.get(index).copied().unwrap_or(&Source::Here);
-            let record = Record {
-                seq: last.seq + 1,
-                entry: Entry::call(call.clone()),
-            };
-            // No journal has an entry that cannot be encoded, as on a single computer.
-            if format::push_record(&mut Vec::new(), &record).is_ok() {
-                last.seq += 1;
-                recent.add(last.seq, source, &Request::from(call.clone()));
-                changes.push(Change::Call(record, source.clone()));
+            if let RecordContent::Call { call, .. } = entry {
+                let source = sources.get(index).copied().unwrap_or(&Source::Here);
+                sharing.record(&Request::from(call.clone()), source);
             }
         }
     }
 
     /// Notes that the state has changed without a call.
     pub(super) fn share_state(&mut self) {
-        if let Shared::Here {
-            last,
-            changes,
-            recent,
-        } = &mut self.shared
-        {
-            last.seq += 1;
-            let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
-            // The new state may differ in any part.
-            *recent = Recent::from(seq);
-            changes.push(Change::State { seq, state });
-            // The following calls have other numbers than the session's record says.
+        if let Shared::Here { sharing, .. } = &mut self.shared {
+            sharing.record_state(&self.mirror);
+            // The calls that follow have other numbers than the session tells.
             self.session_unwritten = true;
         }
     }
@@ -401,7 +282,7 @@ mod tests {
     }
 
     fn record(seq: u64, call: Request) -> Record {
-        let entry = Entry::call(call.into());
+        let entry = RecordContent::call(call.into());
         Record { seq, entry }
     }
 
@@ -582,21 +463,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_changed_long_ago_is_not_known_any_more() {
-        let mut recent = Recent::from(3);
-        for seq in 4..=u64::try_from(RECENT_MOST).unwrap() + 13 {
-            recent.add(seq, &Source::Here, &set_of("/a", 1));
-        }
-        assert!(recent.since(12, "mine").is_none());
-        assert!(recent.since(13, "mine").is_some());
-        let key = "k".repeat(RECENT_BYTES_MOST);
-        recent.add(9_000, &Source::Here, &set_of(&key, 1));
-        assert!(recent.since(8_999, "mine").is_none() && recent.changes.is_empty());
-        assert_eq!(recent.bytes, 0);
-    }
-
-    #[test]
-    fn changes_that_are_not_taken_become_one_state() {
+    fn changes_that_nobody_is_given_become_one_state() {
         let ledger = ledger();
         assert!(ledger.take_as_state().is_none());
         ledger.leave();

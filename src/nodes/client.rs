@@ -8,7 +8,7 @@ use std::{
 use hyper::header::HeaderValue;
 use tokio::{net::TcpStream, time::timeout};
 
-pub(crate) use crate::health::Sign;
+pub(crate) use crate::health::Reaction;
 use crate::{
     health::Claims,
     master::{self, question},
@@ -22,14 +22,14 @@ use crate::{
 const MAX_REPLY: usize = 16 << 20;
 
 /// Makes `call` to the node at `api`, and waits at most `limit` for a sign of life.
-pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
+pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Reaction {
     ask_for(api, call, limit).await.0
 }
 
 /// Like [`ask`], and also returns the value that the node answered.
-pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
+pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Reaction, Option<Value>) {
     let Ok(address) = MasterUri::parse(api) else {
-        return (Sign::Silent, None);
+        return (Reaction::Silent, None);
     };
     let question = async {
         let mut connection = match connect(&address).await {
@@ -40,7 +40,7 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, O
     };
     timeout(limit, question)
         .await
-        .unwrap_or((Sign::Silent, None))
+        .unwrap_or((Reaction::Silent, None))
 }
 
 /// The host of `api`, resolved to its first address. `None` if it has no address within `limit`.
@@ -53,7 +53,7 @@ pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
 /// A node's answers about itself.
 #[derive(Debug)]
 pub(crate) struct Interview {
-    pub sign: Sign,
+    pub sign: Reaction,
     pub pid: Option<i32>,
     /// The topics that it publishes and subscribes to, if known.
     pub claims: Option<Claims>,
@@ -62,7 +62,7 @@ pub(crate) struct Interview {
 impl Interview {
     /// The result for a node that does not answer.
     pub(super) const SILENT: Self = Self {
-        sign: Sign::Silent,
+        sign: Reaction::Silent,
         pid: None,
         claims: None,
     };
@@ -78,7 +78,7 @@ pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
         pid: pid.as_ref().and_then(Value::as_int),
         claims: None,
     };
-    if sign == Sign::Alive {
+    if sign == Reaction::Alive {
         let (publications, subscriptions) =
             (question("getPublications"), question("getSubscriptions"));
         let answers = tokio::join!(
@@ -92,33 +92,37 @@ pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
     interview
 }
 
-async fn connect(address: &MasterUri) -> Result<Connection, Sign> {
+async fn connect(address: &MasterUri) -> Result<Connection, Reaction> {
     let found = resolver::addresses(&address.host, address.port).await;
     let mut refused = false;
-    for socket in found.map_err(|_| Sign::Silent)? {
+    for socket in found.map_err(|_| Reaction::Silent)? {
         match TcpStream::connect(socket).await {
             Ok(stream) => {
                 let name = HeaderValue::from_static("to-a-node");
                 let connection = Connection::over(stream, address, name, MAX_REPLY);
-                return connection.await.map_err(|_| Sign::Silent);
+                return connection.await.map_err(|_| Reaction::Silent);
             }
             Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,
             // The node may live, but this computer cannot reach its address.
-            Err(_) => return Err(Sign::Silent),
+            Err(_) => return Err(Reaction::Silent),
         }
     }
-    Err(if refused { Sign::Dead } else { Sign::Silent })
+    Err(if refused {
+        Reaction::Dead
+    } else {
+        Reaction::Silent
+    })
 }
 
-async fn put(connection: &mut Connection, call: &Call) -> (Sign, Option<Value>) {
+async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Value>) {
     match connection.call(call).await {
         Ok(Reply::Value(Value::Array(answer))) => {
             let mut answer = answer.into_iter();
             let success = answer.next() == Some(Value::Int(1));
-            (Sign::Alive, answer.nth(1).filter(|_| success))
+            (Reaction::Alive, answer.nth(1).filter(|_| success))
         }
         // The node lacks the method.
-        Ok(Reply::Fault { .. }) => (Sign::Alive, None),
-        Ok(Reply::Value(_)) | Err(_) => (Sign::Silent, None),
+        Ok(Reply::Fault { .. }) => (Reaction::Alive, None),
+        Ok(Reply::Value(_)) | Err(_) => (Reaction::Silent, None),
     }
 }

@@ -15,21 +15,24 @@ use tokio::task::JoinSet;
 
 use super::{
     Nodes,
-    client::{self, Interview, Sign},
+    client::{self, Interview, Reaction},
     notifications,
 };
-use crate::status::report::{HealthCheck, Outcome};
+use crate::status::report::{HealthCheck, RecoveryOutcome};
 use tracing::Instrument;
 
 use crate::{
     gate::State,
-    health::{Name, Reconciliation, Refusal, Registration, Verdict, judge, judge_refusal, port_of},
+    health::{
+        IdentityVerdict, Reconciliation, Refusal, RegisteredName, Registration, judge,
+        judge_refusal, port_of,
+    },
     ledger::activity::LastCalls,
     master::{self, CALLER_ID, Kind, Method, Request, question},
     replay::Token,
     resolver,
     ros_env::MasterUri,
-    write_queue::batch::{self, Condition},
+    write_queue::batch::{self, Precondition},
     xmlrpc::{Reply, Value},
 };
 
@@ -41,7 +44,7 @@ const QUESTIONS: u32 = 4;
 /// The result of asking the nodes at one port.
 #[derive(Debug)]
 pub(crate) struct CheckResult {
-    pub(crate) sign: Sign,
+    pub(crate) sign: Reaction,
     pub(crate) names: Vec<String>,
     pub(crate) removed: Vec<String>,
     pub(crate) reconciled: Vec<String>,
@@ -52,7 +55,7 @@ pub(crate) struct CheckResult {
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
-    outcome: Outcome,
+    outcome: RecoveryOutcome,
 ) -> Option<HealthCheck> {
     let under_way = Nodes::begin_check(&nodes);
     // Counts as an unanswered question until the nodes are asked.
@@ -67,8 +70,8 @@ pub(crate) async fn after_recovery(
     let mut notified = match outcome {
         // This master notifies nodes itself, but the previous rosrescue may have died while it
         // stood in for another master.
-        Outcome::Adopted => super::notify_later(&nodes, outage),
-        Outcome::Reconciled => {
+        RecoveryOutcome::Adopted => super::notify_later(&nodes, outage),
+        RecoveryOutcome::Reconciled => {
             // The master may send outdated notifications now.
             nodes
                 .ledger
@@ -142,7 +145,7 @@ pub(crate) fn visit(
 async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
     let mut outcome = CheckResult {
-        sign: Sign::Silent,
+        sign: Reaction::Silent,
         names: Vec::new(),
         removed: Vec::new(),
         reconciled: Vec::new(),
@@ -168,11 +171,11 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
         let names = asked.iter().flat_map(|asked| &asked.names);
         outcome.names = names.map(|name| name.node.clone()).collect();
         match interview.sign {
-            Sign::Silent => {
+            Reaction::Silent => {
                 nodes.mark_unreachable(port);
                 break;
             }
-            Sign::Dead => {
+            Reaction::Dead => {
                 drop(waiting.take());
                 let calls: Vec<_> = asked.iter().flat_map(Asked::calls).collect();
                 match judge_refusal(nodes.gate.is_open(), refused.as_ref(), &calls) {
@@ -190,7 +193,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
                 }
                 break;
             }
-            Sign::Alive => {
+            Reaction::Alive => {
                 refused = None;
                 if nodes.clear(port) {
                     // Notifications to this node were held back until now.
@@ -237,15 +240,15 @@ impl Drop for Waiting {
 #[derive(Default)]
 struct Asked {
     api: String,
-    names: Vec<Name>,
+    names: Vec<RegisteredName>,
     unregistered: Vec<u64>,
 }
 
 /// What an answer means for the names at the address.
 #[derive(Default)]
 struct Findings {
-    others: Vec<Name>,
-    reconciliations: Vec<(Condition, Verdict, Reconciliation)>,
+    others: Vec<RegisteredName>,
+    reconciliations: Vec<(Precondition, IdentityVerdict, Reconciliation)>,
 }
 
 impl Asked {
@@ -260,7 +263,7 @@ impl Asked {
                     api: api.to_owned(),
                     ..Self::default()
                 });
-                asked.names.push(Name {
+                asked.names.push(RegisteredName {
                     node: node.to_owned(),
                     known_pid: pid.map(|(pid, _)| pid),
                     registered_since: pid.is_some_and(|(_, since)| since),
@@ -299,7 +302,7 @@ impl Asked {
                 {
                     continue;
                 }
-                if verdict == Verdict::Another {
+                if verdict == IdentityVerdict::Another {
                     findings.others.push(name.clone());
                     continue;
                 }
@@ -307,7 +310,7 @@ impl Asked {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
                 // If the answer could fit several names, none of them is reconciled.
-                let sure = verdict == Verdict::Itself || self.names.len() == 1;
+                let sure = verdict == IdentityVerdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
                     && last_calls.unregistered == *unregistered
@@ -317,7 +320,7 @@ impl Asked {
                         activity.has_lost(&name.node, api, one.publishes, &one.topic)
                     };
                     reconciliation.missing.retain(had);
-                    let condition = Condition {
+                    let condition = Precondition {
                         node: name.node.clone(),
                         last_calls,
                     };
@@ -399,7 +402,7 @@ impl Findings {
                     list(reconciliation).iter().any(|it| it.is_same(one))
                 })
             };
-            let certain = *verdict == Verdict::Itself;
+            let certain = *verdict == IdentityVerdict::Itself;
             for one in &reconciliation.extra {
                 if confirmed(|reconciliation| &reconciliation.extra, one) {
                     let call = one.unregister(node, api);
@@ -420,7 +423,7 @@ impl Findings {
 async fn reconcile(
     nodes: &Nodes,
     one: &Registration,
-    condition: &Condition,
+    condition: &Precondition,
     call: Request,
     outcome: &mut CheckResult,
 ) {
@@ -471,7 +474,7 @@ async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -
     let Some((calls, last_calls)) = found.filter(|(calls, _)| !calls.is_empty()) else {
         return false;
     };
-    let condition = Condition {
+    let condition = Precondition {
         node: node.to_owned(),
         last_calls,
     };

@@ -15,7 +15,7 @@ use tokio::{
 
 use super::{
     Nodes,
-    client::{self, Sign},
+    client::{self, Reaction},
 };
 use crate::{
     gate::State,
@@ -35,7 +35,7 @@ const AT_ONCE: usize = 8;
 
 /// The evidence collected so far.
 #[derive(Debug)]
-pub(super) struct Liveness {
+pub(super) struct LivenessEvidence {
     known: Mutex<Known>,
     permits: Semaphore,
 }
@@ -55,7 +55,7 @@ pub(crate) struct Life {
     pub(crate) checked: Option<Instant>,
 }
 
-impl Default for Liveness {
+impl Default for LivenessEvidence {
     fn default() -> Self {
         Self {
             known: Mutex::default(),
@@ -64,7 +64,7 @@ impl Default for Liveness {
     }
 }
 
-impl Liveness {
+impl LivenessEvidence {
     fn lock(&self) -> MutexGuard<'_, Known> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -140,7 +140,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
     let here = addresses_here(&port, nodes.timeout).await;
     let sign = match &here {
         None => None,
-        Some(here) if is_among(here, &listening) => Some(Sign::Alive),
+        Some(here) if is_among(here, &listening) => Some(Reaction::Alive),
         Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {
             Some(_admitted) => Some(client::ask(&port, &master::get_pid(), nodes.timeout).await),
             None => None,

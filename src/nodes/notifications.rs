@@ -13,13 +13,13 @@ use tokio::sync::Semaphore;
 
 use super::{
     Nodes,
-    client::{self, Sign},
+    client::{self, Reaction},
 };
 use crate::{
     health::{Claims, port_of},
     limit::rarely,
     master::{self, Displaced, Master},
-    order::{Next, Order, Subject},
+    order::{NextNotification, Order, Subject},
     wait,
 };
 
@@ -115,8 +115,8 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         }
         changed.mark_unchanged();
         let (call, number) = match nodes.ledger.next_notification(&port) {
-            Next::Send { call, number } => (call, number),
-            Next::Wait { until } => {
+            NextNotification::Send { call, number } => (call, number),
+            NextNotification::Wait { until } => {
                 drop(permit);
                 tokio::select! {
                     // The ledger lives as long as this task.
@@ -125,7 +125,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 }
                 continue;
             }
-            Next::Idle => return,
+            NextNotification::Idle => return,
         };
         nodes.stats.notifications_sent.count();
         let is_param = call.method == master::PARAM_UPDATE;
@@ -143,14 +143,14 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             }
         };
         nodes.ledger.notification_ended(number);
-        if is_param && sign == Sign::Silent && answers(&nodes, &port).await {
+        if is_param && sign == Reaction::Silent && answers(&nodes, &port).await {
             nodes.set_mute(&port, true);
             continue;
         }
-        if is_mute && sign == Sign::Alive {
+        if is_mute && sign == Reaction::Alive {
             nodes.set_mute(&port, false);
         }
-        if sign != Sign::Alive {
+        if sign != Reaction::Alive {
             nodes.mark_unreachable(&port);
             nodes.ledger.with_order(|order, _| order.drop_port(&port));
             return;
@@ -160,7 +160,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
 
 /// Whether the node at `port` answers a question.
 async fn answers(nodes: &Nodes, port: &str) -> bool {
-    client::ask(port, &master::get_pid(), nodes.timeout).await == Sign::Alive
+    client::ask(port, &master::get_pid(), nodes.timeout).await == Reaction::Alive
 }
 
 /// Asks a node to shut down because another one has taken its name, as a master does. If a different node listens at
@@ -189,9 +189,9 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             };
             let interview = client::interview(&displaced.api, nodes.timeout).await;
             match interview.sign {
-                Sign::Dead => return,
-                Sign::Silent => continue,
-                Sign::Alive => {}
+                Reaction::Dead => return,
+                Reaction::Silent => continue,
+                Reaction::Alive => {}
             }
             let Displaced { node, api, .. } = &displaced;
             if is_itself(&displaced, interview.pid, interview.claims.as_ref())

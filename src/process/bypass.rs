@@ -94,14 +94,14 @@ fn program_of(pid: u32) -> String {
 
 /// The addresses of the master.
 #[derive(Clone, Debug)]
-pub(crate) struct Place {
+pub(crate) struct MasterAddresses {
     port: u16,
     addresses: Vec<IpAddr>,
     /// Whether one of the addresses belongs to this computer.
     is_here: bool,
 }
 
-impl Place {
+impl MasterAddresses {
     /// Resolves the master's address. `None` if its host has no address.
     pub(crate) async fn of(master: &MasterUri) -> Option<Self> {
         let found = resolver::addresses(&master.host, master.port).await.ok()?;
@@ -139,7 +139,7 @@ pub(crate) struct Bypass {
 impl Bypass {
     /// Reads the table once, and returns the new clients. Blocks for a millisecond per some hundred sockets of this
     /// computer, and longer if it has to search for the owner of a new socket.
-    pub(crate) fn look(&mut self, place: &Place) -> Vec<Who> {
+    pub(crate) fn look(&mut self, place: &MasterAddresses) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
         let (clients, hosts) = split(table, place, &own, resolver::is_own);
@@ -202,7 +202,7 @@ impl Bypass {
 /// addresses of other computers.
 fn split(
     table: Vec<Established>,
-    place: &Place,
+    place: &MasterAddresses,
     own: &HashSet<u64>,
     is_own: impl Fn(IpAddr) -> bool,
 ) -> (HashMap<u64, u32>, HashSet<IpAddr>) {
@@ -233,7 +233,7 @@ pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: Strin
     let mut bypass = Bypass::default();
     loop {
         looks.tick().await;
-        let Some(place) = Place::of(&upstream.address()).await else {
+        let Some(place) = MasterAddresses::of(&upstream.address()).await else {
             continue;
         };
         let looked = spawn_blocking(move || {
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn clients_of_the_master_are_distinguished_from_other_connections() {
-        let place = Place {
+        let place = MasterAddresses {
             port: 11_312,
             addresses: vec!["127.0.0.1".parse().unwrap()],
             is_here: true,
@@ -296,7 +296,9 @@ mod tests {
             let listener = TcpListener::bind(address).unwrap();
             let port = listener.local_addr().unwrap().port();
             let host = "127.0.0.1".to_owned();
-            let place = Place::of(&MasterUri { host, port }).await.unwrap();
+            let place = MasterAddresses::of(&MasterUri { host, port })
+                .await
+                .unwrap();
             let _client = TcpStream::connect(("127.0.0.1", port)).unwrap();
             let mut bypass = Bypass::default();
             assert_eq!(bypass.look(&place), []);

@@ -9,7 +9,7 @@ use std::{
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use crate::status::{report::Outcome, software};
+use crate::status::{report::RecoveryOutcome, software};
 use crate::{
     gate::{State, Tx},
     ledger::{Basis, Ledger, late::CatchUp},
@@ -17,7 +17,7 @@ use crate::{
     limit::rarely,
     master::{Counts, Master, Method, Request},
     process::listeners,
-    replay::{self, Authority, Bears, Inspection, Known, Plan, Token, Treatment},
+    replay::{self, Authority, Bears, Inspection, KnownMaster, Plan, Token, Treatment},
     status::stats::Stats,
     upstream::{
         CallError, ConnectError, Connection, RawReply, Upstream,
@@ -79,7 +79,7 @@ impl ExamineError {
 #[derive(Debug)]
 pub(crate) struct Examination {
     /// How the master got its state.
-    pub outcome: Outcome,
+    pub outcome: RecoveryOutcome,
     /// Process id of the master.
     pub pid: i32,
     /// HTTP version and Python version of the master, as text.
@@ -100,7 +100,7 @@ pub(crate) struct Examination {
 /// The parameters of an examination.
 #[derive(Debug)]
 pub(crate) struct Manner {
-    pub known: Known,
+    pub known: KnownMaster,
     /// The injection into an empty master, if it was prepared in advance.
     pub prepared: Option<JoinHandle<Prepared>>,
 }
@@ -172,12 +172,12 @@ pub(crate) struct Examiner {
 impl Examiner {
     /// The facts about the present master. `new` is the process id of a master that was just started and has not been
     /// called yet.
-    pub(super) fn known(&self, new: Option<i32>) -> Known {
+    pub(super) fn known(&self, new: Option<i32>) -> KnownMaster {
         match (self.ledger.has_served_present(), new) {
-            (None, _) => Known::Nothing,
-            (_, Some(pid)) => Known::New { pid },
-            (Some(true), None) => Known::ServedIfPresent,
-            (Some(false), None) => Known::InjectedIfPresent,
+            (None, _) => KnownMaster::Nothing,
+            (_, Some(pid)) => KnownMaster::New { pid },
+            (Some(true), None) => KnownMaster::ServedIfPresent,
+            (Some(false), None) => KnownMaster::InjectedIfPresent,
         }
     }
 
@@ -196,12 +196,12 @@ impl Examiner {
     ) -> Result<Examination, ExamineError> {
         let start = Instant::now();
         let connection = &mut self.while_alive(self.upstream.connect()).await?;
-        let served = matches!(manner.known, Known::ServedIfPresent);
+        let served = matches!(manner.known, KnownMaster::ServedIfPresent);
         let resumes =
             |first: &Inspection| served && first.bears() == Bears::Present && self.ledger.resume();
-        let is_new = matches!(manner.known, Known::New { .. });
+        let is_new = matches!(manner.known, KnownMaster::New { .. });
         let mut first = match manner.known {
-            Known::New { pid } => Inspection::at_new(pid),
+            KnownMaster::New { pid } => Inspection::at_new(pid),
             _ => self.first_look(connection).await?,
         };
         let mut resumed = resumes(&first);
@@ -212,7 +212,7 @@ impl Examiner {
             resumed = resumes(&first);
         }
         let mut examination = Examination {
-            outcome: Outcome::Resumed,
+            outcome: RecoveryOutcome::Resumed,
             pid: first.pid(),
             speaks: String::new(),
             verification: Verification::TokenFirst,
@@ -344,15 +344,17 @@ impl Examiner {
         let before = self.ledger.token();
         let treatment = replay::treatment(bears, manner.known, mirror.is_empty(), found.is_empty());
         examination.outcome = match treatment {
-            Treatment::Begin => Outcome::Begun,
-            Treatment::TakeOver => Outcome::Adopted,
-            Treatment::Inject | Treatment::Replace => Outcome::Injected,
-            Treatment::Reconcile(_) if manner.known == Known::Nothing => Outcome::Adopted,
-            Treatment::Reconcile(Authority::PendingWrites) => Outcome::Reconciled,
-            Treatment::Reconcile(Authority::Mirror) => Outcome::Injected,
+            Treatment::Begin => RecoveryOutcome::Begun,
+            Treatment::TakeOver => RecoveryOutcome::Adopted,
+            Treatment::Inject | Treatment::Replace => RecoveryOutcome::Injected,
+            Treatment::Reconcile(_) if manner.known == KnownMaster::Nothing => {
+                RecoveryOutcome::Adopted
+            }
+            Treatment::Reconcile(Authority::PendingWrites) => RecoveryOutcome::Reconciled,
+            Treatment::Reconcile(Authority::Mirror) => RecoveryOutcome::Injected,
         };
         let say_difference = |difference: &[String]| match manner.known {
-            Known::Nothing => say_older(difference),
+            KnownMaster::Nothing => say_older(difference),
             _ => say_difference(difference),
         };
         let (state, change) = match treatment {

@@ -27,7 +27,7 @@ static LIMIT: Limit = Limit::new();
 
 /// The last line of a report's file, as JSON. The lines before it are the report for people.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub(crate) struct Kept {
+pub(crate) struct ReportRecord {
     /// Id of the session.
     session: String,
     /// Totals of the session at that time, as in [`Facts`](crate::status::Facts).
@@ -37,7 +37,7 @@ pub(crate) struct Kept {
     pub(crate) report: Report,
 }
 
-impl Kept {
+impl ReportRecord {
     pub(super) fn new(board: &Board, session: &str, report: Report) -> Self {
         let facts = board.read();
         Self {
@@ -52,7 +52,7 @@ impl Kept {
 
 /// Writes a report next to the checkpoint at `checkpoint`, in another thread. The file is not
 /// synced.
-pub(super) fn keep(checkpoint: PathBuf, kept: Kept) {
+pub(super) fn keep(checkpoint: PathBuf, kept: ReportRecord) {
     if LIMIT.pass(Instant::now()).is_none() {
         return;
     }
@@ -63,7 +63,7 @@ pub(super) fn keep(checkpoint: PathBuf, kept: Kept) {
     });
 }
 
-fn write(checkpoint: &Path, kept: &Kept) -> io::Result<()> {
+fn write(checkpoint: &Path, kept: &ReportRecord) -> io::Result<()> {
     let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(());
     };
@@ -116,14 +116,14 @@ fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
 
 /// Reads the reports next to the checkpoint at `checkpoint`, sorted by number. Leaves out files that cannot be read or
 /// have no JSON in the last line.
-pub(crate) fn read(checkpoint: &Path) -> Vec<Kept> {
+pub(crate) fn read(checkpoint: &Path) -> Vec<ReportRecord> {
     let files = files(checkpoint).unwrap_or_default();
-    let mut all: Vec<Kept> = files.iter().filter_map(|file| read_one(file)).collect();
+    let mut all: Vec<ReportRecord> = files.iter().filter_map(|file| read_one(file)).collect();
     all.sort_by_key(|kept| kept.report.number);
     all
 }
 
-fn read_one(file: &Path) -> Option<Kept> {
+fn read_one(file: &Path) -> Option<ReportRecord> {
     let file = regular_file::open(file).ok()?;
     if file.metadata().ok()?.len() > LARGEST {
         return None;
@@ -144,7 +144,7 @@ pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64)
         ..Earlier::default()
     };
     for kept in all.into_iter().filter(|kept| kept.session == session) {
-        let Kept {
+        let ReportRecord {
             rescues,
             deaths,
             worker_restarts,
@@ -166,10 +166,10 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
-    use crate::status::report::{Outcome, Phases};
+    use crate::status::report::{Phases, RecoveryOutcome};
 
-    fn kept(session: &str, number: u64) -> Kept {
-        Kept {
+    fn kept(session: &str, number: u64) -> ReportRecord {
+        ReportRecord {
             session: session.to_owned(),
             rescues: number,
             deaths: number + 1,
@@ -184,7 +184,7 @@ mod tests {
             cause: "the master's process ended".to_owned(),
             ended: Some("signal 9".to_owned()),
             detected_at: 1_795_253_213.0 + number as f64,
-            outcome: Outcome::Injected,
+            outcome: RecoveryOutcome::Injected,
             master_pid: 7,
             master_speaks: "HTTP/1.1".to_owned(),
             phases: Phases::default(),

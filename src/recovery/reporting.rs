@@ -8,7 +8,7 @@ use super::{
     Driver,
     examine::Examination,
     master_process::MasterProcess,
-    report_file::{self, Kept},
+    report_file::{self, ReportRecord},
 };
 use crate::lifecycle::Cause;
 use crate::{
@@ -16,7 +16,7 @@ use crate::{
     limit::all_clear,
     nodes::health_check,
     status::{
-        report::{AWAY, Outcome, Phases, Report, ms},
+        report::{AWAY, Phases, RecoveryOutcome, Report, ms},
         stats::Stats,
     },
 };
@@ -100,7 +100,7 @@ impl Outage {
 }
 
 /// The last repeated message.
-pub(super) struct Said {
+pub(super) struct LastMessage {
     text: String,
     pause: Duration,
     /// When it may be logged again.
@@ -110,9 +110,9 @@ pub(super) struct Said {
 impl Driver {
     /// Reports an examination. The health check and the reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
-        if self.lifecycle.begins() && examination.outcome == Outcome::Injected {
+        if self.lifecycle.begins() && examination.outcome == RecoveryOutcome::Injected {
             // The master holds only the session's initial state.
-            examination.outcome = Outcome::Begun;
+            examination.outcome = RecoveryOutcome::Begun;
         }
         let (cause, since) = (self.outage.cause, self.outage.since);
         let mut report = self.outage.report(Instant::now(), examination);
@@ -123,7 +123,7 @@ impl Driver {
             // The first sign was part of the process's end.
             report.cause = Cause::Exited.as_str().into();
         }
-        if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
+        if report.outcome == RecoveryOutcome::Resumed && quiet.contains(&cause) {
             // This is normal: a master with `-t` closes each idle connection, and the threads of a master that is being
             // stopped end before the process.
             all_clear!(
@@ -139,13 +139,13 @@ impl Driver {
         let store = self.examiner.ledger.seen_store();
         let works = store.filter(|store| store.unprotected.is_none() && report.is_rescue());
         let checkpoint = works.map(|store| store.path);
-        if let (Some(checkpoint), Outcome::Resumed) = (&checkpoint, report.outcome) {
+        if let (Some(checkpoint), RecoveryOutcome::Resumed) = (&checkpoint, report.outcome) {
             report_file::keep(
                 checkpoint.clone(),
-                Kept::new(&self.board, &session, report.clone()),
+                ReportRecord::new(&self.board, &session, report.clone()),
             );
         }
-        self.restored = (report.outcome == Outcome::Injected).then_some(report.number);
+        self.restored = (report.outcome == RecoveryOutcome::Injected).then_some(report.number);
         if !self.lifecycle.has_served() {
             // After a restart of rosrescue, the latest changes before the outage are unknown.
             self.examiner.ledger.with_activity(|mirror, activity| {
@@ -155,7 +155,7 @@ impl Driver {
         let Report {
             number, outcome, ..
         } = report;
-        if outcome != Outcome::Resumed {
+        if outcome != RecoveryOutcome::Resumed {
             let (nodes, board) = (self.nodes.clone(), self.board.clone());
             let check = async move {
                 let check = health_check::after_recovery(nodes, since, outcome).await;
@@ -163,7 +163,7 @@ impl Driver {
                 if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
                     report.log_check();
                     if let Some(checkpoint) = checkpoint {
-                        report_file::keep(checkpoint, Kept::new(&board, &session, report));
+                        report_file::keep(checkpoint, ReportRecord::new(&board, &session, report));
                     }
                 }
             };
@@ -196,6 +196,6 @@ impl Driver {
         tracing::warn!("{text}");
         AWAY.told();
         let next = now + pause;
-        self.said = Some(Said { text, pause, next });
+        self.said = Some(LastMessage { text, pause, next });
     }
 }

@@ -10,7 +10,7 @@ use std::{
 use hyper::StatusCode;
 use ipnet::IpNet;
 
-use super::admission::Refusal;
+use super::admission::Rejection;
 use crate::master::Kind;
 
 /// Pause between two log lines about the same address. A refused node calls again up to 20 times per second.
@@ -20,7 +20,7 @@ const REMEMBERED: usize = 1000;
 
 /// The networks of `--allow` and `--allow-write`. An empty list allows all clients.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Access {
+pub(crate) struct AccessRules {
     allow: Vec<IpNet>,
     allow_write: Vec<IpNet>,
 }
@@ -33,7 +33,7 @@ pub(crate) enum Grant {
     Write,
 }
 
-impl Access {
+impl AccessRules {
     pub(crate) fn new(allow: Vec<IpNet>, allow_write: Vec<IpNet>) -> Self {
         Self { allow, allow_write }
     }
@@ -56,7 +56,7 @@ impl Access {
 
 impl Grant {
     /// Accepts a request of any kind, or refuses it.
-    pub(crate) fn check(self, peer: IpAddr) -> Result<(), Refusal> {
+    pub(crate) fn check(self, peer: IpAddr) -> Result<(), Rejection> {
         match self {
             Self::Nothing => Err(refusal(peer, "call", "--allow")),
             Self::Read | Self::Write => Ok(()),
@@ -65,7 +65,7 @@ impl Grant {
 
     /// Accepts or refuses a call of this kind. The kind is `None` if the call could not be decoded. A call that only
     /// the master understands may make any change.
-    pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Refusal> {
+    pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Rejection> {
         match (self, kind) {
             (Self::Write, _) | (Self::Read, Some(Kind::Read | Kind::Identity)) => Ok(()),
             (Self::Read | Self::Nothing, _) => Err(refusal(peer, "change", "--allow-write")),
@@ -75,7 +75,7 @@ impl Grant {
 
 /// The answer to a refused call. rospy and roscpp treat this status like a master that is not running yet, and call
 /// again. An XML-RPC fault would end a node that is starting.
-fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
+fn refusal(peer: IpAddr, what: &str, option: &str) -> Rejection {
     let reason = match what {
         "call" => {
             format!("{peer} may not call this master: its address is not in rosrescue's {option}")
@@ -84,14 +84,14 @@ fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
             "{peer} may only read from this master: its address is not in rosrescue's {option}"
         ),
     };
-    Refusal {
+    Rejection {
         status: StatusCode::FORBIDDEN,
         reason,
     }
 }
 
 /// Describes the networks for the log at the start.
-impl fmt::Display for Access {
+impl fmt::Display for AccessRules {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let list = |nets: &[IpNet]| {
             let mut names: Vec<_> = nets.iter().map(|net| net.trunc().to_string()).collect();
@@ -123,9 +123,9 @@ impl fmt::Display for Access {
 
 /// When each address was last logged.
 #[derive(Debug, Default)]
-pub(crate) struct Said(HashMap<IpAddr, Instant>);
+pub(crate) struct LastLogged(HashMap<IpAddr, Instant>);
 
-impl Said {
+impl LastLogged {
     /// Whether to log a refusal of `peer` now.
     pub(crate) fn is_due(&mut self, now: Instant, peer: IpAddr) -> bool {
         let is_recent = |said: &Instant| now.duration_since(*said) < SAY_AGAIN;
@@ -153,7 +153,7 @@ mod tests {
 
     fn grant(allow: &[&str], write: &[&str], peer: &str) -> Grant {
         let own = "10.0.0.7".parse().unwrap();
-        Access::new(nets(allow), nets(write)).of(peer.parse().unwrap(), Some(own))
+        AccessRules::new(nets(allow), nets(write)).of(peer.parse().unwrap(), Some(own))
     }
 
     #[test]
@@ -211,7 +211,7 @@ mod tests {
     #[test]
     fn the_start_says_who_may() {
         let says =
-            |allow: &[&str], write: &[&str]| Access::new(nets(allow), nets(write)).to_string();
+            |allow: &[&str], write: &[&str]| AccessRules::new(nets(allow), nets(write)).to_string();
         assert_eq!(
             says(&["10.0.0.7/24"], &["fd00::/64"]),
             "only these networks may call: this computer, 10.0.0.0/24, fd00::/64; only these may change: \
@@ -225,7 +225,7 @@ mod tests {
 
     #[test]
     fn an_address_is_spoken_of_once_a_minute() {
-        let (mut said, now) = (Said::default(), Instant::now());
+        let (mut said, now) = (LastLogged::default(), Instant::now());
         let peer = |number: usize| IpAddr::from(u128::try_from(number).unwrap().to_be_bytes());
         assert!(said.is_due(now, peer(0)));
         assert!(!said.is_due(now, peer(0)));

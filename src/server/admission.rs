@@ -14,7 +14,7 @@ use crate::master::{MASTER, Request};
 
 /// A refused request.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Refusal {
+pub(crate) struct Rejection {
     /// The HTTP status to answer.
     pub status: StatusCode,
     /// The reason, for the log and the answer.
@@ -32,7 +32,7 @@ const BROWSER_TYPES: [&str; 3] = [
 ///
 /// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client
 /// does. The content type may be missing, as in a browser's POST of a typed array.
-pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
         check_origin(headers)?;
@@ -48,7 +48,7 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
         .trim()
         .to_ascii_lowercase();
     if BROWSER_TYPES.contains(&essence.as_str()) {
-        return Err(Refusal {
+        return Err(Rejection {
             status: StatusCode::UNSUPPORTED_MEDIA_TYPE,
             reason: format!("content type `{essence:.100}` is not accepted; XML-RPC is text/xml"),
         });
@@ -58,13 +58,13 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
 
 /// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but such a
 /// page could occupy `/events`, which allows few connections.
-pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     check_host(headers, names)?;
     check_origin(headers)
 }
 
 /// Whether the request comes from a page of this site, or not from a page.
-fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
+fn check_origin(headers: &HeaderMap) -> Result<(), Rejection> {
     for origin in headers.get_all(ORIGIN) {
         let origin = String::from_utf8_lossy(origin.as_bytes());
         let site = origin.strip_prefix("http://").map(str::as_bytes);
@@ -73,7 +73,7 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
             .zip(own)
             .is_some_and(|(a, b)| a.eq_ignore_ascii_case(b))
         {
-            return Err(Refusal {
+            return Err(Rejection {
                 status: StatusCode::FORBIDDEN,
                 reason: format!("a page of `{origin:.100}` may not call the master"),
             });
@@ -87,7 +87,7 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
 ///
 /// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain may follow its host
 /// name. That is safe, because the status page changes nothing.
-fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
         let has_domain = |own: &&String| {
@@ -106,7 +106,7 @@ fn is_own(name: &str, names: &[String]) -> bool {
         || names.iter().any(|own| own.eq_ignore_ascii_case(name))
 }
 
-fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<(), Refusal> {
+fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<(), Rejection> {
     let Some(host) = headers.get(HOST) else {
         return Ok(());
     };
@@ -118,7 +118,7 @@ fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<()
     if is_known(name) {
         return Ok(());
     }
-    Err(Refusal {
+    Err(Rejection {
         status: StatusCode::FORBIDDEN,
         reason: format!("`{name:.100}` is not a name of this computer; use its address"),
     })

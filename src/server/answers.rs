@@ -99,14 +99,14 @@ pub struct Answers {
 
 /// Memory for one answer, released on drop.
 #[derive(Debug)]
-pub(crate) struct Room(OwnedSemaphorePermit);
+pub(crate) struct AnswerRoom(OwnedSemaphorePermit);
 
 /// An answer's bytes, which keep their memory reserved until they have been written.
 struct Counted {
     bytes: Bytes,
     number: u64,
     answers: Arc<Answers>,
-    _room: Room,
+    _room: AnswerRoom,
 }
 
 impl AsRef<[u8]> for Counted {
@@ -152,7 +152,11 @@ impl Answers {
     }
 
     /// Returns `room` if it is enough for `bytes`, or a new reservation if memory becomes free soon.
-    pub(crate) async fn enough(&self, room: Option<Room>, bytes: usize) -> Option<Room> {
+    pub(crate) async fn enough(
+        &self,
+        room: Option<AnswerRoom>,
+        bytes: usize,
+    ) -> Option<AnswerRoom> {
         let kib = self.kib(bytes);
         if let Some(room) = room
             && room.0.num_permits() >= kib as usize
@@ -161,32 +165,32 @@ impl Answers {
         }
         let room = self.room.clone().try_acquire_many_owned(kib);
         match room {
-            Ok(room) => Some(Room(room)),
+            Ok(room) => Some(AnswerRoom(room)),
             Err(_) => self.reserve_now(bytes).await,
         }
     }
 
     /// Reserves memory for an answer that has not been encoded yet.
-    pub(crate) async fn reserve(&self, bytes: usize) -> Room {
+    pub(crate) async fn reserve(&self, bytes: usize) -> AnswerRoom {
         let _turn = self.turn.lock().await;
         self.acquire(bytes).await
     }
 
     /// Reserves memory for an encoded answer. `None` if too many encoded answers already wait.
-    async fn reserve_now(&self, bytes: usize) -> Option<Room> {
+    async fn reserve_now(&self, bytes: usize) -> Option<AnswerRoom> {
         let _waiting = self.waiting.try_acquire().ok()?;
         Some(self.acquire(bytes).await)
     }
 
     /// Reserves memory, and closes clients that read too slowly.
-    async fn acquire(&self, bytes: usize) -> Room {
+    async fn acquire(&self, bytes: usize) -> AnswerRoom {
         let mut room = std::pin::pin!(self.room.clone().acquire_many_owned(self.kib(bytes)));
         loop {
             let next = self.close_slowest(Instant::now());
             tokio::select! {
                 biased;
                 room = &mut room => match room {
-                    Ok(room) => return Room(room),
+                    Ok(room) => return AnswerRoom(room),
                     // The semaphore is never closed.
                     Err(_) => std::future::pending().await,
                 },
@@ -220,7 +224,7 @@ impl Answers {
     pub(crate) async fn count(
         self: &Arc<Self>,
         reply: HttpReply,
-        room: Room,
+        room: AnswerRoom,
         reader: &Arc<Reader>,
     ) -> HttpReply {
         let (head, body) = reply.into_parts();

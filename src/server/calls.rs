@@ -23,15 +23,16 @@ use super::{
 };
 use crate::{
     cli::Reads,
+    cluster::sharing::Source,
     gate::{self, State},
-    ledger::{Ledger, Source, delivery::Delivery},
+    ledger::{Ledger, delivery::Delivery},
     limit::rarely,
     master::{Kind, Master, Method, Request},
     status::stats::Stats,
     upstream::{Head, pool::Pool},
     write_queue::{
         WriteQueue,
-        batch::{self, Answer, Answered, Item},
+        batch::{self, AnswerAndDelivery, CallAnswer, Item},
         parts::Parts,
     },
     xmlrpc::{self, ListWriter, Reply, Value},
@@ -221,7 +222,16 @@ impl Calls {
         Some(reply)
     }
 
-    /// Encodes the result of `answer`. `None` if a master could not encode it.
+    /// The mirror's answer to a parameter subscription that is there already, while another computer has the master.
+    pub(super) async fn stand_in_for_subscribed(&self, call: &Request) -> Option<HttpReply> {
+        let reply = self
+            .encode(|| self.ledger.answer_if_subscribed(call))
+            .await?;
+        self.stats.calls_without_master.count();
+        Some(reply)
+    }
+
+    /// Encodes what `answer` gives. None if a master cannot marshal it.
     ///
     /// An answer that takes milliseconds is encoded outside of the runtime, one at a time. Equal answers in a row are
     /// encoded once. Values share memory, so comparing them is quick.
@@ -408,9 +418,9 @@ impl Calls {
                 )
                 .await?;
             let reply = match &answer {
-                Answer::Made(reply) => Some(reply.clone()),
-                Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
-                Answer::Close | Answer::Elsewhere => None,
+                CallAnswer::Made(reply) => Some(reply.clone()),
+                CallAnswer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
+                CallAnswer::Close | CallAnswer::Elsewhere => None,
             };
             match reply.map(|reply| batch::with_uri(&part, reply, &self.uri)) {
                 Some(Reply::Value(Value::Array(results)))
@@ -427,14 +437,14 @@ impl Calls {
     fn http(
         &self,
         call: Option<&Request>,
-        answer: Answer,
+        answer: CallAnswer,
         delivery: Option<Delivery>,
     ) -> Result<HttpReply, Unanswered> {
         let reply = match answer {
-            Answer::Raw(raw) => forwarded(&self.uri, call, raw),
-            Answer::Made(reply) => made(&self.uri, call, &reply),
-            Answer::Close => return Err(Closed(UNANSWERED).into()),
-            Answer::Elsewhere => return Err(Unanswered::Elsewhere),
+            CallAnswer::Raw(raw) => forwarded(&self.uri, call, raw),
+            CallAnswer::Made(reply) => made(&self.uri, call, &reply),
+            CallAnswer::Close => return Err(Closed(UNANSWERED).into()),
+            CallAnswer::Elsewhere => return Err(Unanswered::Elsewhere),
         };
         Ok(delivered(reply, delivery))
     }
@@ -447,11 +457,11 @@ impl Calls {
         body: Bytes,
         call: Option<Arc<Request>>,
         source: Source,
-    ) -> Result<Answered, Unanswered> {
+    ) -> Result<AnswerAndDelivery, Unanswered> {
         if self.gate.state() == State::Injecting
             && let Some((reply, delivery)) = self.answer_if_unchanged(call.as_deref()).await
         {
-            return Ok((Answer::Made(reply), delivery));
+            return Ok((CallAnswer::Made(reply), delivery));
         }
         let (mut item, mut answered) = Item::new(Some((head, body)), call.clone());
         item.source = source;
@@ -486,7 +496,7 @@ impl Calls {
                     patient = false;
                     self.slow.notify_one();
                     if let Some((reply, delivery)) = self.answer_if_unchanged(call).await {
-                        return Ok((Answer::Made(reply), delivery));
+                        return Ok((CallAnswer::Made(reply), delivery));
                     }
                 }
             }

@@ -13,7 +13,7 @@ use crate::{
     clock,
     status::{
         report::ms,
-        summary::{Caller, Client},
+        summary::{Caller, ClientStatus},
     },
 };
 
@@ -73,9 +73,9 @@ impl Times {
 
 impl Clients {
     /// Lists a connection from `peer` until the result is dropped.
-    pub fn enter(&self, peer: SocketAddr) -> Present<'_> {
+    pub fn enter(&self, peer: SocketAddr) -> ListedClient<'_> {
         self.present.insert(peer, Seen::default());
-        Present {
+        ListedClient {
             clients: self,
             peer,
         }
@@ -154,8 +154,8 @@ impl Clients {
     }
 
     /// The connections sorted by caller id, at most [`LISTED`].
-    pub(crate) fn list(&self) -> Vec<Client> {
-        let clients = self.present.iter().take(LISTED).map(|entry| Client {
+    pub(crate) fn list(&self) -> Vec<ClientStatus> {
+        let clients = self.present.iter().take(LISTED).map(|entry| ClientStatus {
             peer: entry.key().to_string(),
             caller_id: entry.caller_id.clone(),
             calls: entry.calls,
@@ -168,12 +168,12 @@ impl Clients {
 
 /// Removes a connection from the list when it ends.
 #[derive(Debug)]
-pub struct Present<'a> {
+pub struct ListedClient<'a> {
     clients: &'a Clients,
     peer: SocketAddr,
 }
 
-impl Drop for Present<'_> {
+impl Drop for ListedClient<'_> {
     fn drop(&mut self) {
         if let Some((peer, seen)) = self.clients.present.remove(&self.peer) {
             self.clients.keep(seen.caller(&peer), seen.times);
@@ -192,7 +192,7 @@ mod tests {
         let present = clients.enter(peer);
         clients.called(peer, "/talker");
         clients.called(peer, "/talker");
-        let expected = Client {
+        let expected = ClientStatus {
             peer: peer.to_string(),
             caller_id: "/talker".to_owned(),
             calls: 2,

@@ -25,12 +25,13 @@ use crate::{
     cluster::{
         journal::RECORD_BYTES_MAX,
         merge::wire::Ask,
-        way::{Place, Way},
+        sharing::Source,
+        standing::{Pass, Place, Standing},
     },
-    ledger::Source,
     master::{CALLER_ID, Kind, Method, Request, names},
     nodes::served::Served,
     order::ANSWER_LIMIT,
+    ros_env::MasterUri,
     upstream::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
@@ -40,7 +41,9 @@ use crate::{
 
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// rosrescue's own method by which `rosrescue handover` asks the leader to hand over.
+/// The error if the leader's address in etcd is unusable.
+const NO_ADDRESS: &str = "the leader's address cannot be used";
+/// The method by which `rosrescue handover` asks the leader to give up leadership.
 pub(crate) const HANDOVER: &str = "rosrescue/handover";
 
 /// A handover request: the computer that should lead, and a channel for the result. The result is the previous leader's
@@ -50,7 +53,7 @@ pub(crate) type Handover = (String, oneshot::Sender<Result<String, String>>);
 /// The connection to the other computers of the robot.
 #[derive(Clone, Debug)]
 pub(crate) struct Others {
-    pub(crate) way: watch::Receiver<Way>,
+    pub(crate) standing: watch::Receiver<Standing>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
     /// Hosts whose nodes use this rosrescue as their master.
@@ -188,14 +191,14 @@ impl Others {
             call,
             kind,
         };
-        let mut way = self.way.clone();
-        self.conduct(&on_its_way, &mut way, asked_term).await
+        let mut standing = self.standing.clone();
+        self.conduct(&on_its_way, &mut standing, asked_term).await
     }
 
     async fn conduct(
         &self,
         call: &Call<'_>,
-        way: &mut watch::Receiver<Way>,
+        standing: &mut watch::Receiver<Standing>,
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
@@ -207,9 +210,9 @@ impl Others {
             if sent && deletes.is_some() && call.deletes().is_none() {
                 return Ok(deleted(deletes.as_deref().unwrap_or_default()));
             }
-            let now = way.borrow_and_update().clone();
+            let now = standing.borrow_and_update().clone();
             if let Some(term) = asked_term
-                && now != (Way::Here { term: Some(term) })
+                && !now.answers_others(term)
             {
                 return Ok(not_leading(term));
             }
@@ -219,7 +222,10 @@ impl Others {
             }
             let mut by_mirror = false;
             let retry = match now {
-                Way::Here { .. } => {
+                Standing::Leads {
+                    pass: Pass::Calls, ..
+                }
+                | Standing::Alone => {
                     if let Some(to) = call.hands_over() {
                         return Ok(self.hand_over(to).await);
                     }
@@ -231,16 +237,16 @@ impl Others {
                         calls, head, body, ..
                     } = call;
                     let (head, body, request) = (head.clone(), body.clone(), call.call.clone());
-                    let mut leads = self.way.clone();
+                    let mut standing = self.standing.clone();
                     let source = match asked_term {
                         Some(_) => Source::Forwarded,
                         None => Source::Here,
                     };
                     let answered = tokio::select! {
                         biased;
-                        // Writes answered while cut off last only if no other computer changes them. The computer that
-                        // asked may not be cut off, and may be about to lead.
-                        _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
+                        // A cut-off computer answers only its own nodes. The computer that forwarded this call may
+                        // not be cut off, and may be about to lead.
+                        _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, source) => answered,
                     };
                     match answered {
@@ -258,7 +264,8 @@ impl Others {
                         answered => return Ok(answered?),
                     }
                 }
-                Way::Leader { uri, term } => {
+                Standing::Follows { uri, term } => {
+                    let uri = MasterUri::parse(&uri).map_err(|_| Closed(NO_ADDRESS))?;
                     let leader = self.peers.at(&uri);
                     if call.hands_over().is_some() {
                         // The request is sent only once: after a failure, the next leader would hand over as well.
@@ -277,11 +284,16 @@ impl Others {
                             Some(reply) => return Ok(reply),
                             None => Some(Instant::now() + RETRY_PAUSE),
                         },
-                        // The answer would never come, or would no longer count.
-                        _ = way.changed(), if call.kind != Kind::Read => continue,
+                        // Its answer would never come, or no longer counts.
+                        _ = standing.changed(), if call.kind != Kind::Read => continue,
                     }
                 }
-                Way::Nobody { known } => {
+                // Waits until the next leader has taken over, or the merge is done.
+                Standing::Leads { pass, .. } => {
+                    by_mirror = pass == Pass::Reads;
+                    None
+                }
+                Standing::Nobody { known } => {
                     by_mirror = known;
                     None
                 }
@@ -295,7 +307,7 @@ impl Others {
             tokio::select! {
                 biased;
                 Some(reply) = call.by_mirror_when_fresh(), if by_mirror => return Ok(reply),
-                changed = way.changed() => changed.map_err(|_| Closed("rosrescue is stopping"))?,
+                changed = standing.changed() => changed.map_err(|_| Closed("rosrescue is stopping"))?,
                 () = retry => {}
                 () = &mut hold => {
                     call.calls.stats.calls_unanswered.count();
@@ -307,10 +319,10 @@ impl Others {
 
     /// Makes the writes of a computer that was cut off. `None` if this computer no longer leads.
     async fn merge(&self, calls: &Calls, ask: Ask) -> Option<HttpReply> {
-        let mut leads = self.way.clone();
+        let mut standing = self.standing.clone();
         tokio::select! {
             biased;
-            _ = leads.wait_for(|way| *way == Way::Here { term: None }) => None,
+            _ = standing.wait_for(|now| *now == Standing::Alone) => None,
             answer = calls.write_queue.merge(ask) => Some(xml(&answer?.to_reply())),
         }
     }
@@ -365,8 +377,9 @@ impl Call<'_> {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
         let seq = seq.unwrap_or(0);
+        let epoch = self.others.followed.borrow().epoch;
         let mut told = self.others.told();
-        *told = told.max(Place { term, seq });
+        *told = told.max(Place { epoch, term, seq });
         drop(told);
         let number = raw.headers.get(peer::ANSWER_HEADER);
         let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
@@ -385,7 +398,7 @@ impl Call<'_> {
 
     /// The leader's answer. For a slow read, the mirror's answer. `None` if there is no answer now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
-        if self.kind != Kind::Read {
+        if self.kind != Kind::Read && !self.is_subscribed() {
             return match leader.forward(term, &self.head, &self.body).await {
                 Ok(raw) => Some(self.pass_on(leader, term, raw)),
                 Err(error) => {
@@ -440,24 +453,34 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// The mirror's answer to a read. `None` for other calls. Also `None` if the leader's answers on this computer have
-    /// shown a later state than the mirror's: reads on one computer never go back in time.
+    /// Whether this is a parameter subscription that exists already. Nodes repeat it each time they log, and must not
+    /// wait for a takeover.
+    fn is_subscribed(&self) -> bool {
+        let call = self.call.as_ref();
+        call.is_some_and(|call| self.calls.ledger.answer_if_subscribed(call).is_some())
+    }
+
+    /// The mirror's answer to a read or to an existing subscription. `None` for any other call, and `None` as long as
+    /// the mirror is behind the leader's earlier answers, so that no read goes back in time on one computer.
     async fn by_mirror(&self) -> Option<HttpReply> {
-        let read = self.call.as_ref().filter(|_| self.kind == Kind::Read)?;
+        let call = self.call.as_ref()?;
         let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
-        match followed >= told {
-            true => self.calls.stand_in(Some(read)).await,
-            false => None,
+        if !followed.shows(told) {
+            return None;
+        }
+        match self.kind {
+            Kind::Read => self.calls.stand_in(Some(call)).await,
+            _ => self.calls.stand_in_for_subscribed(call).await,
         }
     }
 
     /// Waits until the mirror has caught up, then does as [`Self::by_mirror`].
     async fn by_mirror_when_fresh(&self) -> Option<HttpReply> {
-        if self.kind != Kind::Read {
+        if self.kind != Kind::Read && !self.is_subscribed() {
             return None;
         }
         let mut followed = self.others.followed.clone();
-        let fresh = followed.wait_for(|followed| *followed >= *self.others.told());
+        let fresh = followed.wait_for(|followed| followed.shows(*self.others.told()));
         fresh.await.ok()?;
         self.by_mirror().await
     }

@@ -25,7 +25,7 @@ use crate::{
 };
 
 /// The reply that hyper sends.
-pub(crate) type HttpReply = Response<Content>;
+pub(crate) type HttpReply = Response<ReplyBody>;
 
 /// A value in a reply's extensions that is dropped when the reply has been written, or never will be.
 #[derive(Clone)]
@@ -50,20 +50,20 @@ pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> Htt
 
 /// The body of a reply.
 #[derive(Debug)]
-pub(crate) enum Content {
+pub(crate) enum ReplyBody {
     /// The whole body.
     Whole(Full<Bytes>),
     /// A stream that is produced while the client reads it.
     Events(mpsc::Receiver<Bytes>),
 }
 
-impl From<Bytes> for Content {
+impl From<Bytes> for ReplyBody {
     fn from(bytes: Bytes) -> Self {
         Self::Whole(Full::new(bytes))
     }
 }
 
-impl Body for Content {
+impl Body for ReplyBody {
     type Data = Bytes;
     type Error = Infallible;
 
@@ -114,7 +114,7 @@ pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> Htt
 }
 
 fn plain(raw: RawReply) -> HttpReply {
-    let mut reply = Response::new(Content::from(raw.body));
+    let mut reply = Response::new(ReplyBody::from(raw.body));
     *reply.status_mut() = raw.status;
     if let Some(reason) = raw.reason {
         reply.extensions_mut().insert(reason);
@@ -133,7 +133,7 @@ pub(super) fn xml(reply: &Reply) -> HttpReply {
 
 /// A reply made by rosrescue that is already encoded.
 pub(super) fn encoded(reply: impl Into<Bytes>) -> HttpReply {
-    let mut http = Response::new(Content::from(reply.into()));
+    let mut http = Response::new(ReplyBody::from(reply.into()));
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http
@@ -146,7 +146,7 @@ pub(super) fn no_shutdown(why: &str) -> HttpReply {
 
 /// A reply that is not XML-RPC.
 pub(super) fn page(status: StatusCode, kind: &'static str, content: impl Into<Bytes>) -> HttpReply {
-    let mut http = Response::new(Content::from(content.into()));
+    let mut http = Response::new(ReplyBody::from(content.into()));
     *http.status_mut() = status;
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static(kind));

@@ -16,7 +16,7 @@ use hyper::{
 use super::{
     Server,
     access::Grant,
-    admission::{self, Refusal},
+    admission::{self, Rejection},
     answers,
     body::{self, BodyError, Room},
     calls::Closed,
@@ -213,14 +213,14 @@ async fn page(
     Ok(server.answers.count(page, room, &deadlines.reader).await)
 }
 
-fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
+fn refuse(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     server.stats.requests_refused.count();
     rarely!(warn, %peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
 /// Like [`refuse`], but logs each address at most once a minute, because nodes call again and again.
-fn keep_out(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
+fn keep_out(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     let mut said = server
         .refused
         .lock()

@@ -16,7 +16,7 @@ pub(crate) struct Computers {
     /// Since when it has this role.
     pub(crate) since: f64,
     /// The present leader. If there is none, the last one.
-    pub(crate) leader: Option<Leader>,
+    pub(crate) leader: Option<LeaderStatus>,
     /// Since when there is no leader. `None` if there is one.
     pub(crate) leaderless_since: Option<f64>,
     /// The last journal record that this computer knows of.
@@ -38,7 +38,7 @@ pub(crate) struct Computers {
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Leader {
+pub(crate) struct LeaderStatus {
     pub(crate) name: String,
     /// Address at which nodes and other computers reach the leader.
     pub(crate) uri: String,
@@ -99,7 +99,7 @@ impl From<&ClusterFacts> for Computers {
             name: facts.name.clone(),
             role: facts.role,
             since: clock::wall_time_of(facts.since),
-            leader: facts.leader.as_ref().map(Leader::from),
+            leader: facts.leader.as_ref().map(LeaderStatus::from),
             leaderless_since: facts.leaderless.map(clock::wall_time_of),
             seq: facts.seq,
             behind: facts.behind,
@@ -116,7 +116,7 @@ impl From<&ClusterFacts> for Computers {
     }
 }
 
-impl From<&LeaderFacts> for Leader {
+impl From<&LeaderFacts> for LeaderStatus {
     fn from(facts: &LeaderFacts) -> Self {
         Self {
             name: facts.name.clone(),
@@ -162,7 +162,7 @@ impl From<&Takeover> for Taken {
 
 impl Computers {
     /// The present leader. `None` if there is none.
-    pub(crate) fn leads(&self) -> Option<&Leader> {
+    pub(crate) fn leads(&self) -> Option<&LeaderStatus> {
         self.leader
             .as_ref()
             .filter(|_| self.leaderless_since.is_none())
@@ -269,7 +269,7 @@ impl Computers {
 
 impl Computer {
     /// Describes the computer's role. A computer that is cut off may still name an earlier leader.
-    fn doing(&self, leader: Option<&Leader>) -> String {
+    fn doing(&self, leader: Option<&LeaderStatus>) -> String {
         let doing = match self.role {
             Role::Joining => "is joining",
             Role::Following => "is following",

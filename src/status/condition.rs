@@ -12,7 +12,7 @@ use crate::{clock, gate::State};
 /// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Name {
+pub(crate) enum ConditionName {
     /// Calls pass to the master and every change is recorded.
     Protected,
     /// Another computer leads, and this one forwards calls to it.
@@ -31,7 +31,7 @@ pub(crate) enum Name {
     Waiting,
 }
 
-impl Name {
+impl ConditionName {
     pub(crate) const ALL: [Self; 8] = [
         Self::Protected,
         Self::Following,
@@ -75,7 +75,7 @@ impl Name {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Condition {
     /// The worst condition that applies.
-    pub(crate) name: Name,
+    pub(crate) name: ConditionName,
     /// When the condition began, in seconds since 1970 by the wall clock.
     pub(crate) since: f64,
     /// What nodes notice now, in one or more sentences.
@@ -92,7 +92,10 @@ impl Condition {
 
     /// Whether changes are recorded and calls pass to a master, on this computer or on the leader.
     pub(crate) fn is_protected(&self) -> bool {
-        matches!(self.name, Name::Protected | Name::Following)
+        matches!(
+            self.name,
+            ConditionName::Protected | ConditionName::Following
+        )
     }
 
     /// The condition in one line, as systemd shows it.
@@ -128,10 +131,15 @@ pub(crate) struct Situation {
 pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let (mut text, mut action) = nodes_notice(now, facts);
     let (mut name, mut since) = match now.gate {
-        State::Unknown => (Name::Waiting, now.gate_since),
-        State::StandingIn | State::Late | State::Injecting => (Name::StandingIn, now.gate_since),
-        State::Elsewhere => (Name::NoLeader, now.gate_since),
-        State::Open { .. } => (Name::Protected, now.gate_since.max(facts.settled_since())),
+        State::Unknown => (ConditionName::Waiting, now.gate_since),
+        State::StandingIn | State::Late | State::Injecting => {
+            (ConditionName::StandingIn, now.gate_since)
+        }
+        State::Elsewhere => (ConditionName::NoLeader, now.gate_since),
+        State::Open { .. } => (
+            ConditionName::Protected,
+            now.gate_since.max(facts.settled_since()),
+        ),
     };
     if let Some(cluster) = &facts.cluster {
         match computers::notice(now.gate, cluster) {
@@ -147,13 +155,13 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         }
     }
     if let Some(since_loop) = facts.crash_loop
-        && name < Name::CrashLoop
+        && name < ConditionName::CrashLoop
     {
-        (name, since) = (Name::CrashLoop, since_loop);
+        (name, since) = (ConditionName::CrashLoop, since_loop);
     }
     if let Some(reason) = &now.unprotected {
-        if name < Name::Unprotected {
-            (name, since) = (Name::Unprotected, facts.disk.unprotected_since());
+        if name < ConditionName::Unprotected {
+            (name, since) = (ConditionName::Unprotected, facts.disk.unprotected_since());
         }
         text += &format!(
             " Changes are not recorded, and a crash of rosrescue would lose them: {reason}."
@@ -180,7 +188,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         }
         Guarded::Nobody | Guarded::Systemd | Guarded::Guardian { .. } => {}
     }
-    if matches!(name, Name::Protected | Name::Following) {
+    if matches!(name, ConditionName::Protected | ConditionName::Following) {
         text += match facts.bypassing.is_empty() {
             true => " Every change is recorded.",
             false => " Every change through rosrescue is recorded.",
@@ -273,17 +281,23 @@ mod tests {
             good.line(),
             "protected: Nodes work as usual: the master answers. Every change is recorded."
         );
-        assert_eq!(of(State::Unknown, None, &facts).name, Name::Waiting);
+        assert_eq!(
+            of(State::Unknown, None, &facts).name,
+            ConditionName::Waiting
+        );
         let away = of(State::StandingIn, None, &facts);
-        assert_eq!(away.name, Name::StandingIn);
+        assert_eq!(away.name, ConditionName::StandingIn);
         assert!(away.text.starts_with("Nodes keep working"), "{away:?}");
         assert!(away.action.unwrap().contains("http://robot:11312/"));
 
         facts.crash_loop = Some(Instant::now());
         facts.deaths = 7;
-        assert_eq!(of(State::StandingIn, None, &facts).name, Name::CrashLoop);
+        assert_eq!(
+            of(State::StandingIn, None, &facts).name,
+            ConditionName::CrashLoop
+        );
         let between = of(OPEN, None, &facts);
-        assert_eq!(between.name, Name::CrashLoop);
+        assert_eq!(between.name, ConditionName::CrashLoop);
         assert!(
             between.text.starts_with("Nodes work as usual"),
             "{between:?}"
@@ -304,7 +318,7 @@ mod tests {
         for guarded in [Guarded::NoLonger(7), Guarded::Stopped(7)] {
             facts.guarded = guarded;
             let condition = of(OPEN, None, &facts);
-            assert_eq!(condition.name, Name::Protected);
+            assert_eq!(condition.name, ConditionName::Protected);
             assert!(!condition.is_good() && !guarded.is_guarded());
             assert!(condition.text.contains("process 7"), "{condition:?}");
         }
@@ -315,7 +329,7 @@ mod tests {
         let mut facts = Facts::new(Mode::Proxy);
         facts.bypassing = vec!["rosout (process 7)".to_owned()];
         let condition = of(OPEN, None, &facts);
-        assert_eq!(condition.name, Name::Protected);
+        assert_eq!(condition.name, ConditionName::Protected);
         assert!(!condition.is_good());
         let said = "1 client talks directly to the master, unprotected: rosout (process 7).";
         assert!(condition.text.contains(said), "{condition:?}");

@@ -5,7 +5,7 @@
 
 use std::fmt::{Display, Write};
 
-use super::{computers::Computers, condition::Name, stats::Stats, summary::Status};
+use super::{computers::Computers, condition::ConditionName, stats::Stats, summary::Status};
 use crate::cluster::machine::Role;
 
 /// The text that `/metrics` answers with.
@@ -51,7 +51,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
             add(&mut text, name, help, value);
         }
     }
-    let names = Name::ALL.map(|name| (name.as_str(), status.condition.name == name));
+    let names = ConditionName::ALL.map(|name| (name.as_str(), status.condition.name == name));
     let help = "1 for the present condition, as in /status.json, and 0 for the others";
     add_one_of(&mut text, "condition", help, "name", &names);
     if let Some(cluster) = &status.cluster {

@@ -22,7 +22,7 @@ pub(crate) const CUT_OFF: &str = "this computer was cut off from the others";
 /// How the present master got its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Outcome {
+pub enum RecoveryOutcome {
     /// A new session: master and mirror were both empty.
     Begun,
     /// A new master got the mirror's state.
@@ -35,14 +35,14 @@ pub enum Outcome {
     Resumed,
 }
 
-impl Outcome {
+impl RecoveryOutcome {
     /// Whether the master is a new incarnation.
     pub fn is_new(self) -> bool {
         !matches!(self, Self::Reconciled | Self::Resumed)
     }
 }
 
-impl fmt::Display for Outcome {
+impl fmt::Display for RecoveryOutcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Begun => "a new session started with a new master",
@@ -81,7 +81,7 @@ pub struct Report {
     /// logs.
     pub detected_at: f64,
     /// How the master got its state.
-    pub outcome: Outcome,
+    pub outcome: RecoveryOutcome,
     /// The process id that the master reports.
     pub master_pid: i32,
     /// HTTP version and Python version of the master, as text.
@@ -115,7 +115,11 @@ pub struct Report {
 impl Report {
     /// Whether the recovery is a rescue. An ordinary start is not.
     pub(crate) fn is_rescue(&self) -> bool {
-        !(self.cause == STARTED && matches!(self.outcome, Outcome::Begun | Outcome::Adopted))
+        !(self.cause == STARTED
+            && matches!(
+                self.outcome,
+                RecoveryOutcome::Begun | RecoveryOutcome::Adopted
+            ))
     }
 
     /// Adds the results of the health check.

@@ -13,7 +13,7 @@ pub(crate) const SCHEMA: u32 = 1;
 
 /// A client's connection.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Client {
+pub(crate) struct ClientStatus {
     pub(crate) peer: String,
     /// Caller id of the last call, shortened if it is long.
     pub(crate) caller_id: String,
@@ -36,7 +36,7 @@ pub(crate) struct Caller {
 
 /// Sizes and times of the checkpoint's journal.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Journal {
+pub(crate) struct JournalStatus {
     /// Number of records since the checkpoint was last rewritten as a whole.
     pub(crate) records: u64,
     pub(crate) bytes: u64,
@@ -100,7 +100,7 @@ pub(crate) struct Status {
     pub(crate) checkpoint: String,
     /// Why the state is not recorded. `None` if it is.
     pub(crate) unprotected: Option<String>,
-    pub(crate) journal: Journal,
+    pub(crate) journal: JournalStatus,
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
     pub(crate) guarded: bool,
     pub(crate) guarded_by: String,
@@ -130,7 +130,7 @@ pub(crate) struct Status {
     /// The callers with the longest calls, at most 20.
     pub(crate) slowest_callers: Vec<Caller>,
     /// Connections of clients, at most 1,000.
-    pub(crate) clients: Vec<Client>,
+    pub(crate) clients: Vec<ClientStatus>,
     /// Counters since this process started.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
     /// The robot's computers. `None` without `--cluster`.

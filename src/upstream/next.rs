@@ -13,7 +13,7 @@ const AGE_MAX: Duration = Duration::from_millis(500);
 
 /// A connection for the next call.
 #[derive(Debug)]
-pub(crate) enum Next {
+pub(crate) enum NextConnection {
     /// The connection of the last call, which the master has left open.
     Kept(Box<Verified>),
     /// A new connection, made before it is needed because the master closes each one after one answer. So the next call
@@ -21,7 +21,7 @@ pub(crate) enum Next {
     Ahead(AbortOnDropHandle<Result<Verified, VerifyError>>, Instant),
 }
 
-impl Next {
+impl NextConnection {
     /// The connection after `reply` has come on `verified`: the same one, or a new one made by `connect`. `None` if the
     /// next call has to connect.
     pub(crate) fn after(
@@ -100,14 +100,14 @@ mod tests {
             let last = connect(upstream.clone()).await.unwrap();
             let (last_end, _) = listener.accept().await.unwrap();
             (
-                Next::after(last, &reply, connect(upstream.clone())),
+                NextConnection::after(last, &reply, connect(upstream.clone())),
                 last_end,
             )
         };
         let by_sentinel = || Verification::Sentinel(sentinel.clone());
 
         let (next, _open) = after(reply(true), by_sentinel()).await;
-        assert!(matches!(next, Some(Next::Kept(_))));
+        assert!(matches!(next, Some(NextConnection::Kept(_))));
 
         let (next, _) = after(reply(false), by_sentinel()).await;
         let (accepted, _) = listener.accept().await.unwrap();
@@ -118,10 +118,10 @@ mod tests {
 
         // A connection that the master may close soon is not used.
         let (next, _) = after(reply(false), by_sentinel()).await;
-        let Some(Next::Ahead(made, since)) = next else {
+        let Some(NextConnection::Ahead(made, since)) = next else {
             panic!("{next:?}")
         };
-        assert!(Next::Ahead(made, since - 2 * AGE_MAX).is_stale());
+        assert!(NextConnection::Ahead(made, since - 2 * AGE_MAX).is_stale());
 
         // A tunnel may lead to another master before the connection is used.
         let (next, _) = after(reply(false), Verification::TokenAfterwards).await;

@@ -11,7 +11,7 @@ use tokio::sync::Semaphore;
 
 use super::{
     CallError, Head, RawReply, Upstream, VerifyError,
-    next::Next,
+    next::NextConnection,
     verify::{self, Verified},
 };
 use crate::{
@@ -40,7 +40,7 @@ pub struct Pool {
     gate: gate::Rx,
     permits: Semaphore,
     /// Idle connections, each with its incarnation.
-    idle: Mutex<Vec<(u64, Next)>>,
+    idle: Mutex<Vec<(u64, NextConnection)>>,
     /// Number of reads that have waited too long for the master.
     stalled: AtomicUsize,
 }
@@ -79,7 +79,7 @@ impl Pool {
         Stalled(self)
     }
 
-    fn take_idle(&self, incarnation: u64) -> Option<Next> {
+    fn take_idle(&self, incarnation: u64) -> Option<NextConnection> {
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         idle.retain_mut(|(of, next)| *of == incarnation && !next.is_stale());
         idle.pop().map(|(_, next)| next)
@@ -87,7 +87,7 @@ impl Pool {
 
     fn put_idle(&self, incarnation: u64, token: Token, verified: Verified, reply: &RawReply) {
         let connect = connect(self.upstream.clone(), token);
-        if let Some(next) = Next::after(verified, reply, connect) {
+        if let Some(next) = NextConnection::after(verified, reply, connect) {
             let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
             idle.push((incarnation, next));
         }

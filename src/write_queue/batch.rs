@@ -7,7 +7,8 @@ use tokio::sync::oneshot;
 
 use super::merge::Merge;
 use crate::{
-    ledger::{Source, activity::LastCalls, delivery::Delivery},
+    cluster::sharing::Source,
+    ledger::{activity::LastCalls, delivery::Delivery},
     master::{Entry, Kind, Method, Request, entry_reply},
     order::{BySubject, Concern, Order},
     upstream::{Head, RawReply},
@@ -21,7 +22,7 @@ pub(super) const CALLS_MAX: usize = 100;
 pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]
-pub(crate) enum Answer {
+pub(crate) enum CallAnswer {
     /// The master's reply as it came.
     Raw(RawReply),
     /// A reply that rosrescue must encode: the mirror's, or one result out of a batch.
@@ -38,13 +39,13 @@ pub(crate) struct Item {
     pub raw: Option<(Head, Bytes)>,
     /// The call. `None` if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
-    answer: oneshot::Sender<Answered>,
+    answer: oneshot::Sender<AnswerAndDelivery>,
     /// The subjects of the call, for the order in which nodes hear of them.
     concern: Concern,
     /// The answer's place in the order. Set once the call is on its way to the master, or the mirror has answered it.
     pub delivery: Option<Delivery>,
     /// For a call made by rosrescue: the condition under which it is still wanted.
-    pub condition: Option<Condition>,
+    pub condition: Option<Precondition>,
     /// Whether nodes whose port the call takes have been unregistered.
     pub way_made: bool,
     pub source: Source,
@@ -53,17 +54,17 @@ pub(crate) struct Item {
 }
 
 /// An answer, and what must be dropped when the caller has it.
-pub(crate) type Answered = (Answer, Option<Delivery>);
+pub(crate) type AnswerAndDelivery = (CallAnswer, Option<Delivery>);
 
 /// A node and its last calls at the time when rosrescue decided to register or unregister something for it. The
 /// condition fails if the node itself does the opposite meanwhile.
 #[derive(Clone, Debug)]
-pub struct Condition {
+pub struct Precondition {
     pub node: String,
     pub last_calls: LastCalls,
 }
 
-impl Condition {
+impl Precondition {
     /// Whether the condition holds for a call of this kind, given the node's last calls `now`.
     pub fn holds(&self, kind: Kind, now: LastCalls) -> bool {
         match kind {
@@ -79,7 +80,7 @@ impl Item {
     pub(crate) fn new(
         raw: Option<(Head, Bytes)>,
         call: Option<Arc<Request>>,
-    ) -> (Self, oneshot::Receiver<Answered>) {
+    ) -> (Self, oneshot::Receiver<AnswerAndDelivery>) {
         let (answer, answered) = oneshot::channel();
         let item = Self {
             concern: Concern::of(call.as_deref()),
@@ -105,7 +106,7 @@ impl Item {
         self.concern = Concern::default();
     }
 
-    pub(super) fn reply(self, answer: Answer) {
+    pub(super) fn reply(self, answer: CallAnswer) {
         let _ = self.answer.send((answer, self.delivery));
     }
 

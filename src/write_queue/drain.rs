@@ -10,12 +10,12 @@ use std::{
 use tokio::sync::{mpsc, watch};
 use tracing::Instrument;
 
-use super::batch::{self, Answer, Item};
+use super::batch::{self, CallAnswer, Item};
 use super::{
     Link, Signals, evict, merge,
     outdated::is_outdated,
     resync::ResyncSchedule,
-    round_trip::{Done, Received, RoundTripError, round_trip},
+    round_trip::{Received, RoundTripError, RoundTripResult, round_trip},
 };
 use crate::{
     gate::{self, State},
@@ -23,7 +23,7 @@ use crate::{
     limit::rarely,
     master::{Master, Method, Request},
     status::stats::Stats,
-    upstream::{RawReply, inspect::InspectError, next::Next},
+    upstream::{RawReply, inspect::InspectError, next::NextConnection},
     wait,
     xmlrpc::{self, Reply},
 };
@@ -48,7 +48,7 @@ struct InFlight {
     /// Whether the mirror has answered the items and the master has not.
     late: bool,
     sent: tokio::time::Instant,
-    done: Pin<Box<dyn Future<Output = Done> + Send>>,
+    done: Pin<Box<dyn Future<Output = RoundTripResult> + Send>>,
 }
 
 pub(crate) struct Drain {
@@ -58,7 +58,7 @@ pub(crate) struct Drain {
     resync_interval: Option<Duration>,
     items: mpsc::Receiver<Item>,
     pub(super) queue: VecDeque<Item>,
-    connection: Option<(u64, Next)>,
+    connection: Option<(u64, NextConnection)>,
     in_flight: Option<InFlight>,
     /// Until when the batch in flight may continue behind a shut gate.
     grace: Option<tokio::time::Instant>,
@@ -88,7 +88,7 @@ pub(crate) struct Drain {
 #[derive(Default)]
 struct Opaque {
     incarnation: u64,
-    answers: Vec<(Item, Answer)>,
+    answers: Vec<(Item, CallAnswer)>,
     mark: Mark,
 }
 
@@ -242,7 +242,7 @@ impl Drain {
             && is_outdated(&self.link.ledger, own)
             && let Some(own) = self.queue.pop_front()
         {
-            own.reply(Answer::Close);
+            own.reply(CallAnswer::Close);
         }
         self.held_until = None;
         let inspects = self.resync.begin(tokio::time::Instant::now());
@@ -282,7 +282,7 @@ impl Drain {
         });
     }
 
-    fn done(&mut self, done: Done) {
+    fn done(&mut self, done: RoundTripResult) {
         let Some(InFlight {
             incarnation,
             version,
@@ -305,7 +305,12 @@ impl Drain {
         }
         match done.result {
             Ok(Received::Held(state)) => self.resync(incarnation, version, *state),
-            Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
+            Ok(Received::Reply(raw)) => {
+                let (took, calls) = (sent.elapsed(), items.len());
+                let ledger = &self.link.ledger;
+                ledger.with_order(|order, _| order.master_answered(took, calls));
+                self.deliver(incarnation, items, raw);
+            }
             Err(error) => self.failed(items, &error),
         }
         // A master that ran a lost batch may have notified nodes, and the mirror does not know yet of what.
@@ -438,18 +443,18 @@ impl Drain {
             self.opaque.mark = self.opaque.mark.max(recorded.mark);
             let answers = items
                 .into_iter()
-                .map(|item| (item, Answer::Raw(raw.clone())));
+                .map(|item| (item, CallAnswer::Raw(raw.clone())));
             self.opaque.answers.extend(answers);
             return;
         }
         let answers = match items.len() {
             1 => items
                 .into_iter()
-                .map(|item| (item, Answer::Raw(raw.clone())))
+                .map(|item| (item, CallAnswer::Raw(raw.clone())))
                 .collect(),
             _ => items
                 .into_iter()
-                .zip(replies.into_iter().map(Answer::Made))
+                .zip(replies.into_iter().map(CallAnswer::Made))
                 .collect(),
         };
         self.answer(recorded.mark, None, answers);
@@ -464,7 +469,7 @@ impl Drain {
         );
         self.link.ledger.doubt();
         for item in items {
-            item.reply(Answer::Close);
+            item.reply(CallAnswer::Close);
         }
     }
 
@@ -541,7 +546,7 @@ impl Drain {
         let mut answers = Answers::default();
         for item in std::mem::take(&mut self.queue) {
             if is_outdated(&ledger, &item) {
-                item.reply(Answer::Close);
+                item.reply(CallAnswer::Close);
                 continue;
             }
             let Some(item) = merge::judged(&ledger, item) else {
@@ -568,20 +573,20 @@ impl Drain {
         let items = in_flight.into_iter().flatten();
         let items = items.chain(opaque.into_iter().map(|(item, _)| item));
         for item in items.chain(self.queue.drain(..)) {
-            item.reply(Answer::Elsewhere);
+            item.reply(CallAnswer::Elsewhere);
         }
     }
 
     /// Sends answers once their effects are safe (see
     /// [`Ledger::durable`](crate::ledger::Ledger::durable)) and a whole checkpoint includes this
     /// `version` of the mirror.
-    fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, Answer)>) {
+    fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, CallAnswer)>) {
         let mark = self.link.ledger.to_await(mark);
         let send = move |is_safe: bool| {
             for (item, answer) in answers {
                 item.reply(match is_safe {
                     true => answer,
-                    false => Answer::Elsewhere,
+                    false => CallAnswer::Elsewhere,
                 });
             }
         };
@@ -605,7 +610,7 @@ impl Drain {
 /// Answers from the mirror.
 #[derive(Default)]
 struct Answers {
-    made: Vec<(Item, Answer)>,
+    made: Vec<(Item, CallAnswer)>,
     /// Mark of the last record.
     mark: Mark,
 }
@@ -620,7 +625,7 @@ impl Answers {
         };
         item.delivery = delivery;
         self.mark = self.mark.max(mark);
-        self.made.push((item, Answer::Made(reply)));
+        self.made.push((item, CallAnswer::Made(reply)));
         None
     }
 

@@ -4,7 +4,7 @@
 use std::{sync::Arc, time::Instant};
 
 use super::{
-    batch::{self, Answer, Batch, Item},
+    batch::{self, Batch, CallAnswer, Item},
     drain::Drain,
     merge,
 };
@@ -80,7 +80,7 @@ pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
 fn own(eviction: Eviction, by: String) -> Item {
     let (item, answered) = Item::new(None, Some(Arc::new(eviction.call)));
     tokio::spawn(async move {
-        if let Ok((Answer::Raw(_) | Answer::Made(_), _)) = answered.await {
+        if let Ok((CallAnswer::Raw(_) | CallAnswer::Made(_), _)) = answered.await {
             say(&eviction.nodes, &by);
         }
     });

@@ -5,13 +5,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::sync::oneshot;
 
-use super::batch::{self, Answered, Item};
+use super::batch::{self, AnswerAndDelivery, Item};
 use crate::{
-    cluster::merge::{
-        Verdict,
-        wire::{self, Ask},
+    cluster::{
+        merge::{
+            Verdict,
+            wire::{self, Ask},
+        },
+        sharing::Source,
     },
-    ledger::{Ledger, Source},
+    ledger::Ledger,
     master::Request,
     upstream::Head,
     xmlrpc::{self, Reply, Value},
@@ -27,10 +30,10 @@ impl Judged {
     }
 
     /// The answer to the computer that sent the writes. `reply` is the master's reply to those that were made.
-    pub(super) fn answer(&self, reply: &Reply) -> wire::Answer {
+    pub(super) fn answer(&self, reply: &Reply) -> wire::MergeAnswer {
         match &*self.0.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some(verdicts) => wire::Answer::of(verdicts, reply),
-            None => wire::Answer::Again,
+            Some(verdicts) => wire::MergeAnswer::of(verdicts, reply),
+            None => wire::MergeAnswer::Again,
         }
     }
 }
@@ -43,7 +46,7 @@ pub(crate) struct Merge {
 }
 
 /// Makes an item for the queue. Also returns the receiver of its answer, and the verdicts on its writes.
-pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<Answered>, Judged) {
+pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Judged) {
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
     item.source = Source::Merge(ask.id.clone());
@@ -80,7 +83,7 @@ pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
         .collect();
     judged.set(verdicts);
     if runs.is_empty() {
-        item.reply(batch::Answer::Made(Reply::Value(Value::Nil)));
+        item.reply(batch::CallAnswer::Made(Reply::Value(Value::Nil)));
         return None;
     }
     let call = multicall(runs);

@@ -10,15 +10,15 @@ use crate::{
     upstream::{
         CallError, Head, RawReply, VerifyError,
         inspect::{self, InspectError},
-        next::Next,
+        next::NextConnection,
         verify::{self, Verified},
     },
 };
 
 /// The result of a round trip.
-pub(super) struct Done {
+pub(super) struct RoundTripResult {
     /// The next connection, if there is one already, with its incarnation.
-    pub(super) connection: Option<(u64, Next)>,
+    pub(super) connection: Option<(u64, NextConnection)>,
     pub(super) result: Result<Received, RoundTripError>,
 }
 
@@ -55,9 +55,9 @@ impl RoundTripError {
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,
-    connection: Option<Next>,
+    connection: Option<NextConnection>,
     request: Option<(Head, Bytes)>,
-) -> Done {
+) -> RoundTripResult {
     let upstream = link.upstream.clone();
     let _open = upstream.begin_call();
     let token = link.ledger.token();
@@ -72,7 +72,7 @@ pub(super) async fn round_trip(
     let mut verified = match connected {
         Ok(verified) => verified,
         Err(error) => {
-            return Done {
+            return RoundTripResult {
                 connection: None,
                 result: Err(error.into()),
             };
@@ -91,11 +91,11 @@ pub(super) async fn round_trip(
         }
     };
     let connection = match &result {
-        Ok(Received::Reply(reply)) => Next::after(verified, reply, connect(link, token)),
-        Ok(Received::Held(_)) => Some(Next::Kept(Box::new(verified))),
+        Ok(Received::Reply(reply)) => NextConnection::after(verified, reply, connect(link, token)),
+        Ok(Received::Held(_)) => Some(NextConnection::Kept(Box::new(verified))),
         Err(_) => None,
     };
-    Done {
+    RoundTripResult {
         connection: connection.map(|next| (incarnation, next)),
         result,
     }

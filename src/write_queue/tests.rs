@@ -19,7 +19,7 @@ use bytes::Bytes;
 use tokio::sync::oneshot;
 
 use self::node::{Library, Node, Thread};
-use super::batch::{Answer, Answered, Item, pack};
+use super::batch::{AnswerAndDelivery, CallAnswer, Item, pack};
 use crate::{
     checkpoint::format::Session,
     cli::SyncPolicy,
@@ -28,7 +28,7 @@ use crate::{
     health::port_of,
     ledger::{Ledger, delivery::Delivery, late::CatchUp},
     master::{Kind, Master, Notice, Request},
-    order::{Next, Subject},
+    order::{NextNotification, Subject},
     status::stats::Stats,
     upstream::Head,
     xmlrpc::{Call, Reply, Value},
@@ -87,7 +87,7 @@ enum Event {
 struct Waiting {
     node: usize,
     call: Request,
-    answered: oneshot::Receiver<Answered>,
+    answered: oneshot::Receiver<AnswerAndDelivery>,
 }
 
 /// An answer that has not been written.
@@ -283,7 +283,7 @@ impl World {
         let (mut done, mut waiting) = (Vec::new(), Vec::new());
         for mut call in std::mem::take(&mut self.waiting) {
             match call.answered.try_recv() {
-                Ok((Answer::Made(reply), delivery)) => done.push((call, reply, delivery)),
+                Ok((CallAnswer::Made(reply), delivery)) => done.push((call, reply, delivery)),
                 Ok(other) => panic!("{other:?}"),
                 Err(_) => waiting.push(call),
             }
@@ -418,7 +418,7 @@ impl World {
         let recorded = self.ledger.record(now, self.incarnation, &answered);
         assert!(!recorded.unwrap().doubtful, "the model is the master here");
         for (item, reply) in items.into_iter().zip(replies) {
-            item.reply(Answer::Made(reply));
+            item.reply(CallAnswer::Made(reply));
         }
         self.ledger.settled_calls();
     }
@@ -441,7 +441,7 @@ impl World {
             .stand_in_for(now, &call, item.concern(), &item.source);
         let (reply, _, delivery) = answer.unwrap();
         item.delivery = delivery;
-        item.reply(Answer::Made(reply));
+        item.reply(CallAnswer::Made(reply));
         self.note_value(&call);
     }
 
@@ -522,19 +522,19 @@ impl World {
                 .ledger
                 .with_order(|order, mirror| order.next(now, &port, mirror));
             match next {
-                Next::Send { call, number } => {
+                NextNotification::Send { call, number } => {
                     // The network is sometimes slow.
                     let late = self.dice.one_in(20).then(|| self.dice.below(60_000));
                     let time = self.tell(&call, &port, late.unwrap_or(0)) + 50;
                     self.ports.insert(port.clone(), true);
                     self.after(time, Event::Taken(port, number));
                 }
-                Next::Wait { until } => {
+                NextNotification::Wait { until } => {
                     if let Some(until) = until {
                         self.at(until);
                     }
                 }
-                Next::Idle => {
+                NextNotification::Idle => {
                     self.ports.remove(&port);
                 }
             }

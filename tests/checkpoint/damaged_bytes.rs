@@ -4,7 +4,7 @@ use std::path::Path;
 
 use indexmap::IndexMap;
 use rosrescue::checkpoint::format::{
-    Checkpoint, DecodeError, Decoded, Entry, Record, Session, SnapshotError, Stamp, decode,
+    Checkpoint, Decoded, FormatError, Record, RecordContent, Session, SnapshotError, Stamp, decode,
     encode_checkpoint, encode_record,
 };
 use rosrescue::master::{Snapshot, SnapshotNode};
@@ -43,7 +43,7 @@ fn record(seq: u64) -> Record {
     ];
     Record {
         seq,
-        entry: Entry::call(Call::new("setParam", params)),
+        entry: RecordContent::call(Call::new("setParam", params)),
     }
 }
 
@@ -190,7 +190,7 @@ fn files_of_other_programs_are_recognised() {
         "\u{7f}ELF",
     ] {
         let error = decode(foreign.as_bytes()).unwrap_err();
-        assert_eq!(error, DecodeError::NotACheckpoint, "{foreign}");
+        assert_eq!(error, FormatError::NotACheckpoint, "{foreign}");
     }
     // Files that a crash of the computer may leave count as checkpoints.
     for ours in [&b""[..], &[0; 4096], b"# rosrescue check"] {
@@ -208,7 +208,7 @@ fn a_newer_format_is_recognised() {
     bytes.extend(format!("{:08x}\n- newer: true\n", crc32c::crc32c(line)).bytes());
     assert_eq!(
         decode(&bytes).unwrap_err(),
-        DecodeError::NewerVersion { version: 2 }
+        FormatError::NewerVersion { version: 2 }
     );
     // With a wrong check sum it counts as a damaged checkpoint.
     bytes[line.len()] ^= 1;
@@ -224,19 +224,19 @@ fn file_with_pending_writes() -> Vec<u8> {
     checkpoint.session.incarnation = 2;
     checkpoint.session.delivered = 5;
     let pending = |seq| match record(seq).entry {
-        Entry::Call { call, .. } => call,
-        Entry::Session(_) => unreachable!(),
+        RecordContent::Call { call, .. } => call,
+        RecordContent::Session(_) => unreachable!(),
     };
     checkpoint.pending = vec![pending(6), pending(7)];
     let encoded = encode_checkpoint(&checkpoint, 1).unwrap();
     let mut session = checkpoint.session;
     session.delivered = 8;
     let entries = [
-        Entry::Call {
+        RecordContent::Call {
             call: pending(8),
             pending: true,
         },
-        Entry::Session(session),
+        RecordContent::Session(session),
         record(10).entry,
     ];
     let mut bytes = encoded.bytes;

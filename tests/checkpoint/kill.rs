@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use rosrescue::checkpoint::format::{Checkpoint, Entry};
+use rosrescue::checkpoint::format::{Checkpoint, RecordContent};
 use rosrescue::checkpoint::store::{Store, SyncJob};
 use rosrescue::xmlrpc::{Call, Value};
 
@@ -34,7 +34,7 @@ fn write_until_killed(path: &Path) -> ! {
             "setParam",
             vec!["/w".into(), "/n".into(), (next as i32).into()],
         );
-        let seq = store.append(&[Entry::call(call)]).unwrap();
+        let seq = store.append(&[RecordContent::call(call)]).unwrap();
         writeln!(output, "recorded {seq}").unwrap();
     };
     loop {
@@ -99,7 +99,7 @@ fn acknowledged_records_survive_a_kill() {
             loaded.damage
         );
         let state = match loaded.records.last().map(|record| &record.entry) {
-            Some(Entry::Call { call, .. }) => call.params[2].clone(),
+            Some(RecordContent::Call { call, .. }) => call.params[2].clone(),
             _ => loaded.checkpoint.unwrap().snapshot.params["n"].clone(),
         };
         assert_eq!(state, Value::from(store.seq() as i32));

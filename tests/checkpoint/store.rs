@@ -7,7 +7,7 @@ use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
-use rosrescue::checkpoint::format::{Checkpoint, Entry, Record, Session};
+use rosrescue::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
 use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
 use rosrescue::xmlrpc::{Call, Value};
 use tempfile::TempDir;
@@ -23,8 +23,8 @@ fn seqs(records: &[Record]) -> Vec<u64> {
     records.iter().map(|record| record.seq).collect()
 }
 
-fn entry(nth: i32) -> Entry {
-    Entry::call(Call::new(
+fn entry(nth: i32) -> RecordContent {
+    RecordContent::call(Call::new(
         "setParam",
         vec!["/n".into(), format!("/p{nth}").into(), nth.into()],
     ))

@@ -8,7 +8,7 @@ use self::catalogue::{catalogue, values};
 use indexmap::IndexMap;
 use proptest::prelude::*;
 use rosrescue::checkpoint::format::{
-    Checkpoint, DEPTH_MAX, EncodeError, Entry, Record, Session, decode, encode_checkpoint,
+    Checkpoint, DEPTH_MAX, EncodeError, Record, RecordContent, Session, decode, encode_checkpoint,
     encode_record,
 };
 use rosrescue::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
@@ -108,7 +108,7 @@ fn with_params(params: Struct) -> Checkpoint {
 fn file_with(value: &Value) -> Result<Vec<u8>, EncodeError> {
     let checkpoint = with_value(value);
     let encoded = encode_checkpoint(&checkpoint, 3)?;
-    let entry = Entry::Call {
+    let entry = RecordContent::Call {
         call: set_param(value),
         pending: true,
     };
@@ -134,10 +134,11 @@ fn assert_round_trip(value: &Value) {
     let [
         Record {
             seq: 5_000_000_001,
-            entry: Entry::Call {
-                call,
-                pending: true,
-            },
+            entry:
+                RecordContent::Call {
+                    call,
+                    pending: true,
+                },
         },
     ] = decoded.records.as_slice()
     else {
@@ -167,7 +168,7 @@ fn a_write_that_the_master_has_run_is_not_pending() {
     let encoded = encode_checkpoint(&Checkpoint::default(), 1).unwrap();
     let record = Record {
         seq: 1,
-        entry: Entry::call(set_param(&1.into())),
+        entry: RecordContent::call(set_param(&1.into())),
     };
     let line = encode_record(&record, encoded.stamp).unwrap();
     let file = [encoded.bytes, line].concat();
@@ -187,7 +188,7 @@ fn a_session_record_is_read_back_unchanged() {
     };
     let record = Record {
         seq: 1,
-        entry: Entry::Session(session),
+        entry: RecordContent::Session(session),
     };
     let mut file = encoded.bytes;
     file.extend(encode_record(&record, encoded.stamp).unwrap());

@@ -2,7 +2,7 @@
 
 use std::{path::Path, process::Command, time::Duration};
 
-use rosrescue::cluster::etcd::{Access, Etcd, EtcdError, Options, Tls};
+use rosrescue::cluster::etcd::{Credentials, Etcd, EtcdError, Options, Tls};
 use serde_json::json;
 
 use crate::{
@@ -32,7 +32,7 @@ async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
     }
     let keys = keys();
     for (access, refused) in [
-        (Access::default(), "user name is empty"),
+        (Credentials::default(), "user name is empty"),
         (with_user("root", "wrong"), "authentication failed"),
         (with_user("guest", "guest"), "permission denied"),
     ] {
@@ -61,7 +61,7 @@ async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
 }
 
 /// The gateway of etcd is a client of its own server, so a certificate for servers alone is not enough.
-async fn for_servers_alone(access: Access, folder: &Path) {
+async fn for_servers_alone(access: Credentials, folder: &Path) {
     std::fs::write(folder.join("usage"), "extendedKeyUsage=serverAuth\n").unwrap();
     certificate(folder, "half", "ca", 9);
     let file = |name: &str| folder.join(name).to_str().unwrap().to_owned();
@@ -149,7 +149,7 @@ async fn certificates_are_checked_on_both_sides() {
         &ca,
     ];
     let servers = Servers::with(scratch, 1, "https", &arguments).await;
-    let access = |ca: &str, own: Option<&str>| Access {
+    let access = |ca: &str, own: Option<&str>| Credentials {
         tls: Tls {
             ca: Some(folder.join(format!("{ca}.pem"))),
             cert: own.map(|own| folder.join(format!("{own}.pem"))),
@@ -157,7 +157,7 @@ async fn certificates_are_checked_on_both_sides() {
         },
         user: None,
     };
-    let client = |access: Access| servers.client_of(0, access);
+    let client = |access: Credentials| servers.client_of(0, access);
     client(access("ca", Some("client")))
         .view(&keys(), LIMIT)
         .await
@@ -190,11 +190,11 @@ async fn certificates_are_checked_on_both_sides() {
     certificate(&folder, "expired", "ca", 9);
     renewed.view(&keys(), LIMIT).await.unwrap();
     for_servers_alone(access("ca", Some("client")), &folder).await;
-    let options = |access: Access, url: &str| Options {
+    let options = |access: Credentials, url: &str| Options {
         endpoints: vec![url.to_owned()],
         access,
     };
-    let half = Access {
+    let half = Credentials {
         tls: Tls {
             key: None,
             ..access("ca", Some("client")).tls
@@ -203,7 +203,7 @@ async fn certificates_are_checked_on_both_sides() {
     };
     for (options, said) in [
         (
-            options(Access::default(), "https://127.0.0.1:1"),
+            options(Credentials::default(), "https://127.0.0.1:1"),
             "needs the certificate of etcd's authority",
         ),
         (options(half, "https://127.0.0.1:1"), "needs its key"),
@@ -215,11 +215,14 @@ async fn certificates_are_checked_on_both_sides() {
             options(access("names", None), "https://127.0.0.1:1"),
             "cannot be used",
         ),
-        (options(Access::default(), "127.0.0.1:1"), "is no endpoint"),
+        (
+            options(Credentials::default(), "127.0.0.1:1"),
+            "is no endpoint",
+        ),
         (
             Options {
                 endpoints: Vec::new(),
-                access: Access::default(),
+                access: Credentials::default(),
             },
             "no endpoint of etcd is given",
         ),

@@ -1,12 +1,16 @@
 //! The robot's state in etcd, written by one computer and read by another.
 
-use std::time::Instant;
+use std::{
+    io::{Read, Write},
+    net::TcpStream,
+    time::Instant,
+};
 
 use rosrescue::{
-    checkpoint::format::{self, Checkpoint, Entry, Record, Session},
+    checkpoint::format::{self, Checkpoint, Record, RecordContent, Session},
     cluster::{
         journal::{self, Progress},
-        machine::{Answer, Guard, Op},
+        machine::{EtcdAnswer, Op, RevisionGuard},
         replica::{Replica, ReplicaError},
     },
     xmlrpc::Call,
@@ -26,14 +30,14 @@ fn record(seq: u64, bytes: usize) -> Record {
     let key = format!("/p{seq}");
     let value = "x".repeat(bytes);
     let params = ["/n", key.as_str(), value.as_str()].map(Into::into);
-    let entry = Entry::call(Call::new("setParam", params.to_vec()));
+    let entry = RecordContent::call(Call::new("setParam", params.to_vec()));
     Record { seq, entry }
 }
 
 /// A leader, as simple as possible.
 struct Leader {
     replica: Replica,
-    guard: Guard,
+    guard: RevisionGuard,
     beat: u64,
 }
 
@@ -49,10 +53,10 @@ impl Leader {
             settled: true,
         };
         let answer = replica.run(&settings("a"), &claim, None).await.unwrap();
-        let Answer::Applied { revision, .. } = answer else {
+        let EtcdAnswer::Applied { revision, .. } = answer else {
             panic!("{answer:?}");
         };
-        let guard = Guard {
+        let guard = RevisionGuard {
             leader: revision,
             alive: revision,
         };
@@ -84,7 +88,7 @@ impl Leader {
             let settings = settings("a");
             let answer = self.replica.run(&settings, &beat, entry.as_ref());
             let answer = answer.await.unwrap();
-            let Answer::Applied { revision, seq } = answer else {
+            let EtcdAnswer::Applied { revision, seq } = answer else {
                 panic!("{answer:?}");
             };
             self.guard.alive = revision;
@@ -118,7 +122,7 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
         for change in watch.next().await.unwrap() {
             if follower.keys.seq_of(&change.key).is_some() {
                 let kv = change.kv.unwrap();
-                let new = follower.records(&kv).await.unwrap();
+                let new = follower.records(&kv, change.revision).await.unwrap();
                 seen.extend(progress.take(new, kv.value.len()).unwrap());
             }
         }
@@ -128,6 +132,44 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
     leader.commit(&[record(7, 1)]).await;
     let more = follower.load(loaded.progress).await.unwrap();
     assert_eq!(more.records, [record(7, 1)]);
+}
+
+/// How many read requests the only member has answered.
+fn reads(servers: &Servers) -> u64 {
+    let address = servers.endpoints(0)[0].replace("http://", "");
+    let mut stream = TcpStream::connect(&address).unwrap();
+    let request = format!("GET /metrics HTTP/1.0\r\nHost: {address}\r\n\r\n");
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut page = String::new();
+    stream.read_to_string(&mut page).unwrap();
+    let line = page.lines().find(|line| {
+        line.starts_with("grpc_server_handled_total")
+            && line.contains("grpc_code=\"OK\",grpc_method=\"Range\"")
+    });
+    let count = line.and_then(|line| line.rsplit(' ').next());
+    count.unwrap().parse().unwrap()
+}
+
+/// While a computer merges what it wrote while cut off, it reads the journal again and again. With a long journal each
+/// reading took over 10 s on a busy computer.
+#[tokio::test]
+async fn what_is_known_of_a_long_journal_is_not_read_again() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    for seq in 1..=300 {
+        leader.commit(&[record(seq, 1)]).await;
+    }
+    let follower = replica(&servers);
+    let before = reads(&servers);
+    let known = follower.load(Progress::default()).await.unwrap();
+    let whole = reads(&servers) - before;
+    leader.commit(&[record(301, 1)]).await;
+    let before = reads(&servers);
+    let more = follower.load(known.progress).await.unwrap();
+    assert_eq!(more.records, [record(301, 1)]);
+    assert_eq!(more.view.guard(), leader.guard);
+    let rest = reads(&servers) - before;
+    assert!(rest <= 2 && whole > 5, "{whole} requests, then {rest}");
 }
 
 #[tokio::test]
@@ -180,6 +222,27 @@ async fn a_snapshot_replaces_the_journal_before_it() {
     let all = follower.client.range(&all, LIMIT).await.unwrap();
     let sizes: usize = all.kvs.iter().map(|kv| kv.value.len()).sum();
     assert!(sizes < 4 << 20, "{sizes}");
+}
+
+/// Otherwise a slow reader never gets to the end while others write.
+#[tokio::test]
+async fn a_reader_gets_the_parts_that_it_was_told_of_although_the_leader_has_replaced_them() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    let large = [record(1, 1 << 20)];
+    leader.commit(&large).await;
+    let follower = replica(&servers);
+    let journal = follower.keys.journal_after(0);
+    let found = follower.client.range(&journal, LIMIT).await.unwrap();
+    let state = Checkpoint {
+        seq: 1,
+        ..Checkpoint::default()
+    };
+    let term = leader.guard.leader;
+    let written = leader.replica.write_snapshot(term, &state).await.unwrap();
+    assert!(written.is_some());
+    let records = follower.records(&found.kvs[0], found.revision).await;
+    assert!(records.unwrap() == large);
 }
 
 #[tokio::test]
@@ -245,7 +308,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
         settled: true,
     };
     let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
-    let Answer::Applied { revision, seq: 3 } = answer.unwrap() else {
+    let EtcdAnswer::Applied { revision, seq: 3 } = answer.unwrap() else {
         panic!("no journal holds the state");
     };
     leader.guard.alive = revision;

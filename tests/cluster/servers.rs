@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use rosrescue::cluster::{
-    etcd::{Access, Tls},
+    etcd::{Credentials, Tls},
     journal::Keys,
     machine::{Commit, Settings, WhenAlone},
 };
@@ -27,8 +27,8 @@ pub(crate) fn settings(name: &str) -> Settings {
     }
 }
 
-pub(crate) fn with_user(name: &str, password: &str) -> Access {
-    Access {
+pub(crate) fn with_user(name: &str, password: &str) -> Credentials {
+    Credentials {
         user: Some((name.to_owned(), password.to_owned())),
         tls: Tls::default(),
     }

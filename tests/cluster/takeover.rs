@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use rosrescue::cluster::{
-    etcd::{self, Access, Etcd},
-    machine::{ANSWER_LIMIT, Action, Answer, Input, Machine, Role, View},
+    etcd::{self, Credentials, Etcd},
+    machine::{ANSWER_LIMIT, Action, EtcdAnswer, Input, Machine, Role, View},
 };
 use tokio::{
     sync::mpsc,
@@ -51,7 +51,7 @@ fn run(
                         requests.spawn(async move {
                             let answer =
                                 client.run(&keys, &settings, &op, None, ANSWER_LIMIT).await;
-                            let answer = answer.unwrap_or(Answer::Silence);
+                            let answer = answer.unwrap_or(EtcdAnswer::Silence);
                             let _ = inward.try_send(Input::Answer { number, answer });
                         });
                     }
@@ -101,7 +101,7 @@ async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
     let mut servers = Servers::new(3).await;
     let (tell, mut heard) = mpsc::channel(1000);
     let start = |servers: &Servers, name, first| {
-        let client = servers.client_of(first, Access::default());
+        let client = servers.client_of(first, Credentials::default());
         run(client, name, tell.clone())
     };
     let mut shells = [

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use rosrescue::cluster::{
-    etcd::{Access, Watch, WatchEnd},
+    etcd::{Credentials, Watch, WatchEnd},
     journal::Put,
 };
 
@@ -42,7 +42,7 @@ async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
 #[tokio::test]
 async fn a_watch_continues_at_another_member_and_misses_nothing() {
     let mut servers = Servers::new(3).await;
-    let (writer, keys) = (servers.client_of(1, Access::default()), keys());
+    let (writer, keys) = (servers.client_of(1, Credentials::default()), keys());
     let mut watch = servers.client().watch(keys.small(), 0, QUIET);
     let (mut seen, mut seq) = (0, 0);
     for (member, hangs) in [(0, false), (1, false), (0, true), (2, false), (1, true)] {

@@ -326,12 +326,11 @@ impl Computer {
         self.downtimes.end();
     }
 
-    /// The exit status of rosrescue, which ends by itself.
+    /// The exit status of rosrescue, which ends by itself. All its log lines are there then.
     #[track_caller]
     pub(crate) fn await_end(&mut self) -> Option<i32> {
         let rescue = self.rescue.as_mut().expect("a rosrescue");
-        let what = format!("rosrescue of {} ends", self.name);
-        eventually_some(&what, || rescue.exited()).code()
+        rescue.wait_output().code()
     }
 
     /// SIGTERM to rosrescue alone, and its end.

@@ -40,3 +40,42 @@ fn without_etcd_each_serves_its_nodes_and_afterwards_one_leads() {
     fleet.assert_streams_whole(&[0, 1, 2], &mark);
     fleet.assert_nodes_live();
 }
+
+#[test]
+fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    for value in 1..=20 {
+        fleet.computers[leader].set_param("/before", value);
+    }
+    fleet.await_same_state();
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+    }
+    for computer in &fleet.computers {
+        let what = format!("{} says that it is alone", computer.name);
+        eventually(&what, || computer.role_is("alone"));
+    }
+    let lonely = &fleet.computers[(leader + 1) % 3];
+    lonely.set_param("/alone", 7);
+    for computer in &mut fleet.computers {
+        computer.wipe_etcd();
+        computer.start_etcd();
+    }
+    let back = Instant::now();
+    fleet.await_whole();
+    println!(
+        "etcd has lost its data: whole {:.2?} after its start",
+        back.elapsed()
+    );
+    for computer in &fleet.computers {
+        let what = format!("{} has what was written", computer.name);
+        eventually(&what, || {
+            let param = |key| computer.param(key);
+            param("/before") == Some(20.into()) && param("/alone") == Some(7.into())
+        });
+        assert!(!computer.logged("etcd has lost its data").is_empty());
+    }
+    fleet.assert_nodes_live();
+}

@@ -3,7 +3,7 @@
 use std::{fs::File, process::Child, process::Command, time::Duration};
 
 use rosrescue::cluster::{
-    etcd::{Access, Etcd, Options},
+    etcd::{Credentials, Etcd, Options},
     journal::Keys,
 };
 use rustix::process::Signal;
@@ -143,10 +143,10 @@ impl Servers {
     }
 
     pub(crate) fn client(&self) -> Etcd {
-        self.client_of(0, Access::default())
+        self.client_of(0, Credentials::default())
     }
 
-    pub(crate) fn client_of(&self, first: usize, access: Access) -> Etcd {
+    pub(crate) fn client_of(&self, first: usize, access: Credentials) -> Etcd {
         let endpoints = self.endpoints(first);
         Etcd::new(&Options { endpoints, access }).unwrap()
     }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::Change;
+use super::ForeignChange;
 use rescue_core::checkpoint::format::EncodeError;
 
 /// Why a checkpoint cannot be opened. The files are unchanged.
@@ -72,7 +72,10 @@ pub enum StoreError {
     },
     /// Another process has changed the file.
     #[error("another process changed `{}`: {change}", path.display())]
-    Changed { path: PathBuf, change: Change },
+    Changed {
+        path: PathBuf,
+        change: ForeignChange,
+    },
     /// Another rosrescue took the lock after the lock file had been removed.
     #[error(
         "`{}` is in use by another rosrescue{} now; stop one of the two",

@@ -15,7 +15,7 @@ pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
 /// generation is dropped and the present file stays in use.
 pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
-pub(super) struct Pending {
+pub(super) struct PendingGeneration {
     generation: u64,
     /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
@@ -224,7 +224,7 @@ impl<S: Storage> Store<S> {
         self.generation += 1;
         let generation = self.generation;
         let ticket = Arc::new(Ticket(Mutex::new(true)));
-        self.pending = Some(Pending {
+        self.pending = Some(PendingGeneration {
             generation,
             meanwhile: Vec::new(),
             superseded: false,
@@ -286,7 +286,11 @@ impl<S: Storage> Store<S> {
         finished
     }
 
-    fn switch(&mut self, pending: Option<Pending>, done: Compacted<S>) -> Result<(), StoreError> {
+    fn switch(
+        &mut self,
+        pending: Option<PendingGeneration>,
+        done: Compacted<S>,
+    ) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let written = done.result?;
         let Some(pending) = pending.filter(|pending| !pending.superseded) else {
@@ -361,7 +365,7 @@ impl<S: Storage> Store<S> {
     }
 }
 
-impl Pending {
+impl PendingGeneration {
     pub(super) fn keep(&mut self, body: &[u8]) {
         self.superseded |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
         if self.superseded {

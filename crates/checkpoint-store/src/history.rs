@@ -21,14 +21,14 @@ pub const DRILLS: &str = "/rosrescue_drill_";
 
 /// Why a checkpoint is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum KeepReason {
     /// The session's last checkpoint, kept when the next session began.
     Session,
     /// The state that a new master got in a rescue.
     Rescue,
 }
 
-impl Kind {
+impl KeepReason {
     /// The name of the kind, as in file names.
     pub fn name(self) -> &'static str {
         match self {
@@ -41,7 +41,7 @@ impl Kind {
 /// A checkpoint that is kept beside the present one.
 #[derive(Clone, Debug)]
 pub struct Kept {
-    pub kind: Kind,
+    pub kind: KeepReason,
     /// A number that grows with each file of the same kind.
     pub number: u64,
     pub path: PathBuf,
@@ -58,7 +58,7 @@ pub struct Kept {
 pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
     let names = names_of(path);
     let mut kept = Vec::new();
-    for kind in [Kind::Session, Kind::Rescue] {
+    for kind in [KeepReason::Session, KeepReason::Rescue] {
         for number in names.numbers(&Disk, kind.name())?.into_iter().rev() {
             let path = names.numbered(kind.name(), number);
             // Another process may have removed the file.
@@ -79,7 +79,7 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
 
 /// The number of the last rescue that was kept beside the checkpoint at `path`. 0 if there is none.
 pub fn last_rescue(path: &Path) -> u64 {
-    let numbers = names_of(path).numbers(&Disk, Kind::Rescue.name());
+    let numbers = names_of(path).numbers(&Disk, KeepReason::Rescue.name());
     numbers
         .ok()
         .and_then(|mut numbers| numbers.pop())
@@ -100,7 +100,7 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
         caller.is_none_or(|caller| !caller.starts_with(DRILLS))
     });
     let names = names_of(path);
-    let kept = names.numbered(Kind::Rescue.name(), number);
+    let kept = names.numbered(KeepReason::Rescue.name(), number);
     let encoded = format::encode_checkpoint(&checkpoint, 1).map_err(io::Error::other)?;
     // If a crash leaves this file, the next start removes it.
     let fresh = with(&kept, ".new");
@@ -122,8 +122,9 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
 /// If the folder cannot be read.
 pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
     let all = kept(path)?;
-    let (mut sessions, mut rescues): (Vec<_>, Vec<_>) =
-        all.into_iter().partition(|kept| kept.kind == Kind::Session);
+    let (mut sessions, mut rescues): (Vec<_>, Vec<_>) = all
+        .into_iter()
+        .partition(|kept| kept.kind == KeepReason::Session);
     let mut surplus = sessions.split_off(SESSIONS_MAX.min(sessions.len()));
     surplus.extend(rescues.split_off(RESCUES_MAX.min(rescues.len())));
     // Ranks by age: first the newest of each kind, then the second newest of each kind, and so on.
@@ -133,7 +134,7 @@ pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
     let mut total: u64 = 0;
     for (rank, kept) in ranked {
         total = total.saturating_add(kept.bytes);
-        let last_session = kept.kind == Kind::Session && rank == 0;
+        let last_session = kept.kind == KeepReason::Session && rank == 0;
         if total > bytes_most && !last_session {
             surplus.push(kept);
         }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::generation::failed;
 use super::storage::FileId;
 use super::{Names, Storage, Store, StoreError};
-use rescue_core::checkpoint::format::{self, Entry, Stamp};
+use rescue_core::checkpoint::format::{self, RecordContent, Stamp};
 
 /// Maximum size of the encoding buffer that is kept between appends.
 const BUFFER_BYTES_MAX: usize = 1024 * 1024;
@@ -40,7 +40,7 @@ impl<S: Storage> Store<S> {
     ///
     /// If the entries were not recorded. The store is then unprotected, unless the reason is an
     /// [`EncodeError`](rescue_core::checkpoint::format::EncodeError).
-    pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
+    pub fn append(&mut self, entries: &[RecordContent]) -> Result<u64, StoreError> {
         let first = self.seq.saturating_add(1);
         self.seq = self.seq.saturating_add(entries.len() as u64);
         let mut encoded = Ok(());

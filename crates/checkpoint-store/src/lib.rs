@@ -32,7 +32,7 @@ use std::path::{Path, PathBuf};
 
 use aside::{keep_aside, set_aside_previous};
 pub use error::{OpenError, StoreError};
-use generation::{COMPACTION_BYTES_MIN, Pending};
+use generation::{COMPACTION_BYTES_MIN, PendingGeneration};
 pub use generation::{Compacted, CompactionJob};
 use journal::Active;
 pub use journal::{SyncJob, Synced};
@@ -41,7 +41,7 @@ pub use lock::DiskLock;
 pub use lock::{LockHolder, holder_of};
 use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
-pub use watch::{Change, CheckJob, Checked};
+pub use watch::{CheckJob, Checked, ForeignChange};
 
 /// Part of the name under which a damaged file is kept.
 const BROKEN: &str = "broken";
@@ -64,7 +64,7 @@ pub struct Store<S: Storage = Disk> {
     active: Option<Active<S>>,
     /// Why nothing is being recorded. `None` only if `active` is set.
     unprotected: Option<String>,
-    pending: Option<Pending>,
+    pending: Option<PendingGeneration>,
     /// Number of the last entry, recorded or not. No number is used twice.
     seq: u64,
     synced_seq: u64,

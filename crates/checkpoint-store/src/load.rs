@@ -6,7 +6,7 @@ use std::path::Path;
 use super::names::Names;
 use super::{BROKEN, OpenError, Present, Storage, UNREADABLE};
 use rescue_core::checkpoint::format::{
-    self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session,
+    self, Checkpoint, Damage, FormatError, Framed, Record, RecordContent, Session,
 };
 
 /// Maximum size of a file that is read. No checkpoint is larger.
@@ -34,8 +34,8 @@ impl Loaded {
             .iter()
             .rev()
             .find_map(|record| match &record.entry {
-                Entry::Session(session) => Some(session),
-                Entry::Call { .. } => None,
+                RecordContent::Session(session) => Some(session),
+                RecordContent::Call { .. } => None,
             });
         later.or_else(|| Some(&self.checkpoint.as_ref()?.session))
     }
@@ -43,7 +43,7 @@ impl Loaded {
 
 /// The content for [`Loaded`], and what the store needs to continue.
 #[derive(Debug, Default)]
-pub(super) struct Found {
+pub(super) struct LoadedStore {
     pub(super) loaded: Loaded,
     /// The highest record number known.
     pub(super) seq: u64,
@@ -60,7 +60,10 @@ pub(super) struct Found {
 }
 
 /// Reads the checkpoint of `names`. `None` if there is none.
-pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
+pub(super) fn load(
+    storage: &impl Storage,
+    names: &Names,
+) -> Result<Option<LoadedStore>, OpenError> {
     let path = &names.path;
     // Taken before reading. A file that replaces this one later has another id, and is kept under another name.
     let id = storage.id_at(path).ok().flatten();
@@ -110,17 +113,17 @@ fn load_present(
     names: &Names,
     bytes: &[u8],
     previous: Option<&Framed<'_>>,
-) -> Result<Found, OpenError> {
+) -> Result<LoadedStore, OpenError> {
     let path = &names.path;
     let present = match (format::scan(bytes), previous) {
         (Ok(present), _) => present,
-        (Err(DecodeError::NewerVersion { version }), _) => {
+        (Err(FormatError::NewerVersion { version }), _) => {
             let path = path.clone();
             return Err(OpenError::NewerVersion { path, version });
         }
         // A valid previous generation shows that the damaged file was a checkpoint as well.
-        (Err(DecodeError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
-        (Err(DecodeError::NotACheckpoint), None) => {
+        (Err(FormatError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
+        (Err(FormatError::NotACheckpoint), None) => {
             return Err(OpenError::NotACheckpoint { path: path.clone() });
         }
     };
@@ -150,7 +153,7 @@ fn join(
     snapshot: Result<Checkpoint, String>,
     previous: Option<&Framed<'_>>,
     bytes: &[u8],
-) -> Found {
+) -> LoadedStore {
     let path = &names.path;
     let mut damage = Vec::new();
     let mut damaged = present.damaged.clone();
@@ -207,7 +210,7 @@ fn join(
     // must not be taken for their records.
     let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
     let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
-    Found {
+    LoadedStore {
         seq: seen.max(expected - 1),
         generation: previous
             .and_then(generation)

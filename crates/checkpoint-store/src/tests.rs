@@ -8,7 +8,7 @@ use std::path::Path;
 use super::generation::MEANWHILE_BYTES_MAX;
 use super::sim::{Fault, SimFs};
 use super::*;
-use rescue_core::checkpoint::format::{Checkpoint, Entry, Session};
+use rescue_core::checkpoint::format::{Checkpoint, RecordContent, Session};
 use ros1_master::xmlrpc::{Call, Value};
 
 const PATH: &str = "/log/latest-chkpt.yaml";
@@ -43,7 +43,7 @@ impl Model {
 
     fn append(&mut self, store: &mut Store<SimFs>, count: u64) {
         let numbers: Vec<u64> = (1..=count).map(|nth| store.seq() + nth).collect();
-        let entries: Vec<Entry> = numbers.iter().map(|n| entry(*n)).collect();
+        let entries: Vec<RecordContent> = numbers.iter().map(|n| entry(*n)).collect();
         self.applied.extend(numbers);
         if let Ok(seq) = store.append(&entries) {
             self.acked = seq;
@@ -72,8 +72,8 @@ impl Model {
     }
 }
 
-fn entry(number: u64) -> Entry {
-    Entry::call(Call::new("setParam", vec![number.to_string().into()]))
+fn entry(number: u64) -> RecordContent {
+    RecordContent::call(Call::new("setParam", vec![number.to_string().into()]))
 }
 
 /// The numbers that a loaded state contains, in the order in which they were applied.
@@ -85,10 +85,10 @@ fn state(loaded: &Loaded) -> Vec<u64> {
     let mut numbers: Vec<u64> = snapshot.map(|key| key.parse().unwrap()).collect();
     for record in &loaded.records {
         match &record.entry {
-            Entry::Call { call, .. } => {
+            RecordContent::Call { call, .. } => {
                 numbers.push(call.params[0].as_str().unwrap().parse().unwrap())
             }
-            Entry::Session(_) => {}
+            RecordContent::Session(_) => {}
         }
     }
     numbers

@@ -16,7 +16,7 @@ use super::{Names, Storage, Store, StoreError};
 
 /// A change made by another process.
 #[derive(Debug, Error)]
-pub enum Change {
+pub enum ForeignChange {
     /// Nothing is at the path any more.
     #[error("it was removed or renamed, or its file system was unmounted")]
     Gone,
@@ -37,7 +37,7 @@ pub enum Change {
 /// Why the file cannot be trusted.
 #[derive(Debug)]
 enum Finding {
-    Changed(Change),
+    Changed(ForeignChange),
     Io(io::Error),
 }
 
@@ -77,16 +77,16 @@ impl<S: Storage> CheckJob<S> {
     fn check(&self) -> Result<(), Finding> {
         let (storage, path) = (&self.storage, &self.names.path);
         match storage.id_at(path)? {
-            None => return Err(Finding::Changed(Change::Gone)),
-            Some(id) if id != self.id => return Err(Finding::Changed(Change::Replaced)),
+            None => return Err(Finding::Changed(ForeignChange::Gone)),
+            Some(id) if id != self.id => return Err(Finding::Changed(ForeignChange::Replaced)),
             Some(_) => {}
         }
         if storage.id_at(&self.names.lock())? != Some(self.lock_id) {
-            return Err(Finding::Changed(Change::Lock));
+            return Err(Finding::Changed(ForeignChange::Lock));
         }
         match self.content {
             Some((length, crc)) if storage.checksum(path, length)? != crc => {
-                Err(Finding::Changed(Change::Content))
+                Err(Finding::Changed(ForeignChange::Content))
             }
             _ => Ok(()),
         }
@@ -100,11 +100,11 @@ impl<S: Storage> Active<S> {
 
     /// Compares the file's status with that after this store's last write. If only the modification time differs, the
     /// content is read: `touch` changes that time too, and some file systems update it late.
-    pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), Change> {
+    pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), ForeignChange> {
         let expected = self.length();
         if status.length != expected {
             let found = status.length;
-            return Err(Change::Length { expected, found });
+            return Err(ForeignChange::Length { expected, found });
         }
         if status.modified != self.modified {
             self.modified = status.modified;
@@ -157,8 +157,8 @@ impl<S: Storage> Store<S> {
     }
 
     /// Like [`latch`](Self::latch), after a change by another process.
-    pub(super) fn changed(&mut self, change: Change) -> StoreError {
-        if matches!(change, Change::Lock) {
+    pub(super) fn changed(&mut self, change: ForeignChange) -> StoreError {
+        if matches!(change, ForeignChange::Lock) {
             // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
             // this fails, the next generation reports it.
             let _ = self.hold_lock();

@@ -34,14 +34,14 @@ const IDLE_MOST: usize = 4;
 
 /// The credentials of this computer at etcd.
 #[derive(Clone, Default)]
-pub struct Access {
+pub struct Credentials {
     pub tls: Tls,
     /// User name and password.
     pub user: Option<(String, String)>,
 }
 
 /// Hides the password.
-impl std::fmt::Debug for Access {
+impl std::fmt::Debug for Credentials {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let user = self.user.as_ref().map(|(name, _)| name);
         f.debug_struct("Access")
@@ -59,7 +59,7 @@ pub(super) struct Endpoint {
     host: String,
     port: u16,
     tls: Option<Secured>,
-    access: Arc<Access>,
+    access: Arc<Credentials>,
     idle: Mutex<Vec<Connection>>,
     token: Mutex<Option<String>>,
 }
@@ -71,7 +71,7 @@ fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Endpoint {
     pub(super) fn new(
         url: &str,
-        access: &Arc<Access>,
+        access: &Arc<Credentials>,
         config: Option<&TlsSettings>,
     ) -> Result<Self, EtcdError> {
         let refused =
@@ -145,7 +145,7 @@ impl Endpoint {
             Some(body.collect().await.ok()?.to_bytes())
         };
         let page = ask.await.unwrap_or_default();
-        serde_json::from_slice::<Vec<wire::Peer>>(&page).is_ok_and(|peers| !peers.is_empty())
+        serde_json::from_slice::<Vec<wire::PeerMember>>(&page).is_ok_and(|peers| !peers.is_empty())
     }
 
     fn authority(&self) -> String {

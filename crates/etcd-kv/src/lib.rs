@@ -22,11 +22,11 @@ use bytes::Bytes;
 use serde_json::json;
 use tokio::task::JoinSet;
 
-pub use connection::Access;
+pub use connection::Credentials;
 use connection::Endpoint;
 pub use error::EtcdError;
 pub use tls::Tls;
-pub use watch::{Change, Watch, WatchEnd};
+pub use watch::{KeyChange, Watch, WatchEnd};
 pub use wire::{Kv, Txn, TxnOp, TxnResult};
 
 /// Time without an answer after which the next endpoint is asked as well. A transaction takes 1 to 20 ms.
@@ -41,7 +41,7 @@ const PAGE: usize = 32;
 pub struct Options {
     /// The endpoints, each `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
-    pub access: Access,
+    pub access: Credentials,
 }
 
 /// A client for an etcd cluster.
@@ -69,7 +69,7 @@ pub struct Tried {
 
 /// The status that an etcd member reports.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Status {
+pub struct MemberStatus {
     pub endpoint: String,
     pub version: String,
     pub db_bytes: u64,
@@ -134,24 +134,40 @@ impl Client {
     /// [`EtcdError::Compacted`] if etcd has compacted that moment before all keys were read. Otherwise why they could
     /// not be read.
     pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
-        let mut found: Option<Found> = None;
-        let mut from = range.start.clone();
-        loop {
-            let revision = found.as_ref().map_or(0, |found| found.revision);
-            let request = wire::range(&(from..range.end.clone()), revision, PAGE);
-            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
-            let (revision, more, kvs) = page.read()?;
-            let found = found.get_or_insert(Found {
-                revision,
-                kvs: Vec::new(),
-            });
-            found.kvs.extend(kvs);
-            let Some(last) = found.kvs.last().filter(|_| more) else {
-                return Ok(found.clone());
-            };
-            // The next page begins with the first key after this one.
-            from = format!("{}\0", last.key);
+        self.ranges(std::slice::from_ref(range), None, limit).await
+    }
+
+    /// All keys in these ranges with their values, one range after the other, as they were at `revision`. `None` stands
+    /// for the present revision.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::range`].
+    pub async fn ranges(
+        &self,
+        ranges: &[Range<String>],
+        mut revision: Option<u64>,
+        limit: Duration,
+    ) -> Result<Found, EtcdError> {
+        let mut kvs: Vec<Kv> = Vec::new();
+        for range in ranges {
+            let mut from = range.start.clone();
+            loop {
+                let at = revision.unwrap_or_default();
+                let request = wire::range(&(from..range.end.clone()), at, PAGE);
+                let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
+                let (present, more, page) = page.read()?;
+                revision.get_or_insert(present);
+                kvs.extend(page);
+                let Some(last) = kvs.last().filter(|_| more) else {
+                    break;
+                };
+                // The next page begins with the first key after this one.
+                from = format!("{}\0", last.key);
+            }
         }
+        let revision = revision.unwrap_or_default();
+        Ok(Found { revision, kvs })
     }
 
     /// Creates a lease that ends by itself after about `ttl`, but after 2 s at the earliest. etcd then deletes the keys
@@ -201,7 +217,7 @@ impl Client {
     }
 
     /// The status that each endpoint reports.
-    pub async fn status(&self, limit: Duration) -> Vec<Result<Status, EtcdError>> {
+    pub async fn status(&self, limit: Duration) -> Vec<Result<MemberStatus, EtcdError>> {
         let mut asked = JoinSet::new();
         for index in 0..self.endpoints.len() {
             let client = self.clone();
@@ -212,7 +228,7 @@ impl Client {
         found.into_iter().map(|(_, status)| status).collect()
     }
 
-    async fn status_of(&self, index: usize, limit: Duration) -> Result<Status, EtcdError> {
+    async fn status_of(&self, index: usize, limit: Duration) -> Result<MemberStatus, EtcdError> {
         let Some(endpoint) = self.endpoints.get(index) else {
             return Err(EtcdError::Options("there is no such endpoint".to_owned()));
         };

@@ -21,7 +21,7 @@ const PAUSE: Duration = Duration::from_millis(100);
 
 /// A key that has changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Change {
+pub struct KeyChange {
     pub key: String,
     pub revision: u64,
     /// The new value. `None` if the key was deleted.
@@ -79,7 +79,7 @@ impl Watch {
     /// # Errors
     ///
     /// Why no more changes will come.
-    pub async fn next(&mut self) -> Result<Vec<Change>, WatchEnd> {
+    pub async fn next(&mut self) -> Result<Vec<KeyChange>, WatchEnd> {
         loop {
             let read = match &mut self.open {
                 Some(open) => tokio::time::timeout_at(open.until, open.message()).await,
@@ -198,13 +198,13 @@ impl Watch {
         })
     }
 
-    fn changes(&mut self, answer: &WatchAnswer) -> Result<Vec<Change>, EtcdError> {
+    fn changes(&mut self, answer: &WatchAnswer) -> Result<Vec<KeyChange>, EtcdError> {
         let mut changes = Vec::with_capacity(answer.events.len());
         for event in &answer.events {
             let kv = event.kv.read()?;
             // The rest of this revision may be in the next message.
             self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
-            changes.push(Change {
+            changes.push(KeyChange {
                 key: kv.key.clone(),
                 revision: kv.revision,
                 kv: (event.kind != "DELETE").then_some(kv),

@@ -6,7 +6,7 @@ use base64::{Engine, engine::general_purpose::STANDARD};
 use serde::{Deserialize, Deserializer, de::DeserializeOwned};
 use serde_json::{Value, json};
 
-use super::{EtcdError, Status};
+use super::{EtcdError, MemberStatus};
 
 /// A key with its value.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -142,7 +142,7 @@ where
 }
 
 #[derive(Debug, Default, Deserialize)]
-pub(super) struct Header {
+pub(super) struct ResponseHeader {
     #[serde(default, deserialize_with = "number")]
     revision: u64,
     #[serde(default, deserialize_with = "number")]
@@ -181,7 +181,7 @@ impl RawKv {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct RangeAnswer {
-    header: Header,
+    header: ResponseHeader,
     kvs: Vec<RawKv>,
     more: bool,
 }
@@ -204,7 +204,7 @@ impl RangeAnswer {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct TxnAnswer {
-    header: Header,
+    header: ResponseHeader,
     succeeded: bool,
     responses: Vec<OpAnswer>,
 }
@@ -232,7 +232,7 @@ impl TxnAnswer {
 
 /// An etcd member, as the port for peers lists it.
 #[derive(Debug, Deserialize)]
-pub(super) struct Peer {
+pub(super) struct PeerMember {
     #[serde(rename = "peerURLs")]
     _urls: Vec<String>,
 }
@@ -252,7 +252,7 @@ pub(super) struct Streamed<T> {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct StatusAnswer {
-    header: Header,
+    header: ResponseHeader,
     version: String,
     #[serde(rename = "dbSize", deserialize_with = "number")]
     db_size: u64,
@@ -262,11 +262,11 @@ pub(super) struct StatusAnswer {
 }
 
 impl StatusAnswer {
-    pub(super) fn read(self, endpoint: &str) -> Result<Status, EtcdError> {
+    pub(super) fn read(self, endpoint: &str) -> Result<MemberStatus, EtcdError> {
         if self.version.is_empty() {
             return Err(not_etcd("its status has no version"));
         }
-        Ok(Status {
+        Ok(MemberStatus {
             endpoint: endpoint.to_owned(),
             is_leader: self.leader != 0 && self.leader == self.header.member_id,
             version: self.version,

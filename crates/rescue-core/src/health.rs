@@ -35,7 +35,7 @@ const COMMON: [&str; 6] = [
 
 /// The reaction of a node to a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sign {
+pub enum Reaction {
     /// The node answered.
     Alive,
     /// The node's port refuses connections, so its process is gone.
@@ -100,7 +100,7 @@ fn topics(list: &Value) -> Option<Topics> {
 
 /// Whether the node that answers at a port is the one registered under a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum IdentityVerdict {
     /// There is evidence that the answering node has this name.
     Itself,
     /// There is evidence that another node answers.
@@ -111,7 +111,7 @@ pub enum Verdict {
 
 /// A name registered at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Name {
+pub struct RegisteredName {
     /// The caller id.
     pub node: String,
     /// The process id that the port gave last time.
@@ -127,10 +127,10 @@ pub struct Name {
 /// that port.
 pub fn judge(
     mirror: &Master,
-    names: &[Name],
+    names: &[RegisteredName],
     pid: Option<i32>,
     claims: Option<&Claims>,
-) -> Vec<Verdict> {
+) -> Vec<IdentityVerdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
     // Whether the node's topics are reported, and whether all of them are.
@@ -145,12 +145,12 @@ pub fn judge(
     let fitting = names.iter().zip(&matches);
     let fitting = fitting.filter(|(_, found)| found.is_some_and(|(_, all)| all));
     let last_fitting = fitting.map(|(name, _)| name.registered).max();
-    let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
-        None => Verdict::Unknown,
-        Some((0, _)) => Verdict::Another,
+    let by_topics = |name: &RegisteredName, found: &Option<(usize, bool)>| match found {
+        None => IdentityVerdict::Unknown,
+        Some((0, _)) => IdentityVerdict::Another,
         // The answer only has topics in common with a later node.
-        Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Another,
-        Some(_) => Verdict::Itself,
+        Some((_, false)) if last_fitting > Some(name.registered) => IdentityVerdict::Another,
+        Some(_) => IdentityVerdict::Itself,
     };
     // If only the previous node's name was known then, the process id may be that of a newer node.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
@@ -159,25 +159,27 @@ pub fn judge(
     let verdicts = names.iter().zip(&matches);
     let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
         (Some(known), Some(pid)) if known == pid => match by_topics(name, found) {
-            Verdict::Another if last_of_pid > Some(name.registered) => Verdict::Another,
-            _ => Verdict::Itself,
+            IdentityVerdict::Another if last_of_pid > Some(name.registered) => {
+                IdentityVerdict::Another
+            }
+            _ => IdentityVerdict::Itself,
         },
         // All its topics are reported, and no later node registered. Nevertheless the process id can differ, with some
         // client libraries or after a restart at the same port.
         (Some(_), Some(_)) if matches!(found, Some((_, true))) && last == Some(name.registered) => {
-            Verdict::Itself
+            IdentityVerdict::Itself
         }
-        (Some(_), Some(_)) if !name.registered_since => Verdict::Another,
+        (Some(_), Some(_)) if !name.registered_since => IdentityVerdict::Another,
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
     // A port belongs to one process, so nodes that registered earlier are gone.
     let present = names.iter().zip(&verdicts);
-    let present = present.filter(|(_, verdict)| **verdict == Verdict::Itself);
+    let present = present.filter(|(_, verdict)| **verdict == IdentityVerdict::Itself);
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
         for (name, verdict) in names.iter().zip(&mut verdicts) {
-            if *verdict == Verdict::Unknown && name.registered < last {
-                *verdict = Verdict::Another;
+            if *verdict == IdentityVerdict::Unknown && name.registered < last {
+                *verdict = IdentityVerdict::Another;
             }
         }
     }

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::evidence::{BUSY_LIMIT, Evidence, Sample, Verdict};
+use self::evidence::{BUSY_LIMIT, Evidence, Sample, SilenceVerdict};
 
 pub mod evidence;
 mod open_calls;
@@ -423,7 +423,7 @@ impl Lifecycle {
     /// Kills the silent child if it [hangs](Evidence::judge). Otherwise connects again.
     fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
         match self.evidence.judge(busy_limit) {
-            Verdict::Hung => self.give_up(now),
+            SilenceVerdict::Hung => self.give_up(now),
             verdict => {
                 let actions = self.connect_later(now, far);
                 actions.into_iter().chain(spare(verdict)).collect()
@@ -468,7 +468,7 @@ impl Lifecycle {
         }
         let then = match self.supervision {
             Supervision::Ours => match self.evidence.judge(BUSY_LIMIT) {
-                Verdict::Hung => vec![Action::Kill],
+                SilenceVerdict::Hung => vec![Action::Kill],
                 verdict => spare(verdict).into_iter().collect(),
             },
             Supervision::Theirs => Vec::new(),
@@ -530,10 +530,10 @@ impl Lifecycle {
 }
 
 /// Reports why a master is not killed.
-fn spare(verdict: Verdict) -> Option<Action> {
+fn spare(verdict: SilenceVerdict) -> Option<Action> {
     match verdict {
-        Verdict::Unproved(why) => Some(Action::Spare(why)),
-        Verdict::Hung | Verdict::Unknown => None,
+        SilenceVerdict::Unproved(why) => Some(Action::Spare(why)),
+        SilenceVerdict::Hung | SilenceVerdict::Unknown => None,
     }
 }
 

@@ -30,11 +30,11 @@ use std::{
 
 pub use self::{
     by_subject::BySubject,
-    outbox::Next,
+    outbox::NextNotification,
     subject::{Concern, Heard, Subject, heard_by_read},
 };
 use self::{
-    outbox::{Content, Outbox},
+    outbox::{Outbox, Payload},
     under_way::UnderWay,
 };
 use crate::{master::Master, xmlrpc::Call};
@@ -48,7 +48,8 @@ pub const RECENT: Duration = Duration::from_millis(500);
 /// How long after such a notification the node is told the state again. Idle threads of rosmaster look for work every
 /// 100 ms, so by then a master without a backlog has sent everything.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
-/// Longest time of a master for one notification while many wait. A Python thread gives up its lock every 5 ms.
+/// Longest time that a master with enough CPU time takes for one notification while many wait. A Python thread gives up
+/// its lock every 5 ms.
 const MASTER_TAKES: Duration = Duration::from_millis(5);
 /// Longest backlog of the master for which rosrescue's notifications wait.
 const BACKLOG_MAX: Duration = Duration::from_secs(10);
@@ -98,7 +99,10 @@ impl Order {
             // Notifications that wait there are older than the answer.
             self.outbox.renew(port, subject);
         }
-        Some(self.under_way.add(under_way::Kind::Answer, heard, None))
+        Some(
+            self.under_way
+                .add(under_way::DeliveryKind::Answer, heard, None),
+        )
     }
 
     /// Notes that the answer is ready. From now on it delays others only for a limited time.
@@ -171,6 +175,13 @@ impl Order {
         }
     }
 
+    /// Notes that the master answered a batch of `calls` after `took`. A busy computer that delays its answers delays its
+    /// notifications as well.
+    pub fn master_answered(&mut self, took: Duration, calls: usize) {
+        let per_call = took / u32::try_from(calls.max(1)).unwrap_or(u32::MAX);
+        self.told.pace = per_call.max(self.told.pace * 7 / 8);
+    }
+
     /// Notes that the master is gone and sends no more notifications.
     pub fn master_is_gone(&mut self) {
         self.told = Told::default();
@@ -180,14 +191,14 @@ impl Order {
     /// already, `call` may be older than what that master has sent. Then the node is told the state instead.
     pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
         let is_news = !self.in_flight.tells.has(&subject);
-        let content = is_news.then_some(Content::Call(call));
+        let content = is_news.then_some(Payload::Call(call));
         self.outbox
-            .add(port, subject, content.unwrap_or(Content::State));
+            .add(port, subject, content.unwrap_or(Payload::State));
     }
 
     /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
     pub fn tell_state(&mut self, port: &str, subject: Subject) {
-        self.outbox.add(port, subject, Content::State);
+        self.outbox.add(port, subject, Payload::State);
     }
 
     /// Like [`Self::tell_state`], but not before `at`.
@@ -201,17 +212,17 @@ impl Order {
     }
 
     /// What to do next for the node at `port`.
-    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> Next {
+    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> NextNotification {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
             let answer = self.under_way.answer_to(now, port, subject);
             let written = match answer {
                 Some(under_way::Answer::UnderWay { limit }) => {
                     self.awaited = true;
-                    return Next::Wait { until: limit };
+                    return NextNotification::Wait { until: limit };
                 }
                 Some(under_way::Answer::Written { at }) if now < at + LEAD => {
-                    return Next::Wait {
+                    return NextNotification::Wait {
                         until: Some(at + LEAD),
                     };
                 }
@@ -243,12 +254,12 @@ impl Order {
                 subject,
             };
             let limit = Some(now + NOTIFICATION_LIMIT);
-            let kind = under_way::Kind::Notification;
+            let kind = under_way::DeliveryKind::Notification;
             let number = self.under_way.add(kind, vec![heard], limit);
-            return Next::Send { call, number };
+            return NextNotification::Send { call, number };
         }
         self.outbox.remove(port);
-        Next::Idle
+        NextNotification::Idle
     }
 
     /// Notes that the node has taken the notification with this number, so that it reads later ones after it; or that
@@ -272,7 +283,7 @@ impl Order {
     /// Queues the repeats that are due.
     pub fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
-            self.outbox.add(&port, subject, Content::StateAgain);
+            self.outbox.add(&port, subject, Payload::StateAgain);
         }
     }
 
@@ -311,13 +322,15 @@ struct Told {
     ends: Schedule<Subject>,
     /// When the master is expected to have sent everything.
     busy: Option<Instant>,
+    /// How long the master recently took for a call.
+    pace: Duration,
 }
 
 impl Told {
     /// Notes that the master has begun to notify this many nodes. Returns when it will be done.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
         self.forget(now);
-        let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
+        let takes = MASTER_TAKES.max(self.pace) * u32::try_from(nodes).unwrap_or(u32::MAX);
         let busy = self.busy.map_or(now, |busy| busy.max(now));
         let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MAX);
         self.busy = Some(busy);

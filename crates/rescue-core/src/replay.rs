@@ -25,4 +25,4 @@ pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
 pub use token::{Bears, Token};
-pub use treatment::{Known, Treatment, treatment};
+pub use treatment::{KnownMaster, Treatment, treatment};

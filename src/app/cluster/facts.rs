@@ -1,42 +1,25 @@
-//! What is known of the other computers, for people.
+//! Facts about the other computers, for the status and the log.
 
 use std::{
     collections::BTreeMap,
     time::{Duration, Instant},
 };
 
-use serde::{Deserialize, Serialize};
-
-use super::{Member, Role, Settings, View};
+use super::ClusterDriver;
 use crate::{
     cluster::{
-        etcd::Kv,
-        journal::Keys,
-        namesake::{Key, Sign},
+        machine::{Role, Settings, View},
+        member::Heard,
     },
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };
 
-/// What a computer says of itself, in JSON at `ROBOT/members/NAME`.
-#[derive(Serialize, Deserialize)]
-struct Said {
-    uri: String,
-    version: String,
-    role: String,
-    seq: u64,
-    /// See [`Settings::boot`].
-    #[serde(default)]
-    boot: String,
-}
-
-/// What is known of the other computers.
+/// Facts about the other computers.
 pub(super) struct Known {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
-    /// The entry under this computer's name, if another computer wrote it.
-    namesake: Option<Sign>,
     leader: Option<LeaderFacts>,
-    /// The revision of the last sign of a leader, and when it was seen.
+    /// The revision of the leader's last sign of life, and when it was seen.
     sign: Option<(u64, Instant)>,
     role: (Role, Instant),
     takeovers: u64,
@@ -49,7 +32,6 @@ impl Known {
         Self {
             settings: settings.clone(),
             members: BTreeMap::new(),
-            namesake: None,
             leader: None,
             sign: None,
             role: (Role::Joining, Instant::now()),
@@ -59,7 +41,7 @@ impl Known {
         }
     }
 
-    /// Looks at the keys.
+    /// Notes the leader's keys.
     pub(super) fn look(&mut self, view: &View) {
         let now = Instant::now();
         if let Some(leader) = &view.leader
@@ -77,7 +59,7 @@ impl Known {
                     leader = leader.name,
                     version = leader.version,
                     own = self.settings.version,
-                    "the leader has another version of rosrescue"
+                    "the leader runs another version of rosrescue"
                 );
             }
         }
@@ -87,55 +69,23 @@ impl Known {
         }
     }
 
-    pub(super) fn namesake(&self) -> Option<&Sign> {
-        self.namesake.as_ref()
-    }
-
-    /// A key has changed; `kv` is none if it was deleted.
-    pub(super) fn member(&mut self, keys: &Keys, key: &str, kv: Option<&Kv>) {
-        let Some(name) = key.strip_prefix(&keys.member("")) else {
-            return;
+    /// Notes a member entry.
+    pub(super) fn heard(&mut self, heard: &Heard) {
+        let Some(said) = &heard.said else { return };
+        let mut roles = Role::ALL.into_iter();
+        let role = roles.find(|role| role.as_str() == said.role);
+        let member = MemberFacts {
+            name: heard.name.clone(),
+            uri: said.uri.clone(),
+            version: said.version.clone(),
+            role: role.unwrap_or(Role::Joining),
+            seq: said.seq,
+            heard: Some(Instant::now()),
         };
-        let said = kv.and_then(|kv| serde_json::from_slice::<Said>(&kv.value).ok());
-        if name == self.settings.name {
-            let own = &self.settings;
-            let other = said.as_ref();
-            let other = other.filter(|of| !own.is_of_this_computer(name, &of.uri, &of.boot));
-            self.namesake = other.zip(kv).map(|(of, kv)| Sign {
-                key: Key::Member,
-                uri: of.uri.clone(),
-                revision: kv.revision,
-            });
-        }
-        if let Some(said) = said {
-            let role = Role::ALL
-                .into_iter()
-                .find(|role| role.as_str() == said.role);
-            let member = MemberFacts {
-                name: name.to_owned(),
-                uri: said.uri,
-                version: said.version,
-                role: role.unwrap_or(Role::Joining),
-                seq: said.seq,
-                heard: Some(Instant::now()),
-            };
-            self.members.insert(name.to_owned(), member);
-        }
+        self.members.insert(heard.name.clone(), member);
     }
 
-    /// What this computer says of itself.
-    pub(super) fn own(&self, role: Role, seq: u64) -> Vec<u8> {
-        let said = Said {
-            uri: self.settings.uri.clone(),
-            version: self.settings.version.clone(),
-            role: role.as_str().to_owned(),
-            seq,
-            boot: self.settings.boot.clone(),
-        };
-        serde_json::to_vec(&said).unwrap_or_default()
-    }
-
-    /// Whether `name`, or any other computer if it is empty, can take over; if not, why.
+    /// Checks whether the computer `name`, or any if it is empty, can take over. Returns the reason if not.
     pub(super) fn successor(&self, name: &str) -> Result<(), String> {
         let others = self
             .members
@@ -147,21 +97,20 @@ impl Known {
         });
         let names: Vec<&str> = there.map(|of| of.name.as_str()).collect();
         if name == self.settings.name {
-            return Err(format!("`{name}` leads already"));
+            return Err(format!("`{name}` already leads"));
         }
         match names.as_slice() {
-            [] => Err("no other computer is there".to_owned()),
+            [] => Err("no other computer is connected".to_owned()),
             names if name.is_empty() || names.contains(&name) => Ok(()),
             names => Err(format!(
-                "`{name}` is not there; there are {}",
+                "`{name}` is not connected; connected are {}",
                 names.join(", ")
             )),
         }
     }
 
-    /// This computer leads now. `released`: the one before has given up leading by itself. Returns whether that
-    /// was another computer.
-    pub(super) fn taken_over(&mut self, before: Option<(String, Instant)>, released: bool) -> bool {
+    /// Notes that this computer leads now. `released` says whether the previous leader gave up leadership by itself.
+    pub(super) fn taken_over(&mut self, before: Option<(String, Instant)>, released: bool) {
         let now = Instant::now();
         let took = before
             .as_ref()
@@ -185,74 +134,67 @@ impl Known {
             ),
             None => tracing::info!("this computer leads now"),
         }
-        let from_another = takeover.from.is_some();
         self.last_takeover = Some(takeover);
-        from_another
-    }
-
-    /// Who led last, and when it was heard of last.
-    pub(super) fn before(&self) -> Option<(String, Instant)> {
-        let leader = self.leader.as_ref()?;
-        Some((leader.name.clone(), self.sign?.1))
-    }
-
-    pub(super) fn role(&self) -> Role {
-        self.role.0
-    }
-
-    /// Returns the role before.
-    pub(super) fn set_role(&mut self, role: Role) -> Role {
-        std::mem::replace(&mut self.role, (role, Instant::now())).0
     }
 }
 
-impl Member {
-    /// Since when nobody leads, as far as is known.
+impl ClusterDriver {
+    /// Since when no computer leads, as far as is known.
     fn leaderless(&self) -> Option<Instant> {
         let (role, since) = self.known.role;
         let gone = match role {
             Role::Leading => false,
-            Role::Following => self.was_released || self.view.leader.is_none(),
+            Role::Following => self.member.was_released() || self.member.view().leader.is_none(),
             Role::Joining | Role::CatchingUp | Role::Alone => true,
         };
         let sign = self.known.sign.map_or(since, |(_, at)| at);
         gone.then_some(sign)
     }
 
-    /// Shows on the board how it is.
+    /// Updates the status.
     pub(super) fn show(&mut self) {
+        self.known.look(self.member.view());
+        if self.known.role.0 != self.member.role() {
+            self.known.role = (self.member.role(), Instant::now());
+        }
         let known = &self.known;
+        let own = self.member.says();
         let own = MemberFacts {
-            name: self.settings.name.clone(),
-            uri: self.settings.uri.clone(),
-            version: self.settings.version.clone(),
-            role: self.machine.role(),
-            seq: self.progress.seq,
+            name: self.member.settings().name.clone(),
+            uri: own.uri,
+            version: own.version,
+            role: self.member.machine().role(),
+            seq: own.seq,
             heard: Some(Instant::now()),
         };
         let others = known.members.values().filter(|of| of.name != own.name);
         let mut members: Vec<_> = others.cloned().collect();
         members.push(own);
         members.sort_by(|a, b| a.name.cmp(&b.name));
-        let seq = self.view.seq().max(self.progress.seq);
+        let (name, seq) = (self.member.settings().name.clone(), self.member.seq());
+        let last = self.member.view().seq().max(seq);
         let facts = ClusterFacts {
-            name: self.settings.name.clone(),
+            name,
             role: known.role.0,
             since: known.role.1,
             leader: known.leader.clone(),
             leaderless: self.leaderless(),
-            seq,
-            behind: seq - self.progress.seq,
-            uncommitted: self.uncommitted() as u64,
-            etcd: self.trouble.get(),
+            seq: last,
+            behind: last - seq,
+            uncommitted: self.member.uncommitted() as u64,
+            etcd: self.trouble.get().or_else(|| {
+                let lost = self.member.etcd_lost()?;
+                Some((
+                    lost,
+                    "it has lost its data; a computer is restoring it".to_owned(),
+                ))
+            }),
             members,
             takeovers: known.takeovers,
             last_takeover: known.last_takeover.clone(),
             lost_writes: known.lost_writes,
         };
-        self.given
-            .context
-            .board
-            .update(|board| board.cluster = Some(facts));
+        let board = &self.setup.context.board;
+        board.update(|board| board.cluster = Some(facts));
     }
 }

@@ -1,10 +1,10 @@
-//! A computer begins to take part.
+//! Creates the context of a computer among several.
 
 use std::{
     collections::VecDeque,
     net::IpAddr,
     sync::{Arc, Mutex},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use hyper::header::HeaderValue;
@@ -14,53 +14,52 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::{Background, CutOff, Known, Member, Outgoing};
+use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
-    app::{duty::Context, startup},
-    checkpoint::session::Restore,
+    app::{context::Context, startup},
+    checkpoint::session::RestorePolicy,
     cluster::{
-        etcd::{Access, Etcd, EtcdError, Options, Tls},
-        journal::{Keys, Progress},
-        machine::{ANSWER_LIMIT, Commit, Machine, Settings, View, WhenAlone},
+        etcd::{Credentials, Etcd, EtcdError, Options, Tls},
+        journal::Keys,
+        machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
+        member::{Member, Own},
         replica::Replica,
-        way::{Place, Way},
+        standing::{Place, Standing},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     hide::Hide,
-    master::Master,
     process::Rosmaster,
     server::others::{Forwarded, Others},
     upstream::peer::Peers,
 };
 
-/// It is best to know what was before one claims; but not for longer.
-const START_BY: Duration = Duration::from_secs(2);
-
-/// What a computer among several is given.
-pub(in crate::app) struct Given {
+/// What a computer among several needs.
+pub(in crate::app) struct ClusterSetup {
     pub(in crate::app) config: ClusterConfig,
     pub(in crate::app) context: Arc<Context>,
     pub(in crate::app) rosmaster: Rosmaster,
     pub(in crate::app) rosout: bool,
     /// Identifies this process.
     pub(in crate::app) instance: HeaderValue,
-    pub(in crate::app) restore: Restore,
-    /// How long a call waits that nobody can answer.
+    pub(in crate::app) restore: RestorePolicy,
+    /// How long a call waits that no component can answer.
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
-    /// Which values of parameters the log does not show.
+    /// The parameters whose values are hidden.
     pub(in crate::app) hide: Hide,
     /// Cancelled when calls are no longer taken.
     pub(in crate::app) halt: CancellationToken,
 }
 
-/// Where the other computers are asked, and the task to run.
-pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdError> {
-    let config = &given.config;
+/// Returns the way to the other computers, and the driver to run.
+pub(in crate::app) async fn join(
+    setup: ClusterSetup,
+) -> Result<(Others, ClusterDriver), EtcdError> {
+    let config = &setup.config;
     let client = Etcd::new(&Options {
         endpoints: config.endpoints.clone(),
-        access: Access {
+        access: Credentials {
             tls: Tls {
                 ca: config.ca.clone(),
                 cert: config.cert.clone(),
@@ -88,81 +87,66 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
             WhenCutOff::Refuse => WhenAlone::Refuse,
         },
     };
-    let context = &given.context;
+    let context = &setup.context;
     context.ledger.leave();
-    // One that an earlier process left may hold what others have changed since.
-    block_in_place(|| given.rosmaster.claim_orphan(None));
-    let known = given.restored;
-    let (way, way_rx) = watch::channel(Way::Nobody { known });
+    // A master left by an earlier process may have outdated state.
+    block_in_place(|| setup.rosmaster.claim_orphan(None));
+    let known = setup.restored;
+    let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
-    let followed = watch::Sender::new(Place::default());
+    let place = watch::Sender::new(Place::default());
     let forwarded = Arc::<Forwarded>::default();
-    let peers = Arc::new(Peers::new(given.instance.clone(), context.probe_timeout));
+    let peers = Arc::new(Peers::new(setup.instance.clone(), context.probe_timeout));
     let others = Others {
-        way: way_rx,
+        standing: standing_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
         forwarded: forwarded.clone(),
-        served: given.context.served.clone(),
-        followed: followed.subscribe(),
-        // A restored mirror may be old: it shows nothing before etcd's journal has been read.
+        served: setup.context.served.clone(),
+        followed: place.subscribe(),
+        // A restored mirror may be outdated, so it answers nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {
-            term: 0,
-            seq: given.restored.into(),
+            seq: setup.restored.into(),
+            ..Place::default()
         })),
-        // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
-        hold: given.hold.max(2 * config.ttl),
+        // The next leader needs the time to live, and etcd may have to elect its own leader first.
+        hold: setup.hold.max(2 * config.ttl),
     };
-    let cut_off = CutOff::left(&context.checkpoint, given.restored).await;
-    let member = Member {
-        machine: Machine::new(settings.clone()),
+    let (kept, left) = Kept::left(&context.checkpoint, setup.restored).await;
+    let session = context.ledger.session();
+    let own = Own {
+        state: context.ledger.with_mirror(Clone::clone),
+        restored: setup.restored,
+        term: session.term,
+        seq: session.cluster_seq,
+    };
+    let keys = Keys::new(&config.robot);
+    let id = settings.id.clone();
+    let driver = ClusterDriver {
+        known: Known::new(&settings),
+        member: Member::new(settings, keys.clone(), own, left, id),
         replica: Replica {
             client,
-            keys: Keys::new(&config.robot),
+            keys,
             limit: ANSWER_LIMIT,
         },
-        known: Known::new(&settings),
-        trouble: Arc::default(),
-        background: Background::default(),
-        settings,
-        given,
-        leads: watch::Sender::new(Way::Nobody { known }),
-        way,
+        setup,
+        standing,
+        place,
         peers,
         forwarded,
-        followed,
         handovers,
+        handover: None,
         inbox: VecDeque::new(),
-        start_by: Some(Instant::now() + START_BY),
-        requests: JoinSet::new(),
-        view: View::default(),
+        work: JoinSet::new(),
+        beside: JoinSet::new(),
         watch: None,
-        loading: None,
-        load_at: Some(Instant::now()),
-        loaded: false,
-        wanted: None,
-        reported: 0,
-        held: Master::default(),
-        displaced: Default::default(),
-        progress: Progress::default(),
-        outgoing: Outgoing::default(),
-        duty: None,
+        watched: View::default(),
+        duties: None,
         endings: JoinSet::new(),
-        cut_off,
-        merging: None,
-        ours: false,
-        before: None,
-        was_released: false,
-        led: false,
-        namesake: None,
-        namesakes: None,
-        deciding: None,
-        probe: None,
-        probe_at: None,
-        released: None,
-        release_by: None,
-        ending_roscore: None,
+        kept,
+        trouble: Arc::default(),
     };
-    Ok((others, member))
+    Ok((others, driver))
 }

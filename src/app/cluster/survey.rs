@@ -1,46 +1,36 @@
-//! Warns at the start about what is wrong with `--cluster`, even while it works.
+//! Warns at the start about mistakes in `--cluster`, even if it works.
 
 use std::time::Duration;
 
-use super::{Member, background::Done};
-use crate::cluster::survey::{self, Complaint, LIMIT};
+use crate::cluster::{
+    replica::Replica,
+    survey::{self, Complaint, LIMIT},
+};
 
-/// An etcd that does not answer is tried again after this time, before a warning: it may be starting, too.
+/// An etcd that does not answer gets a second attempt after this time, because it may be starting. Then rosrescue
+/// warns.
 const SECOND_LOOK: Duration = Duration::from_secs(5);
 
-impl Member {
-    /// Tries each endpoint on its own.
-    pub(super) fn try_endpoints(&mut self) {
-        let (client, keys) = (self.replica.client.clone(), self.replica.keys.clone());
-        self.background.tasks.spawn(async move {
-            let found = survey::complaints(&client.try_each(&keys, LIMIT).await);
-            let (may_pass, certain): (Vec<_>, Vec<_>) =
-                found.into_iter().partition(|of| of.may_pass);
-            certain.iter().for_each(warn);
-            if !may_pass.is_empty() {
-                tokio::time::sleep(SECOND_LOOK).await;
-                let mut found = survey::complaints(&client.try_each(&keys, LIMIT).await);
-                found.retain(|of| !certain.contains(of));
-                found.iter().for_each(warn);
-            }
-            Some(Done::Nothing)
-        });
+/// Tries each endpoint separately.
+pub(super) async fn try_endpoints(replica: Replica) {
+    let Replica { client, keys, .. } = replica;
+    let found = survey::complaints(&client.try_each(&keys, LIMIT).await);
+    let (may_pass, certain): (Vec<_>, Vec<_>) = found.into_iter().partition(|of| of.may_pass);
+    certain.iter().for_each(warn);
+    if !may_pass.is_empty() {
+        tokio::time::sleep(SECOND_LOOK).await;
+        let mut found = survey::complaints(&client.try_each(&keys, LIMIT).await);
+        found.retain(|of| !certain.contains(of));
+        found.iter().for_each(warn);
     }
+}
 
-    /// Compares the robot's name with those of other robots, if etcd does not know it.
-    pub(super) fn look_for_typo(&mut self) {
-        if self.view.leader.is_some() {
-            return;
-        }
-        let (client, robot) = (self.replica.client.clone(), self.given.config.robot.clone());
-        self.background.tasks.spawn(async move {
-            // This robot may be among them by now.
-            if let Ok(mut robots) = client.robots(LIMIT).await {
-                robots.retain(|other| *other != robot);
-                survey::typo(&robot, &robots).iter().for_each(warn);
-            }
-            Some(Done::Nothing)
-        });
+/// Looks for a typo in the name `robot`, which etcd does not know, among the other robots' names.
+pub(super) async fn look_for_typo(replica: Replica, robot: String) {
+    // This robot may have keys by now.
+    if let Ok(mut robots) = replica.client.robots(LIMIT).await {
+        robots.retain(|other| *other != robot);
+        survey::typo(&robot, &robots).iter().for_each(warn);
     }
 }
 

@@ -5,7 +5,7 @@ use serde::Deserialize;
 use crate::{
     cli::ClusterArgs,
     cluster::{
-        etcd::{Access, Etcd, EtcdError, Options, Tls, Tried},
+        etcd::{Credentials, Etcd, EtcdError, Options, Tls, Tried},
         journal::Keys,
         survey::LIMIT,
     },
@@ -62,7 +62,7 @@ impl Cluster {
     async fn ask(config: ClusterConfig) -> Result<Self, Unusable> {
         let client = Etcd::new(&Options {
             endpoints: config.endpoints,
-            access: Access {
+            access: Credentials {
                 tls: Tls {
                     ca: config.ca,
                     cert: config.cert,

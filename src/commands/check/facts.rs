@@ -27,7 +27,7 @@ use crate::{
     clock, config,
     process::{
         self, Rosout,
-        bypass::{Bypass, Place},
+        bypass::{Bypass, MasterAddresses},
         listeners,
     },
     resolver,
@@ -51,10 +51,10 @@ const CLOCKS: [&str; 6] = [
 
 /// All facts that `rosrescue check` judges.
 #[derive(Clone, Debug)]
-pub(super) struct Facts {
+pub(super) struct SetupFacts {
     pub(super) version: &'static str,
     /// The master of `proxy` and what answers at its address. `None` for `core`.
-    pub(super) proxied: Option<(MasterUri, ros::Server)>,
+    pub(super) proxied: Option<(MasterUri, ros::Responder)>,
     /// HTTP version of the master of `proxy`, if it answers.
     pub(super) proxied_speaks: Option<String>,
     /// The kernel's release.
@@ -67,12 +67,12 @@ pub(super) struct Facts {
     /// The host of `ROS_MASTER_URI`.
     pub(super) master_host: Option<Host>,
     /// What answers at `ROS_MASTER_URI`, if that is another computer.
-    pub(super) elsewhere: Option<ros::Server>,
+    pub(super) elsewhere: Option<ros::Responder>,
     /// The host that a rosrescue at `ROS_MASTER_URI` calls itself.
     pub(super) elsewhere_host: Option<Host>,
     /// Hosts of registered nodes, each with some of its nodes, if rosrescue runs.
     pub(super) node_hosts: Vec<(Host, Vec<String>)>,
-    pub(super) disk: Disk,
+    pub(super) disk: CheckpointDisk,
     /// The limit of open files that this process may ask for.
     pub(super) files: u64,
     pub(super) clock: Clock,
@@ -91,7 +91,7 @@ pub(super) struct Facts {
     /// Why the address in `ROS_IP` may change.
     pub(super) lease: Option<Lease>,
     /// The master behind rosrescue, and the clients that bypass rosrescue.
-    pub(super) behind: Option<Behind>,
+    pub(super) behind: Option<UpstreamMaster>,
     /// Masters that run beside rosrescue.
     pub(super) masters: Vec<Process>,
     /// What etcd says about `--cluster`. `None` without it.
@@ -148,13 +148,13 @@ pub(super) struct Port {
     /// Why this process cannot listen at the port, if the port is not taken.
     pub(super) error: Option<String>,
     /// What answers at the port, if it is taken.
-    pub(super) taken: Option<Taken>,
+    pub(super) taken: Option<PortInUse>,
 }
 
 #[derive(Clone, Debug)]
-pub(super) struct Taken {
+pub(super) struct PortInUse {
     pub(super) by: Vec<Process>,
-    pub(super) server: ros::Server,
+    pub(super) server: ros::Responder,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -178,7 +178,7 @@ impl Process {
 
 /// The file system of the checkpoint.
 #[derive(Clone, Debug)]
-pub(super) struct Disk {
+pub(super) struct CheckpointDisk {
     pub(super) checkpoint: PathBuf,
     /// The checkpoint's folder, or its nearest parent that exists.
     pub(super) folder: PathBuf,
@@ -206,7 +206,7 @@ pub(super) struct Clock {
     pub(super) service: Option<String>,
 }
 
-impl Facts {
+impl SetupFacts {
     pub(super) async fn gather(args: &CheckArgs, master: Option<MasterUri>) -> Self {
         let env = |name: &str| std::env::var(name).ok();
         let set = |name: &str| env(name).filter(|value| !value.is_empty());
@@ -240,8 +240,8 @@ impl Facts {
         };
         let (mut proxied, mut proxied_speaks) = (None, None);
         if let Some(uri) = master {
-            let server = ros::Server::ask(&uri).await;
-            if matches!(server, ros::Server::Master(_)) {
+            let server = ros::Responder::ask(&uri).await;
+            if matches!(server, ros::Responder::Master(_)) {
                 proxied_speaks = ros::speaks(&uri).await;
             }
             proxied = Some((uri, server));
@@ -255,19 +255,19 @@ impl Facts {
         let is_far = |host: &Host| host.addresses.is_ok() && !host.is_here;
         let far = master_uri.filter(|_| master_host.as_ref().is_some_and(is_far));
         let elsewhere = match &far {
-            Some(uri) if proxied.is_none() => Some(ros::Server::ask(uri).await),
+            Some(uri) if proxied.is_none() => Some(ros::Responder::ask(uri).await),
             _ => None,
         };
         let (mut nodes_of, mut elsewhere_host) = (None, None);
         match (running.map(|taken| &taken.server), &elsewhere, &far) {
-            (Some(ros::Server::Rosrescue { uri, .. }), _, _) => nodes_of = Some(uri.clone()),
-            (_, Some(ros::Server::Rosrescue { uri, .. }), Some(far)) => {
+            (Some(ros::Responder::Rosrescue { uri, .. }), _, _) => nodes_of = Some(uri.clone()),
+            (_, Some(ros::Responder::Rosrescue { uri, .. }), Some(far)) => {
                 nodes_of = Some(far.to_string());
                 if let Ok(own) = MasterUri::parse(uri) {
                     elsewhere_host = Some(Host::find(&own.host).await);
                 }
             }
-            (_, Some(ros::Server::Master(_)), Some(far)) => nodes_of = Some(far.to_string()),
+            (_, Some(ros::Responder::Master(_)), Some(far)) => nodes_of = Some(far.to_string()),
             _ => {}
         }
         let mut node_hosts = Vec::new();
@@ -300,13 +300,13 @@ impl Facts {
             }
         }
         let (behind, known) = match running.map(|taken| &taken.server) {
-            Some(ros::Server::Rosrescue {
+            Some(ros::Responder::Rosrescue {
                 proxied, bypassing, ..
             }) => (proxied.clone(), bypassing.clone()),
             _ => (proxied.as_ref().map(|(uri, _)| uri.clone()), Vec::new()),
         };
         let behind = match behind {
-            Some(uri) => Some(Behind::look(uri, known).await),
+            Some(uri) => Some(UpstreamMaster::look(uri, known).await),
             None => None,
         };
         let lease = match &environment.ip {
@@ -339,7 +339,7 @@ impl Facts {
             has_rosout: Rosout::find(&checkpoint).is_some(),
             strange_python: ros::strange_python().await,
             clock: Clock::read(&checkpoint),
-            disk: Disk::look(checkpoint),
+            disk: CheckpointDisk::look(checkpoint),
             files: getrlimit(Resource::Nofile).maximum.unwrap_or(u64::MAX),
             units: units::find(),
             memory: free_memory(),
@@ -368,9 +368,9 @@ impl Port {
                     host: at,
                     port: number,
                 };
-                taken = Some(Taken {
+                taken = Some(PortInUse {
                     by: listeners::at(number).into_iter().map(Process::of).collect(),
-                    server: ros::Server::ask(&at).await,
+                    server: ros::Responder::ask(&at).await,
                 });
             }
             Err(ListenError::Other { source, .. }) => error = Some(source.to_string()),
@@ -385,7 +385,7 @@ impl Port {
 
 /// The master behind a `proxy`.
 #[derive(Clone, Debug)]
-pub(super) struct Behind {
+pub(super) struct UpstreamMaster {
     pub(super) uri: MasterUri,
     /// Programs that talk to it directly.
     pub(super) bypassing: Vec<String>,
@@ -393,10 +393,13 @@ pub(super) struct Behind {
     pub(super) is_open: bool,
 }
 
-impl Behind {
+impl UpstreamMaster {
     /// Looks for clients that bypass rosrescue. `known` are those that the running rosrescue has seen.
     async fn look(uri: MasterUri, known: Vec<String>) -> Self {
-        let place = timeout(LOOKUP_LIMIT, Place::of(&uri)).await.ok().flatten();
+        let place = timeout(LOOKUP_LIMIT, MasterAddresses::of(&uri))
+            .await
+            .ok()
+            .flatten();
         let mut bypass = Bypass::default();
         if let Some(place) = &place {
             bypass.look(place);
@@ -410,7 +413,7 @@ impl Behind {
     }
 }
 
-impl Disk {
+impl CheckpointDisk {
     fn look(checkpoint: PathBuf) -> Self {
         let whole = std::path::absolute(&checkpoint).unwrap_or_else(|_| checkpoint.clone());
         let mut above = whole.ancestors().skip(1);
@@ -615,11 +618,11 @@ mod tests {
     #[test]
     fn the_disk_of_a_checkpoint_that_is_not_there_yet_is_known() {
         let folder = tempfile::tempdir().unwrap();
-        let disk = Disk::look(folder.path().join("a/b/checkpoint"));
+        let disk = CheckpointDisk::look(folder.path().join("a/b/checkpoint"));
         assert_eq!(disk.folder, folder.path().canonicalize().unwrap());
         assert!(disk.space.unwrap().0 > 0);
         assert!(disk.mount.is_some() && disk.holder.is_none() && disk.refused.is_none());
-        assert!(Disk::look(folder.path().to_owned()).is_folder);
+        assert!(CheckpointDisk::look(folder.path().to_owned()).is_folder);
         let (of, source) = mount_of(Path::new("/proc/1")).unwrap();
         assert_eq!((&*of, &*source), ("proc", "proc"));
     }

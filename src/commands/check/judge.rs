@@ -8,14 +8,14 @@ mod tests;
 
 use super::{
     Finding, Severity,
-    facts::{Facts, Process},
-    ros::Server,
+    facts::{Process, SetupFacts},
+    ros::Responder,
 };
 
 /// Turns the facts into findings.
-pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
+pub(super) fn judge(facts: &SetupFacts) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
-    if let (Some(Server::Rosrescue { .. } | Server::Master(_)), Some(uri)) =
+    if let (Some(Responder::Rosrescue { .. } | Responder::Master(_)), Some(uri)) =
         (&facts.elsewhere, &facts.env.master_uri)
     {
         // Only nodes run on this computer. What serves the robot is checked on the other one.

@@ -11,9 +11,9 @@ use tokio::{sync::Semaphore, task::JoinSet, time::sleep};
 use super::{Finding, Severity};
 use crate::{
     cli::{CheckArgs, TargetArgs},
-    commands::{Failure, counted, live::Live, running::Running},
+    commands::{CommandFailure, counted, live::Live, running::Running},
     master::{Master, question},
-    nodes::client::{self, Sign},
+    nodes::client::{self, Reaction},
     replay::Token,
     status::summary::some,
     xmlrpc::Value,
@@ -28,7 +28,7 @@ const AT_ONCE: usize = 64;
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
 /// Asks the nodes of the running robot.
-pub(super) async fn look(args: &CheckArgs) -> Result<Vec<Finding>, Failure> {
+pub(super) async fn look(args: &CheckArgs) -> Result<Vec<Finding>, CommandFailure> {
     let uri = std::env::var("ROSRESCUE_URI").ok();
     let mut running = Running::find(&TargetArgs { uri })?;
     running.address.port = args.port.unwrap_or(running.address.port);
@@ -43,7 +43,7 @@ pub(super) async fn look(args: &CheckArgs) -> Result<Vec<Finding>, Failure> {
     Ok(found.findings())
 }
 
-async fn ask(live: &mut Live) -> Result<Found, Failure> {
+async fn ask(live: &mut Live) -> Result<Found, CommandFailure> {
     let state = live.state(&Master::default()).await?;
     let permits = Arc::new(Semaphore::new(AT_ONCE));
     let mut answers = JoinSet::new();
@@ -78,14 +78,14 @@ struct Connection {
 }
 
 impl Answer {
-    fn read((sign, value): (Sign, Option<Value>)) -> Self {
+    fn read((sign, value): (Reaction, Option<Value>)) -> Self {
         let list = value.as_ref().and_then(Value::as_array);
         match (sign, list) {
-            (Sign::Alive, Some(list)) => {
+            (Reaction::Alive, Some(list)) => {
                 let connections = list.iter().map(Connection::read).collect::<Option<_>>();
                 connections.map_or(Self::Other, Self::Connections)
             }
-            (Sign::Alive, None) => Self::Other,
+            (Reaction::Alive, None) => Self::Other,
             _ => Self::Silent,
         }
     }
@@ -258,7 +258,7 @@ mod tests {
             Value::Array(fields.map(Value::from).to_vec())
         };
         let list = Value::Array(connections.iter().map(entry).collect());
-        Answer::read((Sign::Alive, Some(list)))
+        Answer::read((Reaction::Alive, Some(list)))
     }
 
     /// Numbers of seen, missing and unknown connections and of silent nodes.
@@ -296,9 +296,9 @@ mod tests {
 
     #[test]
     fn an_answer_of_another_form_says_nothing() {
-        let read = |value| Answer::read((Sign::Alive, value));
+        let read = |value| Answer::read((Reaction::Alive, value));
         assert_eq!(read(None), Answer::Other);
         assert_eq!(read(Some(Value::Array(vec![1.into()]))), Answer::Other);
-        assert_eq!(Answer::read((Sign::Dead, None)), Answer::Silent);
+        assert_eq!(Answer::read((Reaction::Dead, None)), Answer::Silent);
     }
 }

@@ -14,7 +14,7 @@ use tokio::net::TcpStream;
 use crate::{
     commands::running::Running,
     master,
-    nodes::client::{self, Sign},
+    nodes::client::{self, Reaction},
     process, resolver,
     ros_env::MasterUri,
     status::software,
@@ -33,7 +33,7 @@ const SOME: usize = 3;
 
 /// What answers at an address.
 #[derive(Clone, Debug)]
-pub(super) enum Server {
+pub(super) enum Responder {
     Rosrescue {
         version: String,
         uri: String,
@@ -65,7 +65,7 @@ struct Page {
     bypassing: Vec<String>,
 }
 
-impl Server {
+impl Responder {
     pub(super) async fn ask(address: &MasterUri) -> Self {
         let running = Running {
             address: address.clone(),
@@ -86,10 +86,10 @@ impl Server {
         }
         let (uri, get_pid) = (address.to_string(), master::get_pid());
         match client::ask_for(&uri, &get_pid, ANSWER_LIMIT).await {
-            (Sign::Alive, pid) => Self::Master(pid.as_ref().and_then(Value::as_int)),
-            (Sign::Dead, _) => Self::Nobody,
-            (Sign::Silent, _) if page.is_err() => Self::Silent,
-            (Sign::Silent, _) => Self::Other,
+            (Reaction::Alive, pid) => Self::Master(pid.as_ref().and_then(Value::as_int)),
+            (Reaction::Dead, _) => Self::Nobody,
+            (Reaction::Silent, _) if page.is_err() => Self::Silent,
+            (Reaction::Silent, _) => Self::Other,
         }
     }
 }

@@ -19,12 +19,12 @@ const MOST: u64 = 1 << 20;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(in crate::commands) struct Unit {
     pub(in crate::commands) name: String,
-    pub(in crate::commands) kind: Kind,
+    pub(in crate::commands) kind: UnitKind,
     pub(in crate::commands) is_enabled: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::commands) enum Kind {
+pub(in crate::commands) enum UnitKind {
     Rosrescue,
     /// The unit runs a roscore, or a rosmaster at port 11311.
     Roscore,
@@ -77,11 +77,11 @@ pub(super) fn read(path: &Path) -> String {
 }
 
 /// Classifies a unit by the command that it starts, or by the script that it starts, as those of robot_upstart.
-fn kind_of(unit: &str) -> Option<Kind> {
+fn kind_of(unit: &str) -> Option<UnitKind> {
     let mut found = None;
     for line in unit.lines() {
         if line.trim_start().starts_with("ListenStream=11311") {
-            found = Some(Kind::Rosrescue);
+            found = Some(UnitKind::Rosrescue);
         }
         let Some(command) = line.trim_start().strip_prefix("ExecStart=") else {
             continue;
@@ -103,7 +103,7 @@ fn kind_of(unit: &str) -> Option<Kind> {
 }
 
 /// Classifies a command line.
-fn words(text: &str) -> Option<Kind> {
+fn words(text: &str) -> Option<UnitKind> {
     let lines = text
         .lines()
         .filter(|line| !line.trim_start().starts_with('#'));
@@ -117,10 +117,10 @@ fn words(text: &str) -> Option<Kind> {
     let port = port.and_then(|at| names.get(at + 1));
     let is_elsewhere = port.is_some_and(|port| *port != "11311");
     match () {
-        () if has("rosrescue") => Some(Kind::Rosrescue),
-        () if has("roscore") || has("rosmaster") => (!is_elsewhere).then_some(Kind::Roscore),
+        () if has("rosrescue") => Some(UnitKind::Rosrescue),
+        () if has("roscore") || has("rosmaster") => (!is_elsewhere).then_some(UnitKind::Roscore),
         // With --wait, roslaunch starts no master.
-        () if has("roslaunch") && !has("--wait") => Some(Kind::Roslaunch),
+        () if has("roslaunch") && !has("--wait") => Some(UnitKind::Roslaunch),
         () => None,
     }
 }
@@ -179,9 +179,9 @@ mod tests {
         assert_eq!(
             in_folders(&[folder.path().to_owned()], false),
             [
-                unit("core.service", Kind::Roscore, true),
-                unit("rescue.service", Kind::Rosrescue, false),
-                unit("robot.service", Kind::Roslaunch, false),
+                unit("core.service", UnitKind::Roscore, true),
+                unit("rescue.service", UnitKind::Rosrescue, false),
+                unit("robot.service", UnitKind::Roslaunch, false),
             ]
         );
     }

@@ -9,9 +9,9 @@ use serde::Serialize;
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::node::Heard;
+use super::node::NodeLog;
 use crate::{
-    nodes::client::{self, Sign},
+    nodes::client::{self, Reaction},
     xmlrpc::{Call, Value},
 };
 
@@ -48,16 +48,16 @@ impl Api {
             let took = start.elapsed();
             let value = match (sign, value) {
                 (_, Some(value)) => Ok(value),
-                (Sign::Alive, None) => Err("was refused".to_owned()),
-                (Sign::Dead, None) => Err("found no listener".to_owned()),
-                (Sign::Silent, None) if took >= LIMIT => {
+                (Reaction::Alive, None) => Err("was refused".to_owned()),
+                (Reaction::Dead, None) => Err("found no listener".to_owned()),
+                (Reaction::Silent, None) if took >= LIMIT => {
                     Err(format!("had no answer in {} s", LIMIT.as_secs()))
                 }
-                (Sign::Silent, None) if !again => {
+                (Reaction::Silent, None) if !again => {
                     again = true;
                     continue;
                 }
-                (Sign::Silent, None) => Err("lost its connection twice".to_owned()),
+                (Reaction::Silent, None) => Err("lost its connection twice".to_owned()),
             };
             let value = value.map_err(|why| {
                 let first = params.first().and_then(Value::as_str).unwrap_or_default();
@@ -116,7 +116,7 @@ impl Waits {
 
 /// Results of all calls.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Calls {
+pub(super) struct CallResults {
     pub(super) reads: Waits,
     pub(super) writes: Waits,
     /// Times from a write to the notification of its subscriber.
@@ -129,7 +129,7 @@ pub(super) struct Callers {
     pub(super) api: Api,
     /// Address of the drill's node.
     pub(super) node_api: String,
-    pub(super) heard: Arc<Heard>,
+    pub(super) heard: Arc<NodeLog>,
     /// A parameter that no other node uses.
     pub(super) key: String,
     /// A topic that no other node uses.
@@ -138,10 +138,10 @@ pub(super) struct Callers {
 
 impl Callers {
     /// Calls until `stop`.
-    pub(super) async fn run(self, stop: CancellationToken) -> Calls {
+    pub(super) async fn run(self, stop: CancellationToken) -> CallResults {
         let (reads, (written, read_back, notifications), registered) =
             tokio::join!(self.read(&stop), self.write(&stop), self.register(&stop));
-        Calls {
+        CallResults {
             reads: reads.merge(read_back),
             writes: written.merge(registered),
             notifications,

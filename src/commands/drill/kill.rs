@@ -10,7 +10,7 @@ use super::{
     target::Stopped,
     verdict::{Kill, names},
 };
-use crate::{cli::Victim, commands::Failure, process};
+use crate::{cli::Victim, commands::CommandFailure, process};
 
 /// How long the drill watches after each recovery. Late notifications arrive in that time.
 const AFTER: Duration = Duration::from_millis(1500);
@@ -23,7 +23,7 @@ const DEATHS: usize = 5;
 const DEATHS_WITHIN: Duration = Duration::from_secs(61);
 impl Drill<'_> {
     /// Kills as often as `--times` asks, and waits for each recovery.
-    pub(super) async fn kill(&self) -> Result<Vec<Kill>, Failure> {
+    pub(super) async fn kill(&self) -> Result<Vec<Kill>, CommandFailure> {
         let kill = if self.args.hang {
             Victim::Master
         } else {

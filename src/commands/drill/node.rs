@@ -31,7 +31,7 @@ const MAX_CALL: usize = 16 << 20;
 
 /// The notifications that the node got, and its subscriptions.
 #[derive(Debug, Default)]
-pub(super) struct Heard {
+pub(super) struct NodeLog {
     /// The number in the last `paramUpdate` of a drill's parameter.
     pub(super) param: watch::Sender<i32>,
     /// Other parameters or namespaces that changed.
@@ -48,7 +48,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Heard {
+impl NodeLog {
     pub(super) fn updates(&self) -> Vec<(String, Vec<String>)> {
         lock(&self.updates).clone()
     }
@@ -129,15 +129,15 @@ impl Heard {
 
 /// A node that answers until it is dropped.
 #[derive(Debug)]
-pub(super) struct Node {
+pub(super) struct DrillNode {
     pub(super) name: String,
     /// The address that it registers.
     pub(super) api: String,
-    pub(super) heard: Arc<Heard>,
+    pub(super) heard: Arc<NodeLog>,
     server: tokio::task::JoinHandle<()>,
 }
 
-impl Node {
+impl DrillNode {
     /// Starts a node at this computer's address, chosen as rospy and roscpp do.
     pub(super) async fn start(name: String) -> io::Result<Self> {
         let env = |name: &str| std::env::var(name).ok();
@@ -150,7 +150,7 @@ impl Node {
             host: ros_env::advertised_host(&env, &hostname, listener::local_address()),
             port: listener.local_addr()?.port(),
         };
-        let heard = Arc::new(Heard::default());
+        let heard = Arc::new(NodeLog::default());
         let server = tokio::spawn(serve(listener, heard.clone()));
         Ok(Self {
             name,
@@ -161,13 +161,13 @@ impl Node {
     }
 }
 
-impl Drop for Node {
+impl Drop for DrillNode {
     fn drop(&mut self) {
         self.server.abort();
     }
 }
 
-async fn serve(listener: TcpListener, heard: Arc<Heard>) {
+async fn serve(listener: TcpListener, heard: Arc<NodeLog>) {
     loop {
         let Ok((stream, _)) = listener.accept().await else {
             tokio::task::yield_now().await;
@@ -181,7 +181,7 @@ async fn serve(listener: TcpListener, heard: Arc<Heard>) {
 }
 
 async fn answer(
-    heard: Arc<Heard>,
+    heard: Arc<NodeLog>,
     request: Request<Incoming>,
 ) -> Result<Response<Full<Bytes>>, Infallible> {
     let body = Limited::new(request.into_body(), MAX_CALL).collect().await;
@@ -208,7 +208,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_node_answers_for_itself_and_keeps_its_notifications() {
-        let node = Node::start("/drill".to_owned()).await.unwrap();
+        let node = DrillNode::start("/drill".to_owned()).await.unwrap();
         node.heard.subscribes("/chatter", true);
         let ask = async |call| {
             let limit = std::time::Duration::from_secs(60);

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use super::{PREFIX, calls::Api};
 use crate::{
     master,
-    nodes::client::{self, Sign},
+    nodes::client::{self, Reaction},
     xmlrpc::Value,
 };
 
@@ -22,7 +22,7 @@ const PARAMETER: &str = "the parameter ";
 
 /// The robot's state at one moment, without what belongs to drills.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Robot {
+pub(super) struct RobotState {
     /// Registrations, types and parameters, each under a name for people.
     facts: BTreeMap<String, Value>,
     /// Each node's process id. `None` if it did not answer.
@@ -31,14 +31,14 @@ pub(super) struct Robot {
 
 /// The difference between two moments.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Difference {
+pub(super) struct DrillDifference {
     /// Facts that are gone or changed.
     pub(super) lost: Vec<String>,
     /// Facts that are new, or changed by other programs.
     pub(super) new: Vec<String>,
 }
 
-impl Robot {
+impl RobotState {
     pub(super) async fn read(api: &Api) -> Result<Self, String> {
         let state = api.call("getSystemState", &[]).await?;
         let types = api.call("getTopicTypes", &[]).await?;
@@ -53,7 +53,7 @@ impl Robot {
                 let node = found.as_str().unwrap_or_default();
                 let answer = client::ask_for(node, &master::get_pid(), NODE_LIMIT).await;
                 let pid = match answer {
-                    (Sign::Alive, Some(pid)) => pid.as_int(),
+                    (Reaction::Alive, Some(pid)) => pid.as_int(),
                     _ => None,
                 };
                 (name, pid)
@@ -75,8 +75,8 @@ impl Robot {
         meanwhile: &Self,
         later: &Self,
         changed: &BTreeSet<String>,
-    ) -> Difference {
-        let mut difference = Difference::default();
+    ) -> DrillDifference {
+        let mut difference = DrillDifference::default();
         for (node, pid) in &self.nodes {
             let Some(pid) = pid else { continue };
             match later.nodes.get(node) {
@@ -178,7 +178,7 @@ mod tests {
     use super::*;
     use crate::xmlrpc::Struct;
 
-    fn robot(publisher: &str, value: i32, pid: Option<i32>) -> Robot {
+    fn robot(publisher: &str, value: i32, pid: Option<i32>) -> RobotState {
         let list = |of: &str, node: &str| {
             let nodes: Value = vec![node, "/rosrescue_drill_7"].into();
             Value::Array(vec![Value::Array(vec![of.into(), nodes])])
@@ -196,7 +196,7 @@ mod tests {
         ]));
         let (facts, names) = facts(&state, &types, &params);
         let nodes = names.into_iter().map(|name| (name, pid)).collect();
-        Robot { facts, nodes }
+        RobotState { facts, nodes }
     }
 
     #[test]
@@ -206,7 +206,7 @@ mod tests {
         assert_eq!(before.counts(), (2, 4));
         assert_eq!(
             before.compare(&before, &before, &nothing),
-            Difference::default()
+            DrillDifference::default()
         );
         let after = robot("/other", 5, Some(1));
         let difference = before.compare(&before, &after, &nothing);

@@ -8,7 +8,7 @@ use super::calls::Api;
 use crate::{
     cli::Victim,
     commands::{
-        Failure,
+        CommandFailure,
         running::{Running, is_here},
     },
     process::{self, listeners},
@@ -25,7 +25,10 @@ pub(super) struct Target {
 
 impl Target {
     /// The processes to kill, each with its role; the master comes first.
-    pub(super) async fn victims(&self, kill: Victim) -> Result<Vec<(&'static str, u32)>, Failure> {
+    pub(super) async fn victims(
+        &self,
+        kill: Victim,
+    ) -> Result<Vec<(&'static str, u32)>, CommandFailure> {
         let status = &self.running.status().await?;
         let mut victims = Vec::new();
         if kill != Victim::Worker {
@@ -38,29 +41,29 @@ impl Target {
     }
 
     /// The master's process id. `getPid` reports it, and that process must listen at the address that rosrescue calls.
-    async fn master(&self, status: &Status) -> Result<u32, Failure> {
+    async fn master(&self, status: &Status) -> Result<u32, CommandFailure> {
         if status.elsewhere {
-            return Err(Failure::Usage(
+            return Err(CommandFailure::Usage(
                 "another computer has the master: run the drill there (`rosrescue status` shows which \
                  one), or use --no-kill"
                     .to_owned(),
             ));
         }
-        let address =
-            MasterUri::parse(&status.master).map_err(|error| Failure::Failed(error.to_string()))?;
+        let address = MasterUri::parse(&status.master)
+            .map_err(|error| CommandFailure::Failed(error.to_string()))?;
         if !is_here(&address).await {
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "the master at {} is not on this computer: run the drill there, or use --no-kill",
                 status.master
             )));
         }
-        let pid = self.master_pid().await.map_err(Failure::Failed)?;
+        let pid = self.master_pid().await.map_err(CommandFailure::Failed)?;
         let is_master =
             process::runs(pid, "rosmaster") || process::is_of(pid, Path::new(&status.checkpoint));
         if is_master && listeners::listens(pid, address.port) {
             return Ok(pid);
         }
-        Err(Failure::Usage(format!(
+        Err(CommandFailure::Usage(format!(
             "process {pid} calls itself the master at {}, but this computer's processes do not show \
              so: run the drill as the user of rosrescue, and not in another container",
             status.master
@@ -74,9 +77,9 @@ impl Target {
     }
 
     /// The process id of rosrescue's worker. The status reports it, and that process must listen at the port.
-    fn worker(&self, status: &Status) -> Result<u32, Failure> {
+    fn worker(&self, status: &Status) -> Result<u32, CommandFailure> {
         if !status.guarded {
-            return Err(Failure::Usage(
+            return Err(CommandFailure::Usage(
                 "rosrescue runs without a guardian: nobody would start it again (--no-guardian?)"
                     .to_owned(),
             ));
@@ -84,7 +87,7 @@ impl Target {
         let port = self.running.address.port;
         match process::is_rosrescue(status.pid) && listeners::listens(status.pid, port) {
             true => Ok(status.pid),
-            false => Err(Failure::Usage(format!(
+            false => Err(CommandFailure::Usage(format!(
                 "process {} calls itself rosrescue's worker, but it does not seem to listen at port \
                  {port}: run the drill as the user of rosrescue, and not in another container",
                 status.pid
@@ -95,12 +98,12 @@ impl Target {
     /// # Errors
     ///
     /// If this rosrescue runs on another computer.
-    pub(super) async fn require_this_computer(&self) -> Result<(), Failure> {
+    pub(super) async fn require_this_computer(&self) -> Result<(), CommandFailure> {
         let address = &self.running.address;
         if is_here(address).await {
             return Ok(());
         }
-        Err(Failure::Usage(format!(
+        Err(CommandFailure::Usage(format!(
             "the rosrescue at {address} is on another computer, where nothing can be killed from \
              here: run the drill there, or with --no-kill"
         )))

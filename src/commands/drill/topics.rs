@@ -8,7 +8,7 @@ use std::{
 use serde::Serialize;
 use tokio::{task::JoinHandle, time::timeout};
 
-use super::{calls::Api, node::Node, tcpros::Link};
+use super::{calls::Api, node::DrillNode, tcpros::Link};
 use crate::xmlrpc::Value;
 
 /// Longest time for a publisher to accept a subscriber.
@@ -111,7 +111,7 @@ pub(super) struct Topic {
 
 /// The results for one topic.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Report {
+pub(super) struct TopicReport {
     pub(super) topic: String,
     pub(super) publishers: usize,
     pub(super) messages: u64,
@@ -125,7 +125,11 @@ pub(super) struct Report {
 
 impl Topic {
     /// Subscribes to `topic` as a node does, and connects to all of its publishers.
-    pub(super) async fn subscribe(api: &Api, node: &Node, topic: &str) -> Result<Self, String> {
+    pub(super) async fn subscribe(
+        api: &Api,
+        node: &DrillNode,
+        topic: &str,
+    ) -> Result<Self, String> {
         let register = [topic.into(), "*".into(), node.api.as_str().into()];
         let publishers = api.call("registerSubscriber", &register).await?;
         node.heard.subscribes(topic, true);
@@ -153,7 +157,7 @@ impl Topic {
         })
     }
 
-    pub(super) async fn unsubscribe(&self, api: &Api, node: &Node) -> Result<(), String> {
+    pub(super) async fn unsubscribe(&self, api: &Api, node: &DrillNode) -> Result<(), String> {
         unregister(api, node, &self.name).await
     }
 
@@ -176,8 +180,8 @@ impl Topic {
     }
 
     /// The results until `now`. `updates` are the `publisherUpdate`s that the node got.
-    pub(super) fn report(&self, now: Instant, updates: &[(String, Vec<String>)]) -> Report {
-        let mut report = Report {
+    pub(super) fn report(&self, now: Instant, updates: &[(String, Vec<String>)]) -> TopicReport {
+        let mut report = TopicReport {
             topic: self.name.clone(),
             publishers: self.links.len(),
             messages: self.messages(),
@@ -212,7 +216,7 @@ impl Topic {
 }
 
 /// Unregisters the subscriber of `topic`.
-pub(super) async fn unregister(api: &Api, node: &Node, topic: &str) -> Result<(), String> {
+pub(super) async fn unregister(api: &Api, node: &DrillNode, topic: &str) -> Result<(), String> {
     node.heard.subscribes(topic, false);
     let params = [topic.into(), node.api.as_str().into()];
     api.call("unregisterSubscriber", &params).await.map(drop)

@@ -5,8 +5,8 @@ use std::fmt;
 use serde::Serialize;
 
 use super::{
-    calls::{Calls, Waits},
-    robot::Difference,
+    calls::{CallResults, Waits},
+    robot::DrillDifference,
     topics,
 };
 use crate::commands::counted;
@@ -27,14 +27,14 @@ pub(super) struct Kill {
 
 /// The result of a drill.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Verdict {
+pub(super) struct DrillVerdict {
     pub(super) passed: bool,
     pub(super) uri: String,
     pub(super) version: String,
     pub(super) seconds: f64,
     pub(super) kills: Vec<Kill>,
-    pub(super) calls: Calls,
-    pub(super) topics: Vec<topics::Report>,
+    pub(super) calls: CallResults,
+    pub(super) topics: Vec<topics::TopicReport>,
     /// Number of nodes that answered before the drill.
     pub(super) nodes: usize,
     pub(super) registrations_and_parameters: usize,
@@ -44,9 +44,14 @@ pub(super) struct Verdict {
     pub(super) notes: Vec<String>,
 }
 
-impl Verdict {
+impl DrillVerdict {
     /// Collects the failures.
-    pub(super) fn judge(&mut self, difference: Difference, shutdown: Option<String>, limit: u32) {
+    pub(super) fn judge(
+        &mut self,
+        difference: DrillDifference,
+        shutdown: Option<String>,
+        limit: u32,
+    ) {
         let mut failures = Vec::new();
         for kill in self.kills.iter().filter(|kill| kill.recovered_ms.is_none()) {
             let who = names(&kill.killed);
@@ -55,7 +60,7 @@ impl Verdict {
                 kill.signal
             ));
         }
-        let Calls {
+        let CallResults {
             reads,
             writes,
             notifications,
@@ -108,7 +113,7 @@ pub(super) fn names(killed: &[(&'static str, u32)]) -> String {
     names.collect::<Vec<_>>().join(" and ")
 }
 
-impl fmt::Display for Verdict {
+impl fmt::Display for DrillVerdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let verdict = if self.passed { "PASSED" } else { "FAILED" };
         let what = match self.kills.as_slice() {
@@ -195,7 +200,7 @@ impl fmt::Display for Waits {
     }
 }
 
-impl fmt::Display for topics::Report {
+impl fmt::Display for topics::TopicReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let lost = match self.lost {
             Some(0) => "none lost",
@@ -224,13 +229,13 @@ impl fmt::Display for topics::Report {
 mod tests {
     use super::*;
 
-    fn verdict() -> Verdict {
+    fn verdict() -> DrillVerdict {
         let fine = Waits {
             calls: 10,
             longest_ms: 7.0,
             ..Waits::default()
         };
-        Verdict {
+        DrillVerdict {
             passed: false,
             uri: "http://robot:11311/".to_owned(),
             version: "1".to_owned(),
@@ -240,7 +245,7 @@ mod tests {
                 signal: "SIGKILL",
                 recovered_ms: Some(90.0),
             }],
-            calls: Calls {
+            calls: CallResults {
                 reads: fine.clone(),
                 writes: fine.clone(),
                 notifications: fine,
@@ -256,7 +261,7 @@ mod tests {
     #[test]
     fn it_has_passed_if_nothing_failed() {
         let mut passed = verdict();
-        passed.judge(Difference::default(), None, 30);
+        passed.judge(DrillDifference::default(), None, 30);
         assert!(passed.passed && passed.to_string().starts_with("PASSED: "));
         // The verdict also says what the drill could not see.
         assert!(passed.notes[0].contains("no topic carried messages"));
@@ -264,7 +269,8 @@ mod tests {
 
     #[test]
     fn each_failure_is_said() {
-        let fails = |spoil: &dyn Fn(&mut Verdict) -> (Difference, Option<String>), said: &str| {
+        let fails = |spoil: &dyn Fn(&mut DrillVerdict) -> (DrillDifference, Option<String>),
+                     said: &str| {
             let mut failed = verdict();
             let (difference, shutdown) = spoil(&mut failed);
             failed.judge(difference, shutdown, 30);
@@ -272,7 +278,7 @@ mod tests {
             assert!(!failed.passed && text.starts_with("FAILED: "), "{text}");
             assert!(text.contains(said), "{text}");
         };
-        let same = Difference::default;
+        let same = DrillDifference::default;
         fails(
             &|verdict| {
                 verdict.kills[0].recovered_ms = None;
@@ -302,7 +308,7 @@ mod tests {
         let lost = (0..20)
             .map(|number| format!("the node /n{number} is gone"))
             .collect();
-        let lost = Difference {
+        let lost = DrillDifference {
             lost,
             new: Vec::new(),
         };

@@ -27,7 +27,7 @@ pub(super) fn units(user: bool) -> [String; 2] {
 
 /// The settings of one robot.
 #[derive(Clone, Debug)]
-pub(super) struct Robot<'a> {
+pub(super) struct UnitSettings<'a> {
     pub(super) program: &'a Path,
     /// `core` or `proxy`, with options.
     pub(super) command: &'a [String],
@@ -42,7 +42,7 @@ pub(super) struct Robot<'a> {
     pub(super) disabled: &'a [String],
 }
 
-impl Robot<'_> {
+impl UnitSettings<'_> {
     /// The drop-in of the service.
     pub(super) fn service(&self) -> String {
         let mut lines = vec![MARK.to_owned()];
@@ -136,7 +136,7 @@ mod tests {
                 .map(|&word| word.to_owned())
                 .collect::<Vec<_>>()
         };
-        let robot = Robot {
+        let robot = UnitSettings {
             program: Path::new("/usr/local/bin/rosrescue"),
             command: &words(&["core", "--checkpoint", "/a b/100%$"]),
             run_as: Some("robot"),
@@ -163,7 +163,7 @@ mod tests {
                 .socket()
                 .ends_with("\nListenStream=\nListenStream=11411\n")
         );
-        let robot = Robot {
+        let robot = UnitSettings {
             listen: &["127.0.0.1:1", "[::1]:1"].map(|address| address.parse().unwrap()),
             ..robot
         };

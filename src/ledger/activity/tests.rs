@@ -72,7 +72,10 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
     activity.set_notifying(true);
     assert!(apply(&mut activity, false));
     let changes = activity.take_outbox().changes;
-    assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
+    assert_eq!(
+        changes,
+        IndexSet::from([NotifyingChange::Topic("/t".to_owned())])
+    );
     assert_eq!(activity.take_owed(now).topics, ["/t"]);
     assert_eq!(activity.take_owed(now).topics, Vec::<String>::new());
     // Without a master, rosrescue sends the notifications, with the master's words.
@@ -175,8 +178,7 @@ fn a_key_is_kept_once_for_all_its_subscribers() {
     assert_eq!(noticed.len(), NOTICES);
     let (_, first) = &noticed[0];
     assert!(noticed.iter().all(|(_, key)| Arc::ptr_eq(key, first)));
-    let is_shared =
-        |change: &Change| matches!(change, Change::Param(_, key) if Arc::ptr_eq(key, first));
+    let is_shared = |change: &NotifyingChange| matches!(change, NotifyingChange::Param(_, key) if Arc::ptr_eq(key, first));
     let changes = activity.take_outbox().changes;
     assert!(changes.len() == NOTICES && changes.iter().all(is_shared));
 }

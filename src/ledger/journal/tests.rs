@@ -45,8 +45,8 @@ fn set(value: i32) -> Request {
     Request::new(Method::SetParam, params)
 }
 
-fn entry(value: i32) -> Vec<Entry> {
-    vec![Entry::call(set(value).into())]
+fn entry(value: i32) -> Vec<RecordContent> {
+    vec![RecordContent::call(set(value).into())]
 }
 
 /// The complete state after these values were set.

@@ -9,7 +9,7 @@ use tokio::{
 
 use super::*;
 use crate::{
-    checkpoint::format::Session,
+    checkpoint::format::{Record, RecordContent, Session},
     cli::{Reads, SyncPolicy},
     gate,
     ledger::Ledger,
@@ -26,10 +26,18 @@ const TERM: u64 = 7;
 /// A following computer, and what the test controls.
 struct Computer {
     calls: Calls,
-    way: watch::Sender<Way>,
-    /// How far its mirror follows the journal.
+    standing: watch::Sender<Standing>,
+    /// How far its mirror holds the journal.
     followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
+}
+
+fn place(term: u64, seq: u64) -> Place {
+    Place {
+        term,
+        seq,
+        ..Place::default()
+    }
 }
 
 fn set(value: i32) -> Request {
@@ -46,8 +54,8 @@ fn handover() -> Request {
 }
 
 impl Computer {
-    /// Creates a computer whose mirror holds one parameter.
-    fn new(way: Way) -> Self {
+    /// Its mirror holds one parameter.
+    fn new(standing: Standing) -> Self {
         let (gate_tx, gate) = gate::gate();
         gate_tx.set(gate::State::Elsewhere);
         let stats = Box::leak(Box::default());
@@ -71,7 +79,7 @@ impl Computer {
             false,
             crate::lifecycle::Patience::new(second),
         );
-        let (way, way_rx) = watch::channel(way);
+        let (standing, standing_rx) = watch::channel(standing);
         let (handovers_tx, handovers) = mpsc::channel(1);
         let (tell_followed, followed) = watch::channel(Place::default());
         let calls = Calls {
@@ -87,7 +95,7 @@ impl Computer {
             uri: OWN.to_owned(),
             hold: second,
             others: Some(Others {
-                way: way_rx,
+                standing: standing_rx,
                 peers: Arc::new(Peers::new(instance(), second)),
                 handovers: handovers_tx,
                 passing: Arc::default(),
@@ -100,7 +108,7 @@ impl Computer {
         };
         Self {
             calls,
-            way,
+            standing,
             followed: tell_followed,
             handovers,
         }
@@ -130,8 +138,8 @@ fn made_by(call: &Request) -> Reply {
     model.apply(call).reply
 }
 
-/// A leader that answers each call with this status, or never answers.
-async fn leader(says: Option<StatusCode>) -> Way {
+/// A leader that says 421 to each call, or nothing at all.
+async fn leader(says: Option<StatusCode>) -> Standing {
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
     tokio::spawn(async move {
@@ -144,19 +152,22 @@ async fn leader(says: Option<StatusCode>) -> Way {
             open.push(stream);
         }
     });
-    let uri = MasterUri::parse(&format!("http://127.0.0.1:{port}/")).unwrap();
-    Way::Leader { uri, term: TERM }
+    let uri = format!("http://127.0.0.1:{port}/");
+    Standing::Follows { uri, term: TERM }
 }
 
 #[tokio::test]
 async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
-    for way in [
-        Way::Here { term: None },
-        Way::Here { term: Some(8) },
-        Way::Nobody { known: true },
+    for standing in [
+        Standing::Alone,
+        Standing::Leads {
+            term: 8,
+            pass: Pass::Calls,
+        },
+        Standing::Nobody { known: true },
         leader(None).await,
     ] {
-        let computer = Computer::new(way);
+        let computer = Computer::new(standing);
         for call in [get(), set(2), handover()] {
             let answer = computer.ask("/cluster/7", &call).await.unwrap();
             assert_eq!(answer.status(), StatusCode::MISDIRECTED_REQUEST);
@@ -166,12 +177,14 @@ async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
 
 #[tokio::test]
 async fn while_nobody_leads_reads_are_the_mirrors_and_a_write_waits_for_the_next_leader() {
-    let computer = Computer::new(Way::Nobody { known: true });
+    let computer = Computer::new(Standing::Nobody { known: true });
     let answer = computer.ask("/RPC2", &get()).await.unwrap();
     assert_eq!(reply(answer).await, made_by(&get()));
     assert!(computer.ask("/RPC2", &set(2)).await.is_err());
-    // While the state is unknown, the mirror cannot answer.
-    computer.way.send_replace(Way::Nobody { known: false });
+    // Before the state is known there is nothing to answer with.
+    computer
+        .standing
+        .send_replace(Standing::Nobody { known: false });
     assert!(computer.ask("/RPC2", &get()).await.is_err());
 }
 
@@ -191,8 +204,8 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
         );
     }
     let gone = MasterUri::parse("http://127.0.0.1:1/").unwrap();
-    let computer = Computer::new(Way::Leader {
-        uri: gone,
+    let computer = Computer::new(Standing::Follows {
+        uri: gone.to_string(),
         term: TERM,
     });
     let answer = computer.ask("/RPC2", &get()).await.unwrap();
@@ -201,7 +214,7 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
 
 #[tokio::test]
 async fn who_and_where_the_master_is_each_computer_says_of_itself() {
-    let computer = Computer::new(Way::Nobody { known: false });
+    let computer = Computer::new(Standing::Nobody { known: false });
     let uri = Request::new(Method::GetUri, ["/n"]);
     let answer = reply(computer.ask("/RPC2", &uri).await.unwrap()).await;
     let Reply::Value(answer) = answer else {
@@ -212,7 +225,10 @@ async fn who_and_where_the_master_is_each_computer_says_of_itself() {
 
 #[tokio::test]
 async fn a_write_that_no_record_holds_is_refused_before_it_is_run() {
-    let computer = Computer::new(Way::Here { term: Some(TERM) });
+    let computer = Computer::new(Standing::Leads {
+        term: TERM,
+        pass: Pass::Calls,
+    });
     let body = Bytes::from(vec![b' '; RECORD_BYTES_MAX + 1]);
     let from = "127.0.0.1:4000".parse().unwrap();
     let ask = |call| {
@@ -231,7 +247,10 @@ async fn a_write_that_no_record_holds_is_refused_before_it_is_run() {
 
 #[tokio::test]
 async fn a_handover_is_asked_for_where_this_computer_leads_and_is_done_or_refused() {
-    let mut computer = Computer::new(Way::Here { term: Some(TERM) });
+    let mut computer = Computer::new(Standing::Leads {
+        term: TERM,
+        pass: Pass::Calls,
+    });
     for told in [Ok("pc-1".to_owned()), Err("no other computer".to_owned())] {
         let call = handover();
         let mut handovers = std::mem::replace(&mut computer.handovers, mpsc::channel(1).1);
@@ -317,8 +336,8 @@ async fn a_follower_tells_its_leader_when_the_caller_has_the_answer() {
             });
         }
     });
-    let uri = MasterUri::parse(&format!("http://127.0.0.1:{port}/")).unwrap();
-    let computer = Computer::new(Way::Leader { uri, term: TERM });
+    let uri = format!("http://127.0.0.1:{port}/");
+    let computer = Computer::new(Standing::Follows { uri, term: TERM });
     let mut answer = computer.ask("/", &get()).await.unwrap();
     assert!(bodies.recv().await.unwrap().contains("getParam"));
     let held: UntilWritten = answer.extensions_mut().remove().unwrap();
@@ -352,10 +371,10 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
 /// long it takes.
 #[tokio::test(start_paused = true)]
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
-    let computer = Computer::new(Way::Nobody { known: true });
+    let computer = Computer::new(Standing::Nobody { known: true });
     let others = computer.calls.others.clone().unwrap();
-    let told = |term, seq| *others.told() = Place { term, seq };
-    let follows = |term, seq| computer.followed.send_replace(Place { term, seq });
+    let told = |term, seq| *others.told() = place(term, seq);
+    let follows = |term, seq| computer.followed.send_replace(place(term, seq));
     let later = others.hold / 2;
     let get = get();
     told(TERM, 7);
@@ -375,4 +394,30 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     }
     told(TERM + 1, 9);
     assert!(computer.ask("/", &get).await.is_err(), "it is never fresh");
+}
+
+/// `rospy.loginfo` and `get_param_cached` subscribe each time.
+#[tokio::test]
+async fn a_subscription_that_is_there_already_waits_for_no_leader() {
+    let subscribe = |key| Request::new(Method::SubscribeParam, ["/n", "http://n:1/", key]);
+    let record = Record {
+        seq: 1,
+        entry: RecordContent::call(subscribe("/a").into()),
+    };
+    let prompt = 5 * PATIENCE;
+    for standing in [leader(None).await, Standing::Nobody { known: true }] {
+        let computer = Computer::new(standing);
+        computer
+            .calls
+            .ledger
+            .follow(std::slice::from_ref(&record))
+            .unwrap();
+        let (there, new) = (subscribe("/a"), subscribe("/b"));
+        let answer = tokio::time::timeout(prompt, computer.ask("/RPC2", &there)).await;
+        let expected = made_by(&there);
+        assert_eq!(reply(answer.unwrap().unwrap()).await, expected);
+        // One that is new is the leader's affair.
+        let answer = tokio::time::timeout(prompt, computer.ask("/RPC2", &new)).await;
+        assert!(answer.is_err());
+    }
 }

@@ -25,7 +25,7 @@ use crate::{
     health::Health,
     server::{
         Server,
-        replies::{Content, HttpReply, text},
+        replies::{HttpReply, ReplyBody, text},
     },
 };
 
@@ -123,7 +123,7 @@ pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     if !feed.running.swap(true, Ordering::AcqRel) {
         tokio::spawn(look(server.clone()));
     }
-    Response::new(Content::Events(body))
+    Response::new(ReplyBody::Events(body))
 }
 
 /// Sends new events. A listener that reads slowly misses outdated events.

@@ -17,7 +17,7 @@ const FOUND: usize = 200;
 
 /// A parameter or a namespace.
 #[derive(Debug, PartialEq, Eq, Serialize)]
-pub(super) struct Entry {
+pub(super) struct ParamEntry {
     /// The last part of the name. In search results, the whole name.
     name: String,
     /// `namespace`, or the type of the value as rosparam calls it.
@@ -43,7 +43,7 @@ pub(super) struct Entry {
 /// The members of a namespace, sorted by name.
 #[derive(Debug, Default, PartialEq, Eq, Serialize)]
 pub(super) struct Members {
-    members: Vec<Entry>,
+    members: Vec<ParamEntry>,
     /// Number of members that are left out.
     more: usize,
 }
@@ -74,13 +74,13 @@ fn list(namespace: &Struct, name: &str, hide: &Hide, room: &mut usize) -> Member
             Value::Struct(inner) if !inner.is_empty() => {
                 let (count, entries) = size(inner);
                 let members = (entries <= *room).then(|| list(inner, &name, hide, room));
-                Entry {
+                ParamEntry {
                     members,
                     count: Some(count),
-                    ..Entry::named((*part).clone(), "namespace")
+                    ..ParamEntry::named((*part).clone(), "namespace")
                 }
             }
-            value => Entry::of((*part).clone(), &name, value, hide),
+            value => ParamEntry::of((*part).clone(), &name, value, hide),
         }
     });
     Members {
@@ -119,12 +119,12 @@ fn collect(namespace: &Struct, above: &str, text: &str, hide: &Hide, found: &mut
             _ if found.members.len() == FOUND => found.more += 1,
             value => found
                 .members
-                .push(Entry::of(name.clone(), &name, value, hide)),
+                .push(ParamEntry::of(name.clone(), &name, value, hide)),
         }
     }
 }
 
-impl Entry {
+impl ParamEntry {
     fn named(name: String, kind: &'static str) -> Self {
         Self {
             name,

@@ -10,7 +10,7 @@ use serde::Serialize;
 use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Nodes, replay::Token};
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
-pub(super) struct Node {
+pub(super) struct NodeRow {
     pub(super) name: String,
     pub(super) health: Health,
     /// When `health` was last known, in seconds since 1970.
@@ -27,7 +27,7 @@ pub(super) struct Node {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
-pub(super) struct Topic {
+pub(super) struct TopicRow {
     pub(super) name: String,
     #[serde(rename = "type")]
     pub(super) kind: String,
@@ -45,8 +45,8 @@ pub(super) struct Service {
 /// Nodes, topics and services, each sorted by name.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash, Serialize)]
 pub(super) struct Robot {
-    pub(super) nodes: Vec<Node>,
-    pub(super) topics: Vec<Topic>,
+    pub(super) nodes: Vec<NodeRow>,
+    pub(super) topics: Vec<TopicRow>,
     pub(super) services: Vec<Service>,
 }
 
@@ -75,10 +75,10 @@ impl Robot {
             let here = robot.nodes.iter().any(|node| node.name == name);
             if !here {
                 let at = clock::wall_time_of(at);
-                robot.nodes.push(Node {
+                robot.nodes.push(NodeRow {
                     health: Health::Dead,
                     removed_at: Some(at.round() as u64),
-                    ..Node::registered(name, String::new())
+                    ..NodeRow::registered(name, String::new())
                 });
             }
         }
@@ -88,10 +88,10 @@ impl Robot {
 
     /// The content of a snapshot, without rosrescue's own token.
     pub(super) fn of(snapshot: Snapshot) -> Self {
-        let mut nodes: BTreeMap<String, Node> = BTreeMap::new();
+        let mut nodes: BTreeMap<String, NodeRow> = BTreeMap::new();
         for (name, node) in snapshot.nodes {
             if !Token::is_ours(&name) {
-                nodes.insert(name.clone(), Node::registered(name, node.api));
+                nodes.insert(name.clone(), NodeRow::registered(name, node.api));
             }
         }
         let mut topics = BTreeMap::new();
@@ -110,7 +110,7 @@ impl Robot {
                     list.push(name.clone());
                 }
                 let kind = snapshot.topic_types.get(&name);
-                let topic = topics.entry(name.clone()).or_insert_with(|| Topic {
+                let topic = topics.entry(name.clone()).or_insert_with(|| TopicRow {
                     kind: kind.map_or("*", String::as_str).to_owned(),
                     name,
                     publishers: Vec::new(),
@@ -159,7 +159,7 @@ impl Robot {
     }
 }
 
-impl Node {
+impl NodeRow {
     fn registered(name: String, api: String) -> Self {
         Self {
             name,

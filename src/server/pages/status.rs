@@ -10,13 +10,13 @@ use crate::{
     clock,
     gate::State,
     health::Health,
-    ledger::journal::Seen,
+    ledger::journal::StoreState,
     master::Master,
     status::{
-        Disk,
+        DiskStatus,
         computers::Computers,
         condition::{Situation, condition},
-        summary::{Journal, SCHEMA, Status},
+        summary::{JournalStatus, SCHEMA, Status},
     },
 };
 
@@ -133,16 +133,16 @@ impl Pages {
         }
     }
 
-    fn journal(&self, disk: &Disk) -> Journal {
+    fn journal(&self, disk: &DiskStatus) -> JournalStatus {
         let seen = self.ledger.seen_store().unwrap_or_default();
-        let Seen {
+        let StoreState {
             seq,
             journal_bytes: bytes,
             snapshot_bytes,
             ..
         } = seen;
         let (at, from) = disk.compacted.unzip();
-        Journal {
+        JournalStatus {
             records: seq.saturating_sub(from.unwrap_or(seq)),
             bytes,
             snapshot_bytes,

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::Name;
+use super::ConditionName;
 use crate::{
     cluster::machine::Role,
     gate::State,
@@ -14,22 +14,22 @@ use crate::{
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// A condition caused by the other computers.
-pub(super) struct Notice {
-    pub(super) name: Name,
+pub(super) struct ClusterCondition {
+    pub(super) name: ConditionName,
     pub(super) since: Instant,
     pub(super) text: String,
     pub(super) action: Option<String>,
 }
 
 /// The condition caused by the other computers. `None` on the leader, whose condition is that of a single computer.
-pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
+pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<ClusterCondition> {
     let leader = of.leader.as_ref();
     let notice = match (of.role, leader, of.leaderless) {
         (Role::Leading, ..) => return None,
         (Role::Alone, ..) => alone(gate, of),
         (Role::Following, Some(leader), None) => following(of, leader),
-        (Role::CatchingUp, ..) => Notice {
-            name: Name::NoLeader,
+        (Role::CatchingUp, ..) => ClusterCondition {
+            name: ConditionName::NoLeader,
             since: of.leaderless.unwrap_or(of.since),
             text: "Nodes keep working: this computer is taking over, and reads the rest of the journal from etcd. \
                    It answers reads; writes wait."
@@ -37,8 +37,8 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
             action: None,
         },
         (Role::Following, ..) => no_leader(of),
-        (Role::Joining, ..) => Notice {
-            name: Name::NoLeader,
+        (Role::Joining, ..) => ClusterCondition {
+            name: ConditionName::NoLeader,
             since: of.since,
             text: format!(
                 "Calls wait: this computer does not know the others yet{}.",
@@ -50,26 +50,26 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
     Some(notice)
 }
 
-fn following(of: &ClusterFacts, leader: &LeaderFacts) -> Notice {
+fn following(of: &ClusterFacts, leader: &LeaderFacts) -> ClusterCondition {
     let LeaderFacts { name, uri, .. } = leader;
     let trouble = match of.etcd {
         Some(_) => format!(" This computer cannot take over now{}.", etcd(of)),
         None => String::new(),
     };
-    Notice {
-        name: Name::Following,
+    ClusterCondition {
+        name: ConditionName::Following,
         since: of.since.max(leader.since),
         text: format!("Nodes work as usual: the leader, {name} at {uri}, answers.{trouble}"),
         action: None,
     }
 }
 
-fn no_leader(of: &ClusterFacts) -> Notice {
+fn no_leader(of: &ClusterFacts) -> ClusterCondition {
     let last = of.leader.as_ref();
     let last = last.map(|leader| format!(" The last leader was {}.", leader.name));
     let since = of.leaderless.unwrap_or(of.since);
-    Notice {
-        name: Name::NoLeader,
+    ClusterCondition {
+        name: ConditionName::NoLeader,
         since,
         text: format!(
             "Nodes keep working: reads are answered, writes wait for the next leader{}.{}",
@@ -80,7 +80,7 @@ fn no_leader(of: &ClusterFacts) -> Notice {
     }
 }
 
-fn alone(gate: State, of: &ClusterFacts) -> Notice {
+fn alone(gate: State, of: &ClusterFacts) -> ClusterCondition {
     let kept = match of.uncommitted {
         0 => "none so far".to_owned(),
         1 => "1 so far".to_owned(),
@@ -101,8 +101,8 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
              where others change the same"
         ),
     };
-    Notice {
-        name: Name::Alone,
+    ClusterCondition {
+        name: ConditionName::Alone,
         since: of.since,
         text: format!("{notice}. This computer is cut off from the others{why}."),
         action: Some(
@@ -209,7 +209,10 @@ mod tests {
         let mut cluster = ClusterFacts::of_three();
         cluster.leaderless = Some(Instant::now());
         let short = of(State::Elsewhere, &cluster);
-        assert_eq!((short.name, &short.action), (Name::NoLeader, &None));
+        assert_eq!(
+            (short.name, &short.action),
+            (ConditionName::NoLeader, &None)
+        );
         assert!(
             short.text.contains("writes wait") && short.text.contains("pc-1"),
             "{short:?}"
@@ -217,10 +220,10 @@ mod tests {
         cluster.leaderless = Instant::now().checked_sub(2 * PATIENCE);
         assert!(of(State::Elsewhere, &cluster).action.is_some());
         cluster.role = Role::CatchingUp;
-        assert_eq!(of(State::Elsewhere, &cluster).name, Name::NoLeader);
+        assert_eq!(of(State::Elsewhere, &cluster).name, ConditionName::NoLeader);
         cluster.role = Role::Joining;
         for gate in [State::Elsewhere, State::Unknown] {
-            assert_eq!(of(gate, &cluster).name, Name::NoLeader);
+            assert_eq!(of(gate, &cluster).name, ConditionName::NoLeader);
         }
     }
 
@@ -230,7 +233,7 @@ mod tests {
         cluster.role = Role::Alone;
         cluster.uncommitted = 3;
         let serving = of(OPEN, &cluster);
-        assert_eq!(serving.name, Name::Alone);
+        assert_eq!(serving.name, ConditionName::Alone);
         assert!(
             serving
                 .line()
@@ -244,7 +247,7 @@ mod tests {
         assert!(serving.action.is_some());
         cluster.etcd = trouble();
         let refusing = of(State::Elsewhere, &cluster);
-        assert_eq!(refusing.name, Name::Alone);
+        assert_eq!(refusing.name, ConditionName::Alone);
         assert!(refusing.text.contains("--alone refuse"), "{refusing:?}");
         assert!(
             refusing.text.contains("(etcd has no majority)"),
@@ -268,7 +271,10 @@ mod tests {
             well.text.contains("these could take over: pc-1."),
             "{well:?}"
         );
-        assert_eq!(of(State::StandingIn, &cluster).name, Name::StandingIn);
+        assert_eq!(
+            of(State::StandingIn, &cluster).name,
+            ConditionName::StandingIn
+        );
         cluster.members.retain(|member| member.name != "pc-1");
         let last = of(OPEN, &cluster);
         assert!(!last.is_good() && last.action.unwrap().contains("pc-3"));

@@ -14,7 +14,7 @@ fn a_node_knows_better_only_by_the_contrary() {
         registered,
         unregistered,
     };
-    let condition = Condition {
+    let condition = Precondition {
         node: "/n".to_owned(),
         last_calls: last_calls(3, 2),
     };

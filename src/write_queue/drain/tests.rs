@@ -10,7 +10,7 @@ use crate::{
     gate::gate,
     health::port_of,
     lifecycle::Patience,
-    order::{Next as Notification, REPEAT_AFTER, Subject},
+    order::{NextNotification as Notification, REPEAT_AFTER, Subject},
     upstream::{Head, test_master, verify::Verification},
     write_queue::write_queue,
     xmlrpc::Value,

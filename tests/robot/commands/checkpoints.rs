@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use rosrescue::checkpoint::format::{self, Checkpoint, Entry, Record, Session};
+use rosrescue::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
 use rosrescue::master::Snapshot;
 use rosrescue::xmlrpc::Call;
 
@@ -143,7 +143,7 @@ fn file(at: &Path) -> [usize; 3] {
         let call = Call::new("setParam", params!["/n", name, 2]);
         let record = Record {
             seq,
-            entry: Entry::call(call),
+            entry: RecordContent::call(call),
         };
         bytes.extend(format::encode_record(&record, encoded.stamp).unwrap());
         starts[seq as usize - 1] = bytes.len();

@@ -64,7 +64,7 @@ pub struct Session {
 
 /// The content of a record.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Entry {
+pub enum RecordContent {
     /// A write that was answered with success.
     Call {
         call: Call,
@@ -75,7 +75,7 @@ pub enum Entry {
     Session(Session),
 }
 
-impl Entry {
+impl RecordContent {
     /// A write that a master has run.
     pub fn call(call: Call) -> Self {
         let pending = false;
@@ -88,7 +88,7 @@ impl Entry {
 pub struct Record {
     /// The number of the record. It grows by one with each record, across all generations of the file.
     pub seq: u64,
-    pub entry: Entry,
+    pub entry: RecordContent,
 }
 
 /// A complete state and its position in the journal.
@@ -126,7 +126,7 @@ pub enum EncodeError {
 
 /// Why a file cannot be read.
 #[derive(Debug, Error, PartialEq, Eq)]
-pub enum DecodeError {
+pub enum FormatError {
     /// No part of the file belongs to a checkpoint.
     #[error("not a rosrescue checkpoint")]
     NotACheckpoint,

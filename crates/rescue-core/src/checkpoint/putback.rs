@@ -14,7 +14,7 @@ pub type LeftOut = (String, String);
 
 /// The parameters to change.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Params {
+pub struct ParamChanges {
     /// Name, present value in the master, and value in the checkpoint.
     pub set: Vec<(String, Option<Value>, Value)>,
     /// Names of parameters that the checkpoint lacks.
@@ -22,7 +22,7 @@ pub struct Params {
     pub left_out: Vec<LeftOut>,
 }
 
-impl Params {
+impl ParamChanges {
     /// The changes that give `live` every parameter of `file`. With `exact` they also delete all others.
     pub fn between(file: &Struct, live: &Struct, exact: bool) -> Self {
         let mut found = Self::default();
@@ -120,7 +120,7 @@ mod tests {
             ("other", 1.into()),
             ("emptied", space(&[("x", 1.into())])),
         ]);
-        let plan = Params::between(&file, &live, false);
+        let plan = ParamChanges::between(&file, &live, false);
         let set = [
             ("/a/y", Some(5.into()), 2.into()),
             ("/was_value/z", None, 3.into()),
@@ -131,7 +131,7 @@ mod tests {
         assert_eq!(plan.delete, [""; 0]);
         let left: Vec<_> = plan.left_out.iter().map(|(what, _)| what).collect();
         assert_eq!(left, ["parameter /run_id", "parameter /never"]);
-        let exact = Params::between(&file, &live, true);
+        let exact = ParamChanges::between(&file, &live, true);
         assert_eq!(exact.delete, ["/a/new", "/other"]);
         assert_eq!(exact.set.len(), plan.set.len() + 1);
         assert_eq!(exact.set[3].0, "/emptied");

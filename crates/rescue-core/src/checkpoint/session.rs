@@ -5,13 +5,13 @@
 use std::collections::BTreeMap;
 
 use crate::{
-    checkpoint::format::{Checkpoint, Entry, Record, Session},
+    checkpoint::format::{Checkpoint, Record, RecordContent, Session},
     master::{Displaced, Master, Request},
 };
 
 /// When to restore a checkpoint at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Restore {
+pub enum RestorePolicy {
     /// Restore it if the session continues: there was no reboot and no clean stop, or a registered node is still alive.
     Auto,
     /// Always restore it.
@@ -22,7 +22,7 @@ pub enum Restore {
 
 /// What is known about the session in a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Evidence {
+pub struct SessionEvidence {
     /// Whether the computer has not rebooted since.
     pub same_boot: bool,
     /// Whether rosrescue was stopped cleanly.
@@ -39,12 +39,12 @@ pub enum Decision {
     Fresh(&'static str),
 }
 
-/// Whether the decision depends on [`Evidence::node_alive`], which takes time to find out.
-pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
+/// Whether the decision depends on [`SessionEvidence::node_alive`], which takes time to find out.
+pub fn depends_on_nodes(policy: RestorePolicy, evidence: SessionEvidence) -> bool {
     let with = |node_alive| {
         decide(
             policy,
-            Evidence {
+            SessionEvidence {
                 node_alive,
                 ..evidence
             },
@@ -55,23 +55,25 @@ pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
 
 /// Decides whether the session in a checkpoint continues. It does after a kill. After a clean stop or a
 /// reboot it does only if one of its nodes is alive.
-pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
-    let Evidence {
+pub fn decide(policy: RestorePolicy, evidence: SessionEvidence) -> Decision {
+    let SessionEvidence {
         same_boot,
         closed,
         node_alive,
     } = evidence;
     match policy {
-        Restore::Always => Decision::Restore("--restore always"),
-        Restore::Never => Decision::Fresh("--restore never"),
-        Restore::Auto if same_boot && !closed => {
+        RestorePolicy::Always => Decision::Restore("--restore always"),
+        RestorePolicy::Never => Decision::Fresh("--restore never"),
+        RestorePolicy::Auto if same_boot && !closed => {
             Decision::Restore("the session continues: rosrescue was not stopped cleanly")
         }
-        Restore::Auto if node_alive => Decision::Restore("the session continues: nodes are alive"),
-        Restore::Auto if closed => {
+        RestorePolicy::Auto if node_alive => {
+            Decision::Restore("the session continues: nodes are alive")
+        }
+        RestorePolicy::Auto if closed => {
             Decision::Fresh("rosrescue was stopped cleanly and no node is alive")
         }
-        Restore::Auto => Decision::Fresh("the computer was rebooted and no node is alive"),
+        RestorePolicy::Auto => Decision::Fresh("the computer was rebooted and no node is alive"),
     }
 }
 
@@ -108,7 +110,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
     let delivered = |session: &Option<Session>| session.as_ref().map_or(0, |it| it.delivered);
     for Record { seq, entry } in records {
         match entry {
-            Entry::Call {
+            RecordContent::Call {
                 call,
                 pending: waits,
             } => {
@@ -124,7 +126,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                     pending.push((seq, request));
                 }
             }
-            Entry::Session(session) => {
+            RecordContent::Session(session) => {
                 if session.delivered > delivered(&rebuilt.session) {
                     pending.retain(|(seq, _)| *seq > session.delivered);
                 }
@@ -145,12 +147,12 @@ mod tests {
     fn write(seq: u64, pending: bool) -> Record {
         let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
         let call = Call::new("setParam", params);
-        let entry = Entry::Call { call, pending };
+        let entry = RecordContent::Call { call, pending };
         Record { seq, entry }
     }
 
     fn delivered(seq: u64, delivered: u64) -> Record {
-        let entry = Entry::Session(Session {
+        let entry = RecordContent::Session(Session {
             delivered,
             ..Session::default()
         });
@@ -159,7 +161,7 @@ mod tests {
 
     /// The pending writes: those in a snapshot taken at record 5, and those in `records`.
     fn waiting(records: &[Record]) -> Vec<String> {
-        let Entry::Call { call, .. } = write(4, true).entry else {
+        let RecordContent::Call { call, .. } = write(4, true).entry else {
             unreachable!()
         };
         let mut checkpoint = Checkpoint {
@@ -204,7 +206,7 @@ mod tests {
     #[test]
     fn each_call_after_a_session_record_counts_as_one_more_in_the_etcd_journal() {
         let session = |seq, cluster_seq| {
-            let entry = Entry::Session(Session {
+            let entry = RecordContent::Session(Session {
                 cluster_seq,
                 ..Session::default()
             });
@@ -229,7 +231,7 @@ mod tests {
         let calls = [("/a", 1), ("/b", 1), ("/a", 2), ("/c", 1), ("/a", 3)];
         let records = (1..).zip(calls).map(|(seq, (topic, port))| Record {
             seq,
-            entry: Entry::call(publish(topic, port)),
+            entry: RecordContent::call(publish(topic, port)),
         });
         let displaced = rebuild(None, records.collect()).displaced;
         let displaced = displaced.iter().map(|it| (it.api.as_str(), &it.topics));
@@ -243,8 +245,8 @@ mod tests {
         );
     }
 
-    fn restores(policy: Restore, same_boot: bool, closed: bool, node_alive: bool) -> bool {
-        let evidence = Evidence {
+    fn restores(policy: RestorePolicy, same_boot: bool, closed: bool, node_alive: bool) -> bool {
+        let evidence = SessionEvidence {
             same_boot,
             closed,
             node_alive,
@@ -255,20 +257,23 @@ mod tests {
     #[test]
     fn a_session_continues_after_a_crash_or_while_nodes_are_alive() {
         assert!(
-            restores(Restore::Auto, true, false, false),
+            restores(RestorePolicy::Auto, true, false, false),
             "crash and start"
         );
         assert!(
-            !restores(Restore::Auto, true, true, false),
+            !restores(RestorePolicy::Auto, true, true, false),
             "clean stop and start"
         );
         assert!(
-            restores(Restore::Auto, true, true, true),
+            restores(RestorePolicy::Auto, true, true, true),
             "clean stop, nodes alive"
         );
-        assert!(!restores(Restore::Auto, false, false, false), "reboot");
         assert!(
-            restores(Restore::Auto, false, false, true),
+            !restores(RestorePolicy::Auto, false, false, false),
+            "reboot"
+        );
+        assert!(
+            restores(RestorePolicy::Auto, false, false, true),
             "reboot, nodes on another computer"
         );
     }
@@ -276,15 +281,15 @@ mod tests {
     #[test]
     fn nodes_are_asked_only_if_the_decision_depends_on_them() {
         for (policy, same_boot, closed, matters) in [
-            (Restore::Auto, true, false, false),
-            (Restore::Auto, true, true, true),
-            (Restore::Auto, false, false, true),
-            (Restore::Auto, false, true, true),
-            (Restore::Always, false, true, false),
-            (Restore::Never, false, true, false),
+            (RestorePolicy::Auto, true, false, false),
+            (RestorePolicy::Auto, true, true, true),
+            (RestorePolicy::Auto, false, false, true),
+            (RestorePolicy::Auto, false, true, true),
+            (RestorePolicy::Always, false, true, false),
+            (RestorePolicy::Never, false, true, false),
         ] {
             for node_alive in [false, true] {
-                let evidence = Evidence {
+                let evidence = SessionEvidence {
                     same_boot,
                     closed,
                     node_alive,
@@ -299,8 +304,8 @@ mod tests {
     fn restore_always_and_never_decide_without_asking_nodes() {
         for evidence in 0..8 {
             let [boot, closed, alive] = [1, 2, 4].map(|bit| evidence & bit != 0);
-            assert!(restores(Restore::Always, boot, closed, alive));
-            assert!(!restores(Restore::Never, boot, closed, alive));
+            assert!(restores(RestorePolicy::Always, boot, closed, alive));
+            assert!(!restores(RestorePolicy::Never, boot, closed, alive));
         }
     }
 }

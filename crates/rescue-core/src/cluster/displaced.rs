@@ -8,9 +8,9 @@ use std::{
 
 use crate::master::{Displaced, Master, Request};
 
-/// How long it may take to tell a node to shut down, with all retries.
+/// How long it may take to tell a node to shut down, including retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// Most nodes that are remembered.
+/// How many nodes are remembered.
 const MOST: usize = 1024;
 
 /// The nodes of the last minute, the oldest first.
@@ -18,13 +18,13 @@ const MOST: usize = 1024;
 pub struct DisplacedLately(VecDeque<(Instant, Displaced)>);
 
 impl DisplacedLately {
-    /// `call` changes `state`, which is the one before it.
+    /// Notes whom `call` displaces from `state`, the state before the call.
     pub fn note(&mut self, now: Instant, state: &Master, call: &Request) {
         let calls = call.calls().into_iter();
         self.add(now, calls.filter_map(|call| state.displaced_by(call)));
     }
 
-    /// Adds those that a snapshot names.
+    /// Adds the nodes in a snapshot.
     pub fn add(&mut self, now: Instant, displaced: impl IntoIterator<Item = Displaced>) {
         self.0.extend(displaced.into_iter().map(|node| (now, node)));
         let is_old = |at: &Instant| now.duration_since(*at) >= TELLING;
@@ -33,7 +33,7 @@ impl DisplacedLately {
         }
     }
 
-    /// Those of the minute before `now`, one for each address.
+    /// The nodes displaced in the minute before `now`, one per address.
     pub fn at(&self, now: Instant) -> Vec<Displaced> {
         let lately = self.0.iter();
         let lately = lately.filter(|(at, _)| now.duration_since(*at) < TELLING);

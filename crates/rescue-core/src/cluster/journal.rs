@@ -15,19 +15,19 @@ use thiserror::Error;
 
 use crate::checkpoint::format::{self, EncodeError, Record};
 
-/// Most bytes of the records of one transaction. etcd refuses requests of 1.5 MiB, takes 60 ms for one of
-/// 1 MB, and nothing else is committed meanwhile.
+/// Size limit of one transaction's records, in bytes. etcd refuses requests of 1.5 MiB, and one of 1 MB takes 60 ms,
+/// during which nothing else is committed.
 pub const BATCH_BYTES: usize = 256 << 10;
-/// Most records of one transaction: more are no quicker.
+/// How many records one transaction contains at most. More are no faster.
 pub const BATCH_RECORDS: usize = 2_000;
-/// Bytes of a part of something larger.
+/// Size of a part of a larger value, in bytes.
 const PART_BYTES: usize = 512 << 10;
-/// The largest record. etcd keeps 2 GiB at most unless it is told otherwise, and a record is in the journal
-/// and in two snapshots before it goes.
+/// The largest record, in bytes. etcd keeps 2 GiB by default, and a record may be in the journal and in two snapshots
+/// at the same time.
 pub const RECORD_BYTES_MAX: usize = 64 << 20;
-/// A snapshot is due when the journal has outgrown the last one and this,
+/// A snapshot is due when the journal is larger than the last snapshot and than this many bytes.
 const SNAPSHOT_BYTES: usize = 1 << 20;
-/// or has so many entries: who joins reads them all.
+/// A snapshot is also due at this many journal entries, because a computer that joins reads them all.
 const SNAPSHOT_ENTRIES: usize = 1_000;
 
 #[derive(Debug, Error, PartialEq)]
@@ -59,7 +59,7 @@ pub struct Put {
 pub struct Keys(String);
 
 impl Keys {
-    /// The keys of `robot`, which may have slashes.
+    /// The keys of `robot`, whose name may contain slashes.
     pub fn new(robot: &str) -> Self {
         Self(format!("/{}/", robot.trim_matches('/')))
     }
@@ -84,9 +84,18 @@ impl Keys {
         format!("{}journal/{seq:020}", self.0)
     }
 
-    /// All keys but parts of values.
+    /// All keys except parts of values.
     pub fn small(&self) -> Range<String> {
         self.0.clone()..format!("{}v", self.0)
+    }
+
+    /// As [`Self::small`], without the journal up to record `seq`.
+    pub fn small_after(&self, seq: u64) -> [Range<String>; 2] {
+        let all = self.small();
+        [
+            all.start..self.journal(0),
+            self.journal(seq.saturating_add(1))..all.end,
+        ]
     }
 
     /// The keys of the journal after record `seq`.
@@ -94,7 +103,7 @@ impl Keys {
         self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)
     }
 
-    /// What goes when there is a snapshot of record `seq`: the journal up to it, and its blobs.
+    /// The keys to delete once there is a snapshot of record `seq`: the journal up to it, and its blobs.
     pub fn behind(&self, seq: u64) -> [Range<String>; 2] {
         let next = seq.saturating_add(1);
         [
@@ -103,7 +112,7 @@ impl Keys {
         ]
     }
 
-    /// The number of the last record in a key of the journal.
+    /// The number in a journal key: its last record.
     pub fn seq_of(&self, key: &str) -> Option<u64> {
         key.strip_prefix(&self.0)?
             .strip_prefix("journal/")?
@@ -123,12 +132,12 @@ impl Keys {
         format!("{}values/snapshot/{seq:020}/", self.0)
     }
 
-    /// The parts of snapshots before that of record `seq`.
+    /// The parts of snapshots older than that of record `seq`.
     pub fn snapshots_before(&self, seq: u64) -> Range<String> {
         self.snapshots(0)..self.snapshots(seq)
     }
 
-    /// The keys of the parts of what a manifest names.
+    /// The keys of the parts that a manifest names.
     pub fn parts(&self, manifest: &Manifest) -> Range<String> {
         let folder = match manifest.kind {
             Kind::Blob => self.blob(manifest.seq),
@@ -153,23 +162,23 @@ impl Kind {
     }
 }
 
-/// What is in parts elsewhere.
+/// A reference to a value that is stored in parts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Manifest {
     kind: Kind,
-    /// The last record in it.
+    /// Its last record.
     pub seq: u64,
     bytes: usize,
     crc: u32,
 }
 
 impl Manifest {
-    /// Whether it names a whole state, and not records.
+    /// Whether it is a whole state instead of records.
     pub fn is_state(&self) -> bool {
         self.kind == Kind::Snapshot
     }
 
-    /// The parts of `bytes`, and the manifest that is to be written after them.
+    /// Splits `bytes` into parts, and returns them with the manifest, which must be written after them.
     fn split(keys: &Keys, kind: Kind, seq: u64, bytes: &[u8]) -> (Self, Vec<Put>) {
         let manifest = Self {
             kind,
@@ -217,7 +226,7 @@ impl Manifest {
         })
     }
 
-    /// Puts the parts together, which are in the order of their keys.
+    /// Joins the parts, which are sorted by key.
     pub fn assemble(&self, keys: &Keys, parts: &[Vec<u8>]) -> Result<Vec<u8>, JournalError> {
         let whole = parts.concat();
         if whole.len() == self.bytes && crc32c::crc32c(&whole) == self.crc {
@@ -234,21 +243,21 @@ impl Manifest {
     }
 }
 
-/// What one transaction adds to the journal.
+/// The records that one transaction adds to the journal.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Batch {
-    /// How many of the records are in it.
+pub struct JournalBatch {
+    /// How many of the records it contains.
     pub count: usize,
     pub entry: Option<Put>,
 }
 
-/// The first of `records`, as many as go into one transaction.
+/// Takes as many of the first `records` as fit into one transaction.
 ///
 /// # Errors
 ///
-/// [`JournalError::TooLarge`] if the first one is too large at all. It must not have been run: see
+/// [`JournalError::TooLarge`] if the first record is too large for the journal. Such a call must not be run: see
 /// [`check_size`].
-pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
+pub fn pack(keys: &Keys, records: &[Record]) -> Result<JournalBatch, JournalError> {
     let (mut value, mut seq, mut count) = (Vec::new(), 0, 0);
     for record in records.iter().take(BATCH_RECORDS) {
         let before = value.len();
@@ -260,20 +269,20 @@ pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
         (seq, count) = (record.seq, count + 1);
     }
     if count == 0 {
-        return Ok(Batch::default());
+        return Ok(JournalBatch::default());
     }
     check_size(value.len())?;
     if value.len() > BATCH_BYTES {
-        // It is alone.
+        // A large record gets a transaction of its own.
         value = Manifest::split(keys, Kind::Blob, seq, &value).0.text();
     }
     let key = keys.journal(seq);
     let entry = Some(Put { key, value });
-    Ok(Batch { count, entry })
+    Ok(JournalBatch { count, entry })
 }
 
-/// What has to be written before the transaction with this record, each on its own. Without the entry it means
-/// nothing.
+/// The parts of a large record, which must be written before its transaction, one by one. Without the transaction
+/// they have no effect.
 ///
 /// # Errors
 ///
@@ -288,7 +297,7 @@ pub fn parts(keys: &Keys, record: &Record) -> Result<Vec<Put>, JournalError> {
     }
 }
 
-/// Whether a call whose record has so many bytes can be in the journal. To be asked before it is run.
+/// Checks whether a call's record of this size fits into the journal. Must be called before the call is run.
 pub fn check_size(bytes: usize) -> Result<(), JournalError> {
     match bytes > RECORD_BYTES_MAX {
         true => Err(JournalError::TooLarge { bytes }),
@@ -296,7 +305,7 @@ pub fn check_size(bytes: usize) -> Result<(), JournalError> {
     }
 }
 
-/// The records of an entry of the journal, or of a blob.
+/// The records of a journal entry or of a blob.
 pub fn records(key: &str, value: &[u8]) -> Result<Vec<Record>, JournalError> {
     format::read_records(value).map_err(|why| JournalError::Damaged {
         key: key.to_owned(),
@@ -304,22 +313,22 @@ pub fn records(key: &str, value: &[u8]) -> Result<Vec<Record>, JournalError> {
     })
 }
 
-/// The parts of a snapshot, `bytes` of the state after record `seq`, and what is to be written at
-/// [`Keys::snapshot`] when they are there.
+/// The parts of a snapshot (`bytes`, the state after record `seq`), and the value to write at [`Keys::snapshot`]
+/// after them.
 pub fn snapshot(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
     let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
     let (key, value) = (keys.snapshot(), manifest.text());
     (parts, Put { key, value })
 }
 
-/// The parts of a state that replaces the present one as record `seq`, and the journal's entry that names them.
+/// The parts of a state that replaces the present one as record `seq`, and the journal entry that refers to them.
 pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
     let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
     let (key, value) = (keys.journal(seq), manifest.text());
     (parts, Put { key, value })
 }
 
-/// How far a mirror has followed the journal, and how large that is.
+/// How far a mirror has followed the journal, and the journal's size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
     /// The last record.

@@ -1,34 +1,37 @@
-//! Decides who leads, what may be acknowledged, and when this computer is alone.
+//! Decides who leads, what may be acknowledged, and when this computer is cut off.
 //!
-//! A state machine without IO, as [`crate::lifecycle`] is: the shell passes in what happened and when, and
-//! carries out the returned actions. Every deadline is in here. All computers use their own clocks, and only
-//! to measure times: a clock may show anything, and may run up to a tenth too fast or too slow.
+//! A state machine without IO, like [`crate::lifecycle`]: the shell passes in what happened and when, and carries out
+//! the returned actions. All deadlines are decided here. Each computer uses its own clock, and only to measure
+//! durations. Clocks may differ, and may run up to a tenth too fast or too slow.
 
 use std::time::{Duration, Instant};
+
+use crate::cluster::mutant::Mutant;
 
 mod due;
 mod flight;
 mod session;
 mod types;
 
-use self::flight::{Flight, Reign};
-pub use self::session::Session;
+use self::flight::{Flight, Leadership};
+pub use self::session::JournalSession;
 pub use types::{
-    Action, Alive, Answer, Commit, Guard, Input, Leader, Op, Role, Settings, View, WhenAlone,
+    Action, Alive, Commit, EtcdAnswer, Input, Leader, Op, RevisionGuard, Role, Settings, View,
+    WhenAlone,
 };
 
-/// How long a request may take before it counts as [`Answer::Silence`]. Longer than a time to live: an etcd
-/// that takes 2 s for each answer still tells who leads.
+/// How long a request may take before it counts as [`EtcdAnswer::Silence`]. It is longer than a time to live, because an
+/// etcd that needs 2 s per answer still shows who leads.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
-/// Pause before a request that was not answered is sent again.
+/// Pause before an unanswered request is sent again.
 const RETRY: Duration = Duration::from_millis(100);
-/// How often the leader writes `alive` within the time to live.
+/// How often the leader writes `alive` per time to live.
 const BEATS: u32 = 4;
-/// The part of the time to live by which a leader stops before another one may begin: a tenth each for a
-/// clock that is slow and one that is fast.
+/// A leader stops this part of the time to live (a fifth) before another may begin: a tenth for a slow clock, and a
+/// tenth for a fast one.
 const MARGIN: u32 = 5;
-/// How long after the time to live a next leader is waited for. A claim takes three delays of the network, but
-/// etcd may have to choose a leader of its own first: that takes up to 2.6 s from the death of the last one.
+/// How long after the time to live a computer waits for the next leader before it counts as cut off. A claim takes
+/// three network delays, but etcd may have to elect its own leader first, which takes up to 2.6 s.
 const PATIENCE: Duration = Duration::from_millis(1500);
 /// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
 const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
@@ -40,32 +43,33 @@ pub struct Machine {
     role: Role,
     view: View,
     started: Option<Instant>,
-    /// When this process went on, after it had stood still.
+    /// When this process continued after a pause.
     resumed: Option<Instant>,
-    /// When `view` was seen for the first time; another one that differs only in its own revision is no other.
+    /// When `view` was first seen. A view with another revision and the same keys counts as the same.
     observed: Option<Instant>,
-    /// When etcd was heard of last.
+    /// When etcd last answered.
     heard: Option<Instant>,
-    reign: Option<Reign>,
+    leadership: Option<Leadership>,
     flight: Option<Flight>,
     retry_at: Option<Instant>,
     numbers: u64,
     claims: u64,
-    /// The mirror holds the journal up to here,
+    /// The last record of the journal that the mirror contains.
     followed: u64,
-    /// unless it has to be made anew.
+    /// Whether the mirror must be rebuilt from the journal.
     stale: bool,
-    session: Session,
+    session: JournalSession,
     recorded: u64,
     committed: u64,
     acknowledged: u64,
-    /// Whether the leader's rosrescue answers, and since when that is so.
+    /// Whether the leader's rosrescue answers, and since when.
     peer: Option<(bool, Instant)>,
     releasing: Option<String>,
+    claim_not_before: Option<Instant>,
 }
 
 impl Machine {
-    /// A machine at rest; it starts with [`Input::Start`].
+    /// Creates a machine that does nothing until [`Input::Start`].
     pub fn new(settings: Settings) -> Self {
         Self {
             settings,
@@ -75,19 +79,20 @@ impl Machine {
             resumed: None,
             observed: None,
             heard: None,
-            reign: None,
+            leadership: None,
             flight: None,
             retry_at: None,
             numbers: 0,
             claims: 0,
             followed: 0,
             stale: false,
-            session: Session::default(),
+            session: JournalSession::default(),
             recorded: 0,
             committed: 0,
             acknowledged: 0,
             peer: None,
             releasing: None,
+            claim_not_before: None,
         }
     }
 
@@ -95,19 +100,33 @@ impl Machine {
         self.role
     }
 
-    /// What is known of the leader.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// When the leader's keys were first seen in their present state.
+    pub fn observed(&self) -> Option<Instant> {
+        self.observed
+    }
+
+    /// When etcd last answered.
+    pub fn heard(&self) -> Option<Instant> {
+        self.heard
+    }
+
+    /// The leader's keys as this computer knows them.
     pub fn view(&self) -> &View {
         &self.view
     }
 
-    /// What is known of the journal's session.
-    pub fn session(&self) -> Session {
+    /// What is known about the journal's session.
+    pub fn session(&self) -> JournalSession {
         self.session
     }
 
-    /// The term in which this process leads.
+    /// The term in which this process leads, if it does.
     pub fn term(&self) -> Option<u64> {
-        self.reign.map(|reign| reign.term)
+        self.leadership.map(|leadership| leadership.term)
     }
 
     /// The last record of this computer that is known to be in the journal.
@@ -115,54 +134,52 @@ impl Machine {
         self.committed
     }
 
-    /// Whether calls that write are to be recorded here. If not, they are for the leader, or wait.
-    pub fn takes_writes(&self) -> bool {
-        match self.role {
-            Role::Leading => self.releasing.is_none(),
-            Role::Alone => self.settings.alone == WhenAlone::Serve,
-            _ => false,
-        }
-    }
-
-    /// Whether nobody else can lead at `now`.
+    /// Whether no other computer can lead at `now`.
     pub fn is_sole(&self, now: Instant) -> bool {
         self.sole_until().is_some_and(|until| now < until)
     }
 
-    /// Until when this computer may act as the leader without asking again; in the past if it may not. None
-    /// while it is alone and serves: it does not claim to lead then.
+    /// Until when this computer may act as the leader without asking etcd again. In the past if it may not. `None`
+    /// while it is cut off and serves, because it does not claim to lead then.
     pub fn lease(&self, now: Instant) -> Option<Instant> {
         match self.role {
+            _ if Mutant::ActsWithoutLease.lives() => None,
             Role::Alone if self.settings.alone == WhenAlone::Serve => None,
             Role::Leading => Some(self.sole_until().unwrap_or(now)),
             _ => Some(now),
         }
     }
 
-    /// Whether this computer may have a master of its own: only while nobody else can lead. A computer
-    /// that is alone has none. Its mirror answers, because a master would tell its nodes' state to nodes of the
-    /// others as soon as the network lets it.
+    /// Whether this computer may run a master: only while no other computer can lead. While it is cut off, its mirror
+    /// answers instead. A master would notify the other computers' nodes of its own state as soon as the network is
+    /// back.
     pub fn may_have_master(&self) -> bool {
-        self.role == Role::Leading && self.lapses_at().is_some()
+        let unsafely = match self.role {
+            Role::Leading => Mutant::ActsWithoutLease.lives(),
+            Role::Alone => Mutant::MasterWhileAlone.lives(),
+            _ => false,
+        };
+        unsafely || self.role == Role::Leading && self.lapses_at().is_some()
     }
 
-    /// When another computer can lead at the earliest; none if one can.
+    /// The earliest time at which another computer can lead. `None` if one already can.
     fn lapses_at(&self) -> Option<Instant> {
-        let reign = self.reign.filter(|reign| !reign.lapsed)?;
-        Some(reign.sent? + self.settings.ttl)
+        let leadership = self.leadership.filter(|leadership| !leadership.lapsed)?;
+        Some(leadership.sent? + self.settings.ttl)
     }
 
     fn sole_until(&self) -> Option<Instant> {
         let ttl = self.settings.ttl;
-        Some(self.reign?.sent? + ttl - ttl / MARGIN)
+        Some(self.leadership?.sent? + ttl - ttl / MARGIN)
     }
 
-    /// Takes an input at `now`. Returns the actions, in order.
+    /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
             return actions;
         }
+        self.give_up_request(now);
         if self
             .deadline()
             .is_some_and(|due| due + self.settings.ttl / BEATS < now)
@@ -183,6 +200,7 @@ impl Machine {
                 self.acknowledge_early(now, &mut actions);
             }
             Input::Peer(leads) => self.peer(now, leads, &mut actions),
+            Input::Lost { view, until } => self.start_over(now, view, until, &mut actions),
             Input::HandOver(to) => {
                 self.releasing = Some(to).filter(|_| self.role == Role::Leading);
             }
@@ -192,22 +210,39 @@ impl Machine {
         actions
     }
 
-    fn answered(&mut self, now: Instant, number: u64, answer: Answer, actions: &mut Vec<Action>) {
+    /// Counts a request that never ends as unanswered.
+    fn give_up_request(&mut self, now: Instant) {
+        let lost = self.flight.as_ref().filter(|flight| !flight.silent);
+        let lost = lost.filter(|flight| flight.sent + ANSWER_LIMIT + RETRY <= now);
+        if let Some(number) = lost.map(|flight| flight.number)
+            && !Mutant::WaitsForEver.lives()
+        {
+            self.answered(now, number, EtcdAnswer::Silence, &mut Vec::new());
+        }
+    }
+
+    fn answered(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: EtcdAnswer,
+        actions: &mut Vec<Action>,
+    ) {
         let Some(flight) = self.flight.take_if(|flight| flight.number == number) else {
             return;
         };
         let view = match answer {
-            Answer::Silence => {
+            EtcdAnswer::Silence => {
                 self.retry_at = Some(now + RETRY);
-                // Its effect is unknown, so it is sent again. A claim shows in the keys.
+                // Its effect is unknown, so it is sent again. The keys show whether a claim succeeded.
                 self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
                     silent: true,
                     ..flight
                 });
                 return;
             }
-            Answer::Is(view) => view,
-            Answer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
+            EtcdAnswer::Is(view) => view,
+            EtcdAnswer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
         };
         self.retry_at = None;
         self.flight = Some(flight);
@@ -215,7 +250,7 @@ impl Machine {
         self.flight.take_if(|flight| flight.number == number);
     }
 
-    /// The keys after `op` was made.
+    /// The keys after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
@@ -263,7 +298,28 @@ impl Machine {
         }
     }
 
-    /// etcd shows the keys.
+    /// Starts over with `view`, because etcd has lost its data.
+    fn start_over(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
+        self.flight = None;
+        self.deposed(actions);
+        // A claim in an old snapshot is not this process's claim.
+        self.settings.id.push('+');
+        (self.observed, self.heard) = (Some(now), Some(now));
+        (self.peer, self.retry_at) = (None, None);
+        self.session = JournalSession::GoesOn;
+        self.claim_not_before = Some(until);
+        self.view = view;
+        self.follow_to(0);
+        self.stale = false;
+        actions.push(Action::CatchUp(self.view.seq()));
+    }
+
+    /// Does not claim leadership before `until`.
+    pub fn hold_claims(&mut self, until: Instant) {
+        self.claim_not_before = Some(until);
+    }
+
+    /// Handles keys that etcd shows.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         self.heard = Some(now);
         if view.revision < self.view.revision {
@@ -280,7 +336,7 @@ impl Machine {
             self.session.see(alive, other && changed && !first);
         }
         if view.guard().leader != self.view.guard().leader {
-            // Nothing is known of the next leader's rosrescue.
+            // Nothing is known yet about the next leader's rosrescue.
             self.peer = None;
         }
         self.view = view;
@@ -288,11 +344,11 @@ impl Machine {
         let mine = leader.filter(|leader| leader.id == self.settings.id);
         let mine = mine.map(|leader| leader.term);
         let alive = self.view.alive.as_ref();
-        match (self.reign, mine) {
-            (Some(reign), Some(term)) if reign.term == term => {
+        match (self.leadership, mine) {
+            (Some(leadership), Some(term)) if leadership.term == term => {
                 let beat = alive.map_or(0, |alive| alive.beat);
                 if let Some(flight) = self.flight.take_if(|flight| flight.is_beat(beat)) {
-                    self.beaten(now, reign, &flight, actions);
+                    self.beaten(now, leadership, &flight, actions);
                 }
             }
             (Some(_), _) => self.deposed(actions),
@@ -307,8 +363,14 @@ impl Machine {
         }
     }
 
-    /// The beat in `flight` was made.
-    fn beaten(&mut self, now: Instant, reign: Reign, flight: &Flight, actions: &mut Vec<Action>) {
+    /// Handles the success of the beat in `flight`.
+    fn beaten(
+        &mut self,
+        now: Instant,
+        leadership: Leadership,
+        flight: &Flight,
+        actions: &mut Vec<Action>,
+    ) {
         let Op::Beat {
             beat,
             released,
@@ -319,38 +381,45 @@ impl Machine {
             return;
         };
         self.retry_at = None;
-        if reign.caught_up {
+        if leadership.caught_up {
             self.committed = self.view.seq();
         }
         if released.is_some() {
-            // A write may have come in between.
+            // Another write may have come in between.
             self.deposed(actions);
             actions.push(Action::Released);
             return;
         }
-        self.reign = Some(Reign {
+        self.leadership = Some(Leadership {
             sent: Some(flight.first),
             beat: *beat,
             full: *seq > self.view.seq(),
             lapsed: false,
-            ..reign
+            ..leadership
         });
         let upto = self.committed;
         self.acknowledge(upto, actions);
         if self.role == Role::Alone && self.is_sole(now) {
-            match reign.caught_up {
-                true => self.become_role(Role::Leading, actions),
+            match leadership.caught_up {
+                true => {
+                    if self.settings.alone == WhenAlone::Refuse {
+                        // The shell has stopped recording, and starts again after the journal's last record.
+                        self.hand_back(actions);
+                        self.stale = false;
+                    }
+                    self.become_role(Role::Leading, actions);
+                }
                 false => self.catch_up(actions),
             }
         }
     }
 
-    /// A claim of this process was made.
+    /// Handles the success of this process's claim.
     fn claimed(&mut self, term: u64, actions: &mut Vec<Action>) {
         let flight = self.flight.take();
         let claim = self.view.leader.as_ref().map_or(0, |leader| leader.claim);
         let sent = flight.filter(|flight| flight.is_claim(claim));
-        self.reign = Some(Reign {
+        self.leadership = Some(Leadership {
             term,
             sent: sent.map(|flight| flight.first),
             beat: 0,
@@ -375,14 +444,14 @@ impl Machine {
         !self.stale && self.followed >= self.view.seq()
     }
 
-    /// Another one leads, or could.
+    /// Gives up, because another computer leads or could lead.
     fn deposed(&mut self, actions: &mut Vec<Action>) {
-        (self.reign, self.releasing) = (None, None);
+        (self.leadership, self.releasing) = (None, None);
         self.flight.take_if(|flight| flight.op != Op::Read);
-        self.give_way(actions);
+        self.step_down(actions);
     }
 
-    fn give_way(&mut self, actions: &mut Vec<Action>) {
+    fn step_down(&mut self, actions: &mut Vec<Action>) {
         match self.role {
             Role::Leading | Role::Alone => self.hand_back(actions),
             _ => {}
@@ -391,7 +460,7 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Calls of this computer are in no journal.
+    /// Has the shell keep this computer's calls that are not in the journal.
     fn hand_back(&mut self, actions: &mut Vec<Action>) {
         let Self {
             committed,

@@ -1,8 +1,8 @@
-//! What of the writes that a computer has answered while it was alone still holds: all but those about
-//! something that others have changed since it was cut off, whatever it is now.
+//! Decides which of a computer's writes hold that it answered while it was cut off: all, except those whose subject
+//! others have changed since, whatever its value is now.
 //!
-//! It is judged twice by the same rules: by the computer that was alone, by what it reads in the journal; and by
-//! the leader before each portion, by what came after that. See decision 42.
+//! The same rules apply twice: on the computer that was cut off, to the changes that it reads in the journal; and on
+//! the leader, before each portion, to later changes. See decision 42.
 
 mod changes;
 mod pending;
@@ -10,44 +10,45 @@ pub mod wire;
 
 use std::fmt;
 
-use self::changes::{param_of, value_at};
+use self::changes::param_of;
+pub(super) use self::changes::value_at;
 pub use self::{
-    changes::{Changes, Subject},
-    pending::{Pending, weight},
+    changes::{ChangeSubject, Changes},
+    pending::{WritesToSend, weight},
 };
 use crate::{
     master::{Master, Method, Request, names},
     xmlrpc::Value,
 };
 
-/// What becomes of the writes.
+/// The result of a merge.
 #[derive(Debug, Default, PartialEq)]
 pub struct Merged {
-    /// To be sent to the leader, in this order.
+    /// The writes to send to the leader, in this order.
     pub send: Vec<Request>,
     pub lost: Vec<Lost>,
 }
 
-/// A write that does not hold.
+/// A write that is lost.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lost {
     pub call: Request,
     pub why: Conflict,
-    /// What others have set the parameter to, or one that holds it.
+    /// The value that others set the parameter, or a namespace around it, to.
     pub present: Option<Value>,
 }
 
-/// What becomes of a write.
+/// The verdict on one write.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Verdict {
-    /// Nobody has changed the same.
+    /// Others have not changed its subject.
     Runs,
-    /// Others have changed the same, to what it would set.
+    /// Others have changed its subject to the same value.
     Holds,
     Lost(Lost),
 }
 
-/// What was changed meanwhile by others.
+/// What others changed meanwhile.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conflict {
     Parameter(String),
@@ -61,7 +62,7 @@ pub enum Conflict {
         name: String,
         node: String,
     },
-    /// The node has registered this anew.
+    /// The node has registered this again.
     Registration {
         name: String,
         node: String,
@@ -85,13 +86,13 @@ impl fmt::Display for Conflict {
                 )
             }
             Self::Registration { name, node } => {
-                write!(f, "`{node}` has registered `{name}` anew meanwhile")
+                write!(f, "`{node}` has registered `{name}` again meanwhile")
             }
         }
     }
 }
 
-/// Separates `pending`, in order, by what others have changed. `now` is the state where they are.
+/// Separates `pending`, in order, by the others' changes. `now` is the others' state.
 pub fn merge<'a>(
     changes: &Changes,
     now: &Master,
@@ -105,12 +106,12 @@ pub fn merge<'a>(
         match judge(changes, now, call) {
             Verdict::Runs => merged.send.push(call.clone()),
             Verdict::Holds => {}
-            // What was deleted again is not lost.
+            // A value that was deleted again is not lost.
             Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
             Verdict::Lost(lost) => merged.lost.push(lost),
         }
         if let Some(path) = path.filter(|_| *call.method() == Method::DeleteParam) {
-            deleted.add(Subject::Param(path));
+            deleted.add(ChangeSubject::Param(path));
         }
     }
     merged.send.reverse();
@@ -118,7 +119,7 @@ pub fn merge<'a>(
     merged
 }
 
-/// What becomes of `call`, other than a multicall.
+/// Judges `call`, which is no multicall.
 pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let Some(why) = conflict(changes, now, call) else {
         return Verdict::Runs;
@@ -135,6 +136,18 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
             return Verdict::Holds;
         }
     }
+    // The present owner of the name or service has already ended that registration.
+    let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
+    let unregisters = matches!(
+        call.method(),
+        Method::UnregisterPublisher
+            | Method::UnregisterSubscriber
+            | Method::UnregisterService
+            | Method::UnsubscribeParam
+    );
+    if over && unregisters {
+        return Verdict::Holds;
+    }
     let call = call.clone();
     Verdict::Lost(Lost { call, why, present })
 }
@@ -143,8 +156,8 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
     let caller = call.caller()?;
     let name = || Some(names::resolve(call.text(1)?, caller));
     let node = |at: usize| node(changes, now, caller, call.text(at)?);
-    let anew = |publishes| {
-        let subject = Subject::Topic {
+    let registered_again = |publishes| {
+        let subject = ChangeSubject::Topic {
             publishes,
             topic: name()?,
             node: caller.to_owned(),
@@ -163,8 +176,8 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
             Some(Conflict::Parameter(name()?))
         }
         Method::RegisterPublisher | Method::RegisterSubscriber => node(3),
-        Method::UnregisterPublisher => node(2).or_else(|| anew(true)),
-        Method::UnregisterSubscriber => node(2).or_else(|| anew(false)),
+        Method::UnregisterPublisher => node(2).or_else(|| registered_again(true)),
+        Method::UnregisterSubscriber => node(2).or_else(|| registered_again(false)),
         Method::RegisterService => {
             node(3).or_else(|| service(changes, now, &name()?, call.text(2)?))
         }
@@ -174,20 +187,20 @@ fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict>
     }
 }
 
-/// Whether others have a node `caller`, which is at `api` here. A registration would end it.
+/// Whether others have a node `caller` at another address than `api`. A registration would end that node.
 fn node(changes: &Changes, now: &Master, caller: &str, api: &str) -> Option<Conflict> {
     let holder = now.api_of(caller).filter(|holder| *holder != api)?;
-    let theirs = changes.has(&Subject::Node(caller.to_owned()));
+    let theirs = changes.has(&ChangeSubject::Node(caller.to_owned()));
     theirs.then(|| Conflict::Node {
         name: caller.to_owned(),
         api: holder.to_owned(),
     })
 }
 
-/// Whether another node provides the service that is at `api` here.
+/// Whether another node provides the service that is at `api` on this computer.
 fn service(changes: &Changes, now: &Master, name: &str, api: &str) -> Option<Conflict> {
     let provider = now.registry().services.get(name)?;
-    let theirs = changes.has(&Subject::Service(name.to_owned()));
+    let theirs = changes.has(&ChangeSubject::Service(name.to_owned()));
     (provider.api != api && theirs).then(|| Conflict::Service {
         name: name.to_owned(),
         node: provider.node.clone(),

@@ -1,16 +1,16 @@
 //! Detects another living computer with this one's name, before this one takes part. Pure.
 //!
-//! Keys in etcd may be of a computer with the same name and another address. That computer is alive if they
-//! change: `alive` several times within the time to live, the entry among the members every five seconds. If they
-//! do not, they are left from an earlier time, in which this computer had another address.
+//! Keys in etcd may name a computer with the same name and another address. It is alive if they change: `alive`
+//! several times per time to live, the entry among the members every five seconds. If they do not change, they are
+//! from a time when this computer had another address.
 
 use std::time::{Duration, Instant};
 
 use crate::cluster::machine::{Settings, View};
 
-/// A living computer changes its entry among the members within this time.
+/// A living computer updates its entry among the members within this time.
 pub const MEMBER_SAYS: Duration = Duration::from_secs(7);
-/// For this long after the start, a namesake that begins to lead counts as one that started first.
+/// How long after the start a namesake that begins to lead counts as started first.
 const YOUNG: Duration = Duration::from_secs(15);
 
 /// The key that shows a namesake.
@@ -22,24 +22,24 @@ pub enum Key {
     Member,
 }
 
-/// A key of a computer with this one's name that is not this computer.
+/// Evidence of another computer with this one's name: a key that it wrote.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sign {
     pub key: Key,
-    /// Where that computer is, as it says.
+    /// The address of that computer.
     pub uri: String,
-    /// The revision of the last change.
+    /// The revision of the key's last change.
     pub revision: u64,
 }
 
-/// The sign in `leader` and `alive`, if there is one.
+/// The evidence in `leader` and `alive`, if any.
 pub fn sign_of_leader(own: &Settings, view: &View) -> Option<Sign> {
     let leader = view.leader.as_ref()?;
     let alive = view.alive.as_ref();
     let is_other = leader.id != own.id
         && leader.name == own.name
         && !own.is_of_this_computer(&leader.name, &leader.uri, &leader.boot);
-    // One that has given up does not write any more, but its last word is no sign of life either.
+    // A computer that has given up leadership writes no more, so its keys are no sign of life.
     let leads = alive.is_none_or(|alive| alive.released.is_none());
     (is_other && leads).then(|| Sign {
         key: Key::Leader,
@@ -48,16 +48,16 @@ pub fn sign_of_leader(own: &Settings, view: &View) -> Option<Sign> {
     })
 }
 
-/// What was seen at the start, and since when.
+/// The evidence at the start, and when it was seen.
 #[derive(Clone, Debug)]
-pub struct Watch {
+pub struct NamesakeWatch {
     first: Vec<Sign>,
     since: Instant,
     hold: Option<Instant>,
 }
 
-impl Watch {
-    /// `first`: the signs in etcd at `now`. `ttl`: the time to live of a leader.
+impl NamesakeWatch {
+    /// Creates a watch. `first` is the evidence in etcd at `now`, `ttl` the time to live of a leader.
     pub fn new(now: Instant, ttl: Duration, first: Vec<Sign>) -> Self {
         let limits = first.iter().map(|sign| match sign.key {
             Key::Leader => ttl,
@@ -70,28 +70,28 @@ impl Watch {
         }
     }
 
-    /// Until when this computer must not take part; none if it may at once.
+    /// Until when this computer must wait. `None` if it may start at once.
     pub fn hold(&self) -> Option<Instant> {
         self.hold
     }
 
-    /// The address that the namesake gave.
+    /// The address of the suspected namesake.
     pub fn suspect(&self) -> Option<&str> {
         self.first.first().map(|sign| sign.uri.as_str())
     }
 
-    /// Whether this computer may write its own entry among the members at `now`. Before, it would hide that of
-    /// its namesake.
+    /// Whether this computer may write its entry among the members at `now`. Earlier, it would overwrite the
+    /// namesake's entry.
     pub fn is_over(&self, now: Instant) -> bool {
         self.hold.is_none_or(|until| until <= now)
     }
 
-    /// A living namesake, if `signs` at `now` show one.
+    /// The living namesake that `signs` at `now` prove, if any.
     pub fn living<'a>(&self, now: Instant, signs: &'a [Sign]) -> Option<&'a Sign> {
         signs.iter().find(|sign| {
             let counts = match sign.key {
                 Key::Leader => now < self.since + YOUNG,
-                // Of two that start together, only the one that does not lead ends.
+                // Of two that start together, only the one that does not lead stops.
                 Key::Member => !self.is_over(now),
             };
             counts && !self.first.contains(sign)
@@ -169,7 +169,7 @@ mod tests {
     fn a_namesake_is_alive_if_its_keys_change_and_forgotten_if_they_do_not() {
         let now = Instant::now();
         let there = "http://10.0.0.2:11311/";
-        let watch = Watch::new(now, TTL, vec![member(there, 5)]);
+        let watch = NamesakeWatch::new(now, TTL, vec![member(there, 5)]);
         assert_eq!(watch.hold(), Some(now + MEMBER_SAYS));
         assert!(!watch.is_over(now));
         assert_eq!(watch.living(now + TTL, &[member(there, 5)]), None);
@@ -179,7 +179,7 @@ mod tests {
         assert_eq!(watch.living(now + MEMBER_SAYS, &changed), None);
         let leader = |revision| sign_of_leader(&own("u"), &led("a", there, "", revision));
         let [first, next] = [5, 6].map(|revision| leader(revision).unwrap());
-        let watch = Watch::new(now, TTL, vec![first.clone()]);
+        let watch = NamesakeWatch::new(now, TTL, vec![first.clone()]);
         assert_eq!(watch.hold(), Some(now + TTL));
         assert_eq!(watch.living(now, &[first]), None);
         assert_eq!(watch.living(now, std::slice::from_ref(&next)), Some(&next));
@@ -188,7 +188,7 @@ mod tests {
     #[test]
     fn of_two_that_start_together_the_one_that_does_not_lead_notices() {
         let now = Instant::now();
-        let watch = Watch::new(now, TTL, Vec::new());
+        let watch = NamesakeWatch::new(now, TTL, Vec::new());
         assert_eq!((watch.hold(), watch.suspect()), (None, None));
         let there = "http://10.0.0.2:11311/";
         assert_eq!(watch.living(now, &[member(there, 5)]), None);

@@ -2,17 +2,22 @@
 
 mod computer;
 mod etcd;
+mod history;
 mod world;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use self::world::{Plan, World};
-use super::machine::{Commit, WhenAlone};
+use self::world::{Counts, Plan, World};
+use super::{
+    machine::{Commit, WhenAlone},
+    member::PROBES,
+    mutant::Mutant,
+};
 
 /// How many schedules are played.
 fn schedules() -> u64 {
     let number = std::env::var("ROSRESCUE_SCHEDULES").ok();
-    number.map_or(300, |number| number.parse().unwrap())
+    number.map_or(120, |number| number.parse().unwrap())
 }
 
 /// The first seed; a failure says its own.
@@ -34,33 +39,52 @@ fn plan(seed: u64) -> Plan {
             _ => WhenAlone::Serve,
         },
         faults: true,
+        twins: false,
         traced: std::env::var_os("ROSRESCUE_SEED").is_some() && schedules() == 1,
-        ttl: Duration::from_millis(if (seed / 8).is_multiple_of(2) {
-            1000
-        } else {
-            2000
-        }),
+        ttl: match (seed / 8).is_multiple_of(2) {
+            true => Duration::from_secs(1),
+            false => Duration::from_secs(2),
+        },
     }
 }
 
+/// Plays the schedule of a seed.
+fn play(seed: u64) -> World {
+    let mut world = World::new(plan(seed));
+    world.run(Duration::from_secs(12));
+    world.heal();
+    world.run(Duration::from_secs(15));
+    world
+}
+
 #[test]
-fn no_schedule_of_failures_loses_a_write_or_leaves_two_leaders() {
-    let mut totals = world::Counts::default();
+fn no_schedule_of_failures_breaks_a_promise() {
+    let mut totals = Counts::default();
+    let began = Instant::now();
+    let mut broken = 0;
     for seed in first()..first() + schedules() {
-        let mut world = World::new(plan(seed));
-        world.run(Duration::from_secs(12));
-        world.heal();
-        world.run(Duration::from_secs(15));
-        world.check();
+        let world = play(seed);
         totals.add(&world.counts);
+        if let Err(why) = world.verdict() {
+            println!("seed {seed}: {why}");
+            broken += 1;
+        }
     }
-    println!("{totals:?}");
+    assert_eq!(broken, 0, "schedules that break a promise");
+    let rate = schedules() as f64 / began.elapsed().as_secs_f64() * 60.0;
+    println!("{} schedules, {rate:.0} a minute: {totals:?}", schedules());
     // Else the schedules test nothing.
-    assert!(
-        totals.reigns > schedules() && totals.alone > schedules() / 4,
-        "{totals:?}"
-    );
-    assert!(totals.acknowledged > 10 * schedules() && totals.merged > 0 && totals.reported > 0);
+    let enough = totals.reigns > schedules() && totals.alone > schedules() / 4;
+    assert!(enough || schedules() < 20, "{totals:?}");
+}
+
+/// 4465: a computer that is cut off shows what it answered early as a leader. The checker took that for the journal's.
+/// 9952: a leader with `--alone refuse` that etcd answered again waited for ever for records that it had given up.
+#[test]
+fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
+    for seed in [4465, 9952] {
+        play(seed).check();
+    }
 }
 
 /// Without any other failure, and with delays of at most 20 ms between computers.
@@ -78,7 +102,7 @@ fn calm(seed: u64) -> World {
 #[test]
 fn a_handover_makes_no_call_wait_longer_than_200_ms() {
     let mut longest = Duration::ZERO;
-    for seed in first()..first() + schedules().min(300) {
+    for seed in first()..first() + schedules().min(100) {
         let mut world = calm(seed);
         let before = world.leaders()[0];
         world.hand_over(before);
@@ -95,7 +119,7 @@ fn a_handover_makes_no_call_wait_longer_than_200_ms() {
 #[test]
 fn a_dead_leader_is_succeeded_within_its_time_to_live_and_300_ms() {
     let mut longest = Duration::ZERO;
-    for seed in first()..first() + schedules().min(300) {
+    for seed in first()..first() + schedules().min(100) {
         let mut world = calm(seed);
         let before = world.leaders()[0];
         world.kill(before);
@@ -110,16 +134,23 @@ fn a_dead_leader_is_succeeded_within_its_time_to_live_and_300_ms() {
 }
 
 #[test]
-fn one_failure_makes_no_call_wait_longer_than_the_time_to_live_and_1500_ms() {
+fn one_failure_makes_no_call_wait_longer_than_five_quarters_of_the_time_to_live_and_1500_ms() {
     let mut longest = Duration::ZERO;
     for seed in first()..first() + schedules() {
         let mut world = calm(seed);
         world.counts.waited = Duration::ZERO;
         let failure = world.fail_once();
         world.run(Duration::from_secs(10));
-        let waited = world.counts.waited.saturating_sub(plan(seed).ttl);
-        // Until the failure is noticed, 40 ms; the answer's way, 60 ms; what was on its way before.
-        let most = Duration::from_millis(1500 + 250);
+        let ttl = plan(seed).ttl;
+        let waited = world.counts.waited.saturating_sub(ttl);
+        let patience = Duration::from_millis(1500);
+        // A follower that is cut off from the leader alone notices it with its next question to the leader.
+        let unnoticed = ttl / PROBES;
+        // Clocks are up to a twentieth too slow.
+        let slow = (ttl + patience) / 20;
+        // A computer looks after its calls every 40 ms; the answer's way takes 60 ms; some is on its way before.
+        let rest = Duration::from_millis(250);
+        let most = patience + unnoticed + slow + rest;
         assert!(waited < most, "seed {seed}: {failure}: {waited:?} more");
         longest = longest.max(waited);
         world.heal();
@@ -127,4 +158,91 @@ fn one_failure_makes_no_call_wait_longer_than_the_time_to_live_and_1500_ms() {
         world.check();
     }
     println!("the longest wait is the time to live and {longest:?}");
+}
+
+#[test]
+fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
+    for seed in first()..first() + schedules().min(100) {
+        let mut world = lost(seed);
+        world.heal();
+        world.run(Duration::from_secs(15));
+        world.check();
+    }
+}
+
+/// etcd loses its data in a calm moment.
+fn lost(seed: u64) -> World {
+    let mut world = calm(seed);
+    world.lose_etcd();
+    world.run(Duration::from_secs(10));
+    world
+}
+
+/// Two computers have one name.
+fn twins(seed: u64) -> World {
+    let plan = Plan {
+        faults: false,
+        twins: true,
+        ..plan(seed)
+    };
+    let mut world = World::new(plan);
+    world.run(Duration::from_secs(20));
+    world.heal();
+    world.run(Duration::from_secs(15));
+    world
+}
+
+#[test]
+fn of_two_computers_with_one_name_one_ends() {
+    for seed in first()..first() + schedules().min(50) {
+        twins(seed).check();
+    }
+}
+
+/// The first seed at which `mutant` breaks a promise, of so many.
+fn found(mutant: Mutant, most: u64) -> Option<(u64, String)> {
+    let seeds = first()..first() + most;
+    seeds.into_iter().find_map(|seed| {
+        Mutant::put(Some(mutant));
+        let world = match mutant {
+            Mutant::TrustsLostEtcd => {
+                let mut world = lost(seed);
+                world.heal();
+                world.run(Duration::from_secs(15));
+                world
+            }
+            Mutant::IgnoresNamesake => twins(seed),
+            _ => play(seed),
+        };
+        let verdict = world.verdict();
+        Mutant::put(None);
+        verdict.err().map(|why| (seed, why))
+    })
+}
+
+/// Each defect of the past is found when it is put back.
+#[test]
+fn every_defect_of_the_past_is_found_within_10_000_schedules() {
+    let mutants = [
+        Mutant::OwnDiskWins,
+        Mutant::ActsWithoutLease,
+        Mutant::MasterWhileAlone,
+        Mutant::StaleReads,
+        Mutant::MergesByState,
+        Mutant::GuessesByValues,
+        Mutant::JudgesOnce,
+        Mutant::KeepsForwarded,
+        Mutant::KeepsEachWrite,
+        Mutant::TrustsLostEtcd,
+        Mutant::IgnoresNamesake,
+        Mutant::WaitsForEver,
+    ];
+    let mut missed = Vec::new();
+    for mutant in mutants {
+        match found(mutant, 10_000) {
+            Some((seed, why)) => println!("{mutant:?}: seed {seed}: {why}"),
+            None => missed.push(mutant),
+        }
+    }
+    assert!(missed.is_empty(), "not found: {missed:?}");
 }

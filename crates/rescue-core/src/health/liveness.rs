@@ -7,7 +7,7 @@ use std::{
 
 use serde::Serialize;
 
-use super::Sign;
+use super::Reaction;
 
 /// Pause before a node is asked again. It is shorter if the socket table shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
@@ -31,7 +31,7 @@ pub enum Health {
 /// The latest evidence about a port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Seen {
-    sign: Sign,
+    sign: Reaction,
     pub at: Instant,
 }
 
@@ -72,7 +72,7 @@ impl Liveness {
                 continue;
             };
             match listens(name) {
-                Some(true) => port.note(Sign::Alive, now),
+                Some(true) => port.note(Reaction::Alive, now),
                 // The process has just ended, or the kernel forwards the port elsewhere. A connection shows which.
                 Some(false) if port.is_alive() => port.next = now,
                 _ => {}
@@ -86,17 +86,17 @@ impl Liveness {
     }
 
     /// Notes the answer from a port, if there was one. Returns whether the port has just been found dead.
-    pub fn answered(&mut self, port: &str, sign: Option<Sign>, now: Instant) -> bool {
+    pub fn answered(&mut self, port: &str, sign: Option<Reaction>, now: Instant) -> bool {
         let Some(port) = self.0.get_mut(port) else {
             return false;
         };
         port.asked = false;
         port.next = now + ASK_AGAIN;
-        let was_dead = port.seen.is_some_and(|seen| seen.sign == Sign::Dead);
+        let was_dead = port.seen.is_some_and(|seen| seen.sign == Reaction::Dead);
         if let Some(sign) = sign {
             port.seen = Some(Seen { sign, at: now });
         }
-        sign == Some(Sign::Dead) && !was_dead
+        sign == Some(Reaction::Dead) && !was_dead
     }
 
     pub fn seen(&self, port: &str) -> Option<Seen> {
@@ -105,13 +105,13 @@ impl Liveness {
 }
 
 impl Port {
-    fn note(&mut self, sign: Sign, now: Instant) {
+    fn note(&mut self, sign: Reaction, now: Instant) {
         self.seen = Some(Seen { sign, at: now });
         self.next = now + ASK_AGAIN;
     }
 
     fn is_alive(&self) -> bool {
-        self.seen.is_some_and(|seen| seen.sign == Sign::Alive)
+        self.seen.is_some_and(|seen| seen.sign == Reaction::Alive)
     }
 }
 
@@ -122,9 +122,9 @@ impl Health {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {
             _ if unreachable => Self::Unreachable,
-            Some(Sign::Alive) => Self::Alive,
-            Some(Sign::Dead) => Self::Dead,
-            Some(Sign::Silent) => Self::Unreachable,
+            Some(Reaction::Alive) => Self::Alive,
+            Some(Reaction::Dead) => Self::Dead,
+            Some(Reaction::Silent) => Self::Unreachable,
             None => Self::Unchecked,
         }
     }
@@ -150,7 +150,7 @@ mod tests {
         // The socket table has not been read yet.
         assert_eq!(liveness.round(&all, |_| None, now), ["here"]);
         assert!(liveness.round(&all, |_| None, now).is_empty(), "once");
-        assert!(!liveness.answered("here", Some(Sign::Alive), now));
+        assert!(!liveness.answered("here", Some(Reaction::Alive), now));
         for _ in 0..100 {
             now += SECOND;
             assert!(liveness.round(&all, |_| Some(true), now).is_empty());
@@ -158,14 +158,14 @@ mod tests {
         }
         now += SECOND;
         assert_eq!(liveness.round(&all, |_| Some(false), now), ["here"]);
-        assert!(liveness.answered("here", Some(Sign::Dead), now));
+        assert!(liveness.answered("here", Some(Reaction::Dead), now));
         assert_eq!(health(&liveness, now), Health::Dead);
         now += SECOND;
         assert!(liveness.round(&all, |_| Some(false), now).is_empty());
         now += ASK_AGAIN;
         assert_eq!(liveness.round(&all, |_| Some(false), now), ["here"]);
         assert!(
-            !liveness.answered("here", Some(Sign::Dead), now),
+            !liveness.answered("here", Some(Reaction::Dead), now),
             "told once"
         );
         // Another process uses the same port now.
@@ -179,14 +179,14 @@ mod tests {
         let mut liveness = Liveness::default();
         let all = ports(&["far", "nowhere"]);
         assert_eq!(liveness.round(&all, |_| None, now), ["far", "nowhere"]);
-        liveness.answered("far", Some(Sign::Silent), now);
+        liveness.answered("far", Some(Reaction::Silent), now);
         liveness.answered("nowhere", None, now);
         let health = |port, liveness: &Liveness, now| Health::of(liveness.seen(port), false, now);
         assert_eq!(health("far", &liveness, now), Health::Unreachable);
         assert_eq!(health("nowhere", &liveness, now), Health::Unchecked);
         now += ASK_AGAIN;
         assert_eq!(liveness.round(&all, |_| None, now), ["far", "nowhere"]);
-        liveness.answered("far", Some(Sign::Alive), now);
+        liveness.answered("far", Some(Reaction::Alive), now);
         assert_eq!(health("far", &liveness, now), Health::Alive);
         assert_eq!(health("far", &liveness, now + STALE), Health::Unchecked);
         // The health check's result takes precedence.

@@ -21,8 +21,8 @@ fn claims(publications: &[&str], subscriptions: &[&str]) -> Claims {
     Claims::read(&list(publications), &list(subscriptions)).unwrap()
 }
 
-fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
-    Name {
+fn name(node: &str, known_pid: Option<i32>, registered: u64) -> RegisteredName {
+    RegisteredName {
         node: node.to_owned(),
         known_pid,
         registered_since: false,
@@ -31,7 +31,7 @@ fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
 }
 
 /// The verdicts on `/a` and `/b`, which are registered at one port. `/a` publishes `/ta`, and `/b` publishes `/tb`.
-fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<Verdict> {
+fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<IdentityVerdict> {
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
         publish(&mut master, node, topic, "http://n:1/");
@@ -57,7 +57,7 @@ fn addresses_that_differ_only_after_the_port_share_it() {
 
 #[test]
 fn a_different_process_id_means_another_node() {
-    use Verdict::{Another, Itself};
+    use IdentityVerdict::{Another, Itself};
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);
     // One process may have two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
@@ -75,18 +75,27 @@ fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
     publish(&mut master, "/a", "/more", "http://n:1/");
-    let judge = |names: &[Name], topics: &[&str]| {
+    let judge = |names: &[RegisteredName], topics: &[&str]| {
         judge(&master, names, Some(2), Some(&claims(topics, &[])))
     };
     let a = name("/a", Some(1), 1);
     let all = ["/more", "/ta", "/other"];
-    assert_eq!(judge(std::slice::from_ref(&a), &all), [Verdict::Itself]);
+    assert_eq!(
+        judge(std::slice::from_ref(&a), &all),
+        [IdentityVerdict::Itself]
+    );
     let some = ["/ta", "/other"];
-    assert_eq!(judge(std::slice::from_ref(&a), &some), [Verdict::Another]);
+    assert_eq!(
+        judge(std::slice::from_ref(&a), &some),
+        [IdentityVerdict::Another]
+    );
     // A later node at the port publishes the same topics.
     publish(&mut master.clone(), "/b", "/ta", "http://n:1/");
     let verdicts = judge(&[a, name("/b", Some(2), 2)], &all);
-    assert_eq!(verdicts, [Verdict::Another, Verdict::Itself]);
+    assert_eq!(
+        verdicts,
+        [IdentityVerdict::Another, IdentityVerdict::Itself]
+    );
 }
 
 #[test]
@@ -114,14 +123,18 @@ fn a_name_that_registered_again_may_be_another_process() {
         let said = claims(&[topic], &[]);
         judge(&master, &[name], Some(pid), Some(&said))
     };
-    assert_eq!(judge(1, "/new"), [Verdict::Itself], "the same process");
-    assert_eq!(judge(2, "/ta"), [Verdict::Itself], "restarted");
-    assert_eq!(judge(2, "/new"), [Verdict::Another]);
+    assert_eq!(
+        judge(1, "/new"),
+        [IdentityVerdict::Itself],
+        "the same process"
+    );
+    assert_eq!(judge(2, "/ta"), [IdentityVerdict::Itself], "restarted");
+    assert_eq!(judge(2, "/new"), [IdentityVerdict::Another]);
 }
 
 #[test]
 fn different_topics_mean_another_node() {
-    use Verdict::{Another, Itself, Unknown};
+    use IdentityVerdict::{Another, Itself, Unknown};
     let of_b = claims(&["/rosout", "/tb"], &["/clock"]);
     assert_eq!(verdicts([None, None], 1, Some(&of_b)), [Another, Itself]);
     let neither = claims(&["/tc"], &[]);
@@ -137,7 +150,7 @@ fn different_topics_mean_another_node() {
 
 #[test]
 fn of_two_nodes_that_share_topics_the_one_that_matches_is_there() {
-    use Verdict::{Another, Itself};
+    use IdentityVerdict::{Another, Itself};
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
         publish(&mut master, node, topic, "http://n:1/");
@@ -163,10 +176,19 @@ fn a_port_has_one_node_behind_it() {
         let names = [name("/a", None, a), name("/b", None, b)];
         judge(&master, &names, Some(1), Some(&said))
     };
-    assert_eq!(judge(1, 2), [Verdict::Another, Verdict::Itself]);
+    assert_eq!(
+        judge(1, 2),
+        [IdentityVerdict::Another, IdentityVerdict::Itself]
+    );
     // A process took a second name, or the order of registrations is unknown: both nodes are kept.
-    assert_eq!(judge(2, 1), [Verdict::Unknown, Verdict::Itself]);
-    assert_eq!(judge(0, 0), [Verdict::Unknown, Verdict::Itself]);
+    assert_eq!(
+        judge(2, 1),
+        [IdentityVerdict::Unknown, IdentityVerdict::Itself]
+    );
+    assert_eq!(
+        judge(0, 0),
+        [IdentityVerdict::Unknown, IdentityVerdict::Itself]
+    );
 }
 
 #[test]

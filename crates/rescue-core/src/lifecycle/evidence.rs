@@ -53,7 +53,7 @@ pub struct Sample {
 
 /// The conclusion from a silence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum SilenceVerdict {
     /// The master hangs, or the system does not show what it does.
     Hung,
     /// There is no proof that the master hangs, for this reason.
@@ -111,9 +111,9 @@ impl Evidence {
 
     /// Judges a master that was silent during all samples. A master that has used the processor for `busy_limit`
     /// without an answer hangs. After a verdict without proof, only the last sample and later ones are judged.
-    pub fn judge(&mut self, busy_limit: Duration) -> Verdict {
+    pub fn judge(&mut self, busy_limit: Duration) -> SilenceVerdict {
         let verdict = self.verdict(busy_limit);
-        if verdict != Verdict::Unknown
+        if verdict != SilenceVerdict::Unknown
             && let Some(last) = self.last
         {
             self.first = Some(last);
@@ -124,51 +124,51 @@ impl Evidence {
         verdict
     }
 
-    fn verdict(&self, busy_limit: Duration) -> Verdict {
+    fn verdict(&self, busy_limit: Duration) -> SilenceVerdict {
         let (Some(first), Some(last)) = (self.first, self.last) else {
-            return Verdict::Hung;
+            return SilenceVerdict::Hung;
         };
         let (Some(before), Some(now)) = (first.master, last.master) else {
-            return Verdict::Hung;
+            return SilenceVerdict::Hung;
         };
         let watched = last.at.duration_since(first.at);
         if watched < WATCHED_LEAST {
-            return Verdict::Unknown;
+            return SilenceVerdict::Unknown;
         }
         let stopped = self
             .stopped
             .map_or(Duration::ZERO, |since| last.at.duration_since(since.at));
         if stopped >= watched / 5 * 3 {
-            return Verdict::Hung;
+            return SilenceVerdict::Hung;
         }
         if watched < IDLE_LEAST {
-            return Verdict::Unknown;
+            return SilenceVerdict::Unknown;
         }
         let silent = self.silent.and_then(|sample| sample.master);
         let spent = now.ran.saturating_sub(silent.unwrap_or(before).ran);
         if spent >= busy_limit {
-            return Verdict::Hung;
+            return SilenceVerdict::Hung;
         }
         let ran = now.ran.saturating_sub(before.ran);
         if ran > watched / BUSY_PART {
-            return Verdict::Unproved("it is busy");
+            return SilenceVerdict::Unproved("it is busy");
         }
         let waited = now.waited.saturating_sub(before.waited);
         let turns = now.turns.saturating_sub(before.turns);
         let each = waited / u32::try_from(turns).unwrap_or(u32::MAX).max(1);
         if self.runnable && turns < TURNS_LEAST || each > STARVED_WAIT {
-            return Verdict::Unproved("it gets too little CPU time");
+            return SilenceVerdict::Unproved("it gets too little CPU time");
         }
         if self.on_disk {
-            return Verdict::Unproved("it waits for a disk");
+            return SilenceVerdict::Unproved("it waits for a disk");
         }
         if self.was_stopped {
-            return Verdict::Unproved("it was stopped only part of the time");
+            return SilenceVerdict::Unproved("it was stopped only part of the time");
         }
         if last.own_wait.saturating_sub(first.own_wait) > watched / UNFAIR_PART {
-            return Verdict::Unproved("rosrescue gets too little CPU time to probe it");
+            return SilenceVerdict::Unproved("rosrescue gets too little CPU time to probe it");
         }
-        Verdict::Hung
+        SilenceVerdict::Hung
     }
 }
 
@@ -193,7 +193,7 @@ mod tests {
     }
 
     /// The verdict after samples at 0, 500 and 1,000 ms. `seen` changes the samples of an idle master.
-    fn verdict(seen: impl Fn(u64, &mut Effort, &mut Duration)) -> Verdict {
+    fn verdict(seen: impl Fn(u64, &mut Effort, &mut Duration)) -> SilenceVerdict {
         let start = Instant::now();
         let mut evidence = Evidence::default();
         for at in [0, 500, 1000] {
@@ -208,8 +208,8 @@ mod tests {
         evidence.judge(BUSY_LIMIT)
     }
 
-    fn is_unproved(verdict: Verdict, word: &str) {
-        let Verdict::Unproved(why) = verdict else {
+    fn is_unproved(verdict: SilenceVerdict, word: &str) {
+        let SilenceVerdict::Unproved(why) = verdict else {
             panic!("{verdict:?} instead of {word}")
         };
         assert!(why.contains(word), "{why}");
@@ -217,18 +217,18 @@ mod tests {
 
     #[test]
     fn a_stopped_or_idle_master_that_does_not_answer_hangs() {
-        assert_eq!(verdict(|_, _, _| {}), Verdict::Hung);
+        assert_eq!(verdict(|_, _, _| {}), SilenceVerdict::Hung);
         let stop = |effort: &mut Effort| {
             effort.stopped = true;
             effort.ran = ms(7);
         };
-        assert_eq!(verdict(|_, effort, _| stop(effort)), Verdict::Hung);
+        assert_eq!(verdict(|_, effort, _| stop(effort)), SilenceVerdict::Hung);
         // This holds however much processor time rosrescue gets.
         let starved = |at: u64, effort: &mut Effort, own: &mut Duration| {
             stop(effort);
             *own = ms(at);
         };
-        assert_eq!(verdict(starved), Verdict::Hung);
+        assert_eq!(verdict(starved), SilenceVerdict::Hung);
     }
 
     #[test]
@@ -241,7 +241,7 @@ mod tests {
             is_unproved(verdict(waits), "too little CPU time");
             // Threads of an idle master are runnable from time to time.
             let found = verdict(|at, effort, _| effort.runnable = at == moment);
-            assert_eq!(found, Verdict::Hung);
+            assert_eq!(found, SilenceVerdict::Hung);
         }
         let found = verdict(|at, effort, _| {
             effort.turns /= 10;
@@ -280,28 +280,28 @@ mod tests {
             });
             verdicts.push(evidence.judge(BUSY_LIMIT));
         }
-        let hung = verdicts.iter().position(|it| *it == Verdict::Hung);
+        let hung = verdicts.iter().position(|it| *it == SilenceVerdict::Hung);
         assert_eq!(hung, Some(30));
     }
 
     #[test]
     fn there_is_no_verdict_at_first_and_an_invisible_process_counts_as_hung() {
         let mut evidence = Evidence::default();
-        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
         let mut sample = Sample {
             at: Instant::now(),
             master: None,
             own_wait: Duration::ZERO,
         };
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
         evidence.clear();
         sample.master = Some(Effort::default());
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Unknown);
+        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Unknown);
         sample.at += IDLE_LEAST;
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
     }
 
     /// A start that is busy for five seconds and then waits forever.
@@ -322,8 +322,8 @@ mod tests {
             });
             evidence.judge(BUSY_LIMIT)
         };
-        assert_eq!(sample(&mut evidence, 0), Verdict::Unknown);
+        assert_eq!(sample(&mut evidence, 0), SilenceVerdict::Unknown);
         is_unproved(sample(&mut evidence, 30), "busy");
-        assert_eq!(sample(&mut evidence, 31), Verdict::Hung);
+        assert_eq!(sample(&mut evidence, 31), SilenceVerdict::Hung);
     }
 }

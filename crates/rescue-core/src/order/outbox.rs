@@ -15,7 +15,7 @@ const QUEUE_MAX: usize = 256;
 
 /// What to do next for a node.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Next {
+pub enum NextNotification {
     /// Send `call`, then report it by [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
     /// Ask again when something has changed, or at `until` at the latest.
@@ -35,7 +35,7 @@ pub(super) struct Outbox {
 
 /// The content of a notification.
 #[derive(Clone, Debug)]
-pub(super) enum Content {
+pub(super) enum Payload {
     /// The call that a master would have sent.
     Call(Arc<Call>),
     /// The state at the time of sending.
@@ -47,23 +47,23 @@ pub(super) enum Content {
 #[derive(Debug)]
 pub(super) struct Notification {
     subject: Subject,
-    content: Content,
+    content: Payload,
 }
 
 impl Notification {
     /// Whether the notification contains the state at the time of sending.
     pub(super) fn is_state(&self) -> bool {
-        !matches!(self.content, Content::Call(_))
+        !matches!(self.content, Payload::Call(_))
     }
 
     /// Whether the notification is a repeat.
     pub(super) fn is_repeat(&self) -> bool {
-        matches!(self.content, Content::StateAgain)
+        matches!(self.content, Payload::StateAgain)
     }
 }
 
 impl Outbox {
-    pub(super) fn add(&mut self, port: &str, subject: Subject, content: Content) {
+    pub(super) fn add(&mut self, port: &str, subject: Subject, content: Payload) {
         let notification = Notification { subject, content };
         let Some(queue) = self.ports.get_mut(port) else {
             self.idle.push(port.to_owned());
@@ -113,7 +113,7 @@ impl Outbox {
         mirror: &Master,
     ) -> Option<Arc<Call>> {
         let Notification { subject, content } = notification;
-        if let Content::Call(call) = content {
+        if let Payload::Call(call) = content {
             return Some(call);
         }
         // Waiting notifications about the same subject are older than the present state.
@@ -147,7 +147,7 @@ fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     let mut told = HashSet::new();
     queue.retain_mut(|notification| {
         if !notification.is_state() && is_it(&notification.subject) {
-            notification.content = Content::State;
+            notification.content = Payload::State;
         }
         !notification.is_state() || told.insert(notification.subject.clone())
     });

@@ -18,14 +18,14 @@ pub(super) struct UnderWay {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum DeliveryKind {
     Answer,
     Notification,
 }
 
 #[derive(Debug)]
 struct Entry {
-    kind: Kind,
+    kind: DeliveryKind,
     heard: Vec<Heard>,
     /// Until when it delays others. `None` if there is no limit yet.
     limit: Option<Instant>,
@@ -51,7 +51,12 @@ pub(super) enum Answer {
 
 impl UnderWay {
     /// Adds an answer or a notification about `heard`, which delays others until `limit`. Returns its number.
-    pub(super) fn add(&mut self, kind: Kind, heard: Vec<Heard>, limit: Option<Instant>) -> u64 {
+    pub(super) fn add(
+        &mut self,
+        kind: DeliveryKind,
+        heard: Vec<Heard>,
+        limit: Option<Instant>,
+    ) -> u64 {
         self.last += 1;
         for heard in &heard {
             self.by_subject.add(&heard.subject, self.last);
@@ -134,7 +139,7 @@ impl UnderWay {
     pub(super) fn answer_to(&self, now: Instant, port: &str, subject: &Subject) -> Option<Answer> {
         let to_port = self
             .concerned(subject)
-            .filter(|(_, entry, heard)| entry.kind == Kind::Answer && heard.port == port);
+            .filter(|(_, entry, heard)| entry.kind == DeliveryKind::Answer && heard.port == port);
         let mut last = None;
         for (_, entry, _) in to_port {
             if let Some(MustWait { until }) = entry.delays(now) {

@@ -4,7 +4,7 @@ use super::{Authority, Bears};
 
 /// What is known about a master before it is examined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Known {
+pub enum KnownMaster {
     /// Nothing is known.
     Nothing,
     /// If the master has the token, this process has already let calls pass to it.
@@ -38,7 +38,7 @@ pub enum Treatment {
 /// because it has the present token, has been served and has missed no write.
 pub fn treatment(
     bears: Bears,
-    known: Known,
+    known: KnownMaster,
     mirror_is_empty: bool,
     master_is_empty: bool,
 ) -> Treatment {
@@ -47,14 +47,14 @@ pub fn treatment(
         (Bears::Nothing, _) if master_is_empty => Treatment::Begin,
         (Bears::Nothing, _) => Treatment::TakeOver,
         // A new session has no state that could replace the master's.
-        (Bears::Earlier, Known::Nothing) if mirror_is_empty => Treatment::TakeOver,
+        (Bears::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::TakeOver,
         // A later incarnation has been served, so the mirror is newer than everything in this master.
         (Bears::Earlier, _) => Treatment::Replace,
         // The checkpoint is older than this master, or another rosrescue has a copy of it.
-        (Bears::Later(_), Known::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
+        (Bears::Later(_), KnownMaster::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
         (Bears::Later(_), _) => Treatment::Replace,
         // It has run all writes of the checkpoint that are not pending, and perhaps more.
-        (Bears::Present, Known::Nothing | Known::ServedIfPresent) => {
+        (Bears::Present, KnownMaster::Nothing | KnownMaster::ServedIfPresent) => {
             Treatment::Reconcile(Authority::PendingWrites)
         }
         (Bears::Present, _) => Treatment::Reconcile(Authority::Mirror),
@@ -68,7 +68,7 @@ mod tests {
     #[test]
     fn each_master_is_treated_as_the_architecture_document_says() {
         use Treatment::{Begin, Inject, Reconcile, Replace, TakeOver};
-        let (served, injected) = (Known::ServedIfPresent, Known::InjectedIfPresent);
+        let (served, injected) = (KnownMaster::ServedIfPresent, KnownMaster::InjectedIfPresent);
         for (bears, known, mirror_is_empty, master_is_empty, expected) in [
             (
                 Bears::Present,
@@ -86,14 +86,14 @@ mod tests {
             ),
             (
                 Bears::Present,
-                Known::Nothing,
+                KnownMaster::Nothing,
                 false,
                 false,
                 Reconcile(Authority::PendingWrites),
             ),
             (
                 Bears::Later(7),
-                Known::Nothing,
+                KnownMaster::Nothing,
                 false,
                 false,
                 Reconcile(Authority::PendingWrites),
@@ -107,14 +107,26 @@ mod tests {
                 Reconcile(Authority::PendingWrites),
             ),
             (Bears::Earlier, served, false, false, Replace),
-            (Bears::Earlier, Known::Nothing, false, false, Replace),
-            (Bears::Earlier, Known::Nothing, true, false, TakeOver),
-            (Bears::Nothing, Known::Nothing, true, false, TakeOver),
-            (Bears::Nothing, Known::Nothing, true, true, Begin),
-            (Bears::Nothing, Known::Nothing, false, false, Inject),
+            (Bears::Earlier, KnownMaster::Nothing, false, false, Replace),
+            (Bears::Earlier, KnownMaster::Nothing, true, false, TakeOver),
+            (Bears::Nothing, KnownMaster::Nothing, true, false, TakeOver),
+            (Bears::Nothing, KnownMaster::Nothing, true, true, Begin),
+            (Bears::Nothing, KnownMaster::Nothing, false, false, Inject),
             (Bears::Nothing, served, false, true, Inject),
-            (Bears::Nothing, Known::New { pid: 1 }, false, true, Inject),
-            (Bears::Nothing, Known::New { pid: 1 }, true, true, Begin),
+            (
+                Bears::Nothing,
+                KnownMaster::New { pid: 1 },
+                false,
+                true,
+                Inject,
+            ),
+            (
+                Bears::Nothing,
+                KnownMaster::New { pid: 1 },
+                true,
+                true,
+                Begin,
+            ),
         ] {
             let found = treatment(bears, known, mirror_is_empty, master_is_empty);
             assert_eq!(found, expected, "{bears:?} {known:?}");

@@ -6,7 +6,7 @@ use super::{Entry, Kind, Master, Notice, NoticeSink, Request, returnable};
 use crate::xmlrpc::{Reply, Value};
 
 /// What a method returns: status code, message, value.
-pub(crate) type Answer = Result<(i32, String, Value), Failure>;
+pub(crate) type MethodResult = Result<(i32, String, Value), Failure>;
 
 /// Why a method ended early.
 #[derive(Debug, PartialEq)]
@@ -40,7 +40,7 @@ struct Spec {
     arity: usize,
     /// The value of an answer that reports an error.
     error: fn() -> Value,
-    run: fn(&mut Master, Args<'_>) -> Answer,
+    run: fn(&mut Master, Args<'_>) -> MethodResult,
 }
 
 const MULTICALL: &str = "system.multicall";
@@ -276,7 +276,7 @@ impl Master {
         spec: &Spec,
         params: &[Value],
         notices: &mut dyn NoticeSink,
-    ) -> Answer {
+    ) -> MethodResult {
         let Some((caller_id, rest)) = params.split_first() else {
             return refused("missing required caller_id parameter");
         };
@@ -300,7 +300,7 @@ pub fn is_success(reply: &Reply) -> bool {
     matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
 }
 
-fn refused(text: &str) -> Answer {
+fn refused(text: &str) -> MethodResult {
     Err(Failure::Refused(text.to_owned()))
 }
 

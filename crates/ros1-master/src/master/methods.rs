@@ -1,29 +1,29 @@
 //! The methods of the Master API, as in `rosmaster/master_api.py`.
 
-use super::api::{Answer, Args, Failure, strings};
-use super::registry::Shared;
+use super::api::{Args, Failure, MethodResult, strings};
+use super::registry::SharedRegistration;
 use super::{Master, NoticeSink, checks, names};
 use crate::xmlrpc::{Struct, Value};
 
 impl Master {
-    pub(crate) fn get_pid(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn get_pid(&mut self, _: Args<'_>) -> MethodResult {
         Ok((1, String::new(), self.pid.into()))
     }
 
-    pub(crate) fn get_uri(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn get_uri(&mut self, _: Args<'_>) -> MethodResult {
         Ok((1, String::new(), self.uri.as_str().into()))
     }
 
-    pub(crate) fn shutdown(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn shutdown(&mut self, _: Args<'_>) -> MethodResult {
         Ok((1, "shutdown".to_owned(), 0.into()))
     }
 
-    pub(crate) fn register_publisher(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn register_publisher(&mut self, of: Args<'_>) -> MethodResult {
         let caller_id = of.caller_id;
         let (topic, topic_type, api) = self.topic_params(&of)?;
         let bumped = self
             .registry
-            .register(Shared::Publishers, &topic, caller_id, api);
+            .register(SharedRegistration::Publishers, &topic, caller_id, api);
         self.notify_bumped(caller_id, bumped, of.notices);
         if topic_type != "*" || !self.topic_types.contains_key(&topic) {
             self.topic_types
@@ -34,21 +34,21 @@ impl Master {
         Ok((1, message, strings(subscribers)))
     }
 
-    pub(crate) fn register_subscriber(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn register_subscriber(&mut self, of: Args<'_>) -> MethodResult {
         let (topic, topic_type, api) = self.topic_params(&of)?;
-        let bumped = self
-            .registry
-            .register(Shared::Subscribers, &topic, of.caller_id, api);
+        let bumped =
+            self.registry
+                .register(SharedRegistration::Subscribers, &topic, of.caller_id, api);
         self.notify_bumped(of.caller_id, bumped, of.notices);
         if topic_type != "*" && !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
         }
-        let publishers = self.registry.apis(Shared::Publishers, &topic);
+        let publishers = self.registry.apis(SharedRegistration::Publishers, &topic);
         Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
     }
 
-    pub(crate) fn register_service(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn register_service(&mut self, of: Args<'_>) -> MethodResult {
         let caller_id = of.caller_id;
         let [service, service_api, api] = of.params()?;
         let service = checks::resource("service", service, caller_id)?;
@@ -62,30 +62,30 @@ impl Master {
         Ok((1, message, 1.into()))
     }
 
-    pub(crate) fn unregister_publisher(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn unregister_publisher(&mut self, of: Args<'_>) -> MethodResult {
         let [topic, api] = of.params()?;
         let topic = checks::resource("topic", topic, of.caller_id)?;
         let api = checks::api("caller_api", api)?;
         let (message, done) =
             self.registry
-                .unregister(Shared::Publishers, &topic, of.caller_id, api);
+                .unregister(SharedRegistration::Publishers, &topic, of.caller_id, api);
         if done {
             self.notify_publishers(&topic, of.notices);
         }
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn unregister_subscriber(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn unregister_subscriber(&mut self, of: Args<'_>) -> MethodResult {
         let [topic, api] = of.params()?;
         let topic = checks::resource("topic", topic, of.caller_id)?;
         let api = checks::api("caller_api", api)?;
         let (message, done) =
             self.registry
-                .unregister(Shared::Subscribers, &topic, of.caller_id, api);
+                .unregister(SharedRegistration::Subscribers, &topic, of.caller_id, api);
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn unregister_service(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn unregister_service(&mut self, of: Args<'_>) -> MethodResult {
         let [service, service_api] = of.params()?;
         let service = checks::resource("service", service, of.caller_id)?;
         let service_api = checks::api("service_api", service_api)?;
@@ -95,7 +95,7 @@ impl Master {
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn lookup_service(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn lookup_service(&mut self, of: Args<'_>) -> MethodResult {
         let [service] = of.params()?;
         let service = checks::resource("service", service, of.caller_id)?;
         Ok(match self.registry.services.get(&service) {
@@ -107,7 +107,7 @@ impl Master {
         })
     }
 
-    pub(crate) fn lookup_node(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn lookup_node(&mut self, of: Args<'_>) -> MethodResult {
         let [node] = of.params()?;
         let node = checks::name("node", node, of.caller_id)?;
         Ok(match self.registry.nodes.get(&node) {
@@ -116,7 +116,7 @@ impl Master {
         })
     }
 
-    pub(crate) fn get_published_topics(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn get_published_topics(&mut self, of: Args<'_>) -> MethodResult {
         let [subgraph] = of.params()?;
         let mut subgraph = checks::subgraph(subgraph, of.caller_id)?;
         if !subgraph.is_empty() && !subgraph.ends_with('/') {
@@ -132,14 +132,14 @@ impl Master {
         ))
     }
 
-    pub(crate) fn get_topic_types(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn get_topic_types(&mut self, _: Args<'_>) -> MethodResult {
         let pairs = self.topic_types.iter();
         let pairs = pairs.map(|(topic, topic_type)| pair(topic, topic_type));
         let message = "current system state".to_owned();
         Ok((1, message, Value::Array(pairs.collect())))
     }
 
-    pub(crate) fn get_system_state(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn get_system_state(&mut self, _: Args<'_>) -> MethodResult {
         let shared = |kind| {
             let keys = self.registry.shared(kind).iter();
             let keys = keys.map(|(key, callers)| {
@@ -152,14 +152,14 @@ impl Master {
             Value::Array(vec![service.as_str().into(), provider])
         });
         let state = vec![
-            shared(Shared::Publishers),
-            shared(Shared::Subscribers),
+            shared(SharedRegistration::Publishers),
+            shared(SharedRegistration::Subscribers),
             Value::Array(services.collect()),
         ];
         Ok((1, "current system state".to_owned(), Value::Array(state)))
     }
 
-    pub(crate) fn set_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn set_param(&mut self, of: Args<'_>) -> MethodResult {
         let [key, value] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let value = checks::param_value(value)?;
@@ -171,7 +171,7 @@ impl Master {
         Ok((1, format!("parameter {key} set"), 0.into()))
     }
 
-    pub(crate) fn delete_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn delete_param(&mut self, of: Args<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let changed = names::param_key(&key);
@@ -185,7 +185,7 @@ impl Master {
         })
     }
 
-    pub(crate) fn get_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn get_param(&mut self, of: Args<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         Ok(match self.params.get(&key) {
@@ -194,14 +194,14 @@ impl Master {
         })
     }
 
-    pub(crate) fn has_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn has_param(&mut self, of: Args<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let has = self.params.has(&key);
         Ok((1, key, has.into()))
     }
 
-    pub(crate) fn search_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn search_param(&mut self, of: Args<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = checks::key(key)?;
         Ok(match self.params.search(of.caller_id, key)? {
@@ -213,7 +213,7 @@ impl Master {
         })
     }
 
-    pub(crate) fn get_param_names(&mut self, _: Args<'_>) -> Answer {
+    pub(crate) fn get_param_names(&mut self, _: Args<'_>) -> MethodResult {
         Ok((
             1,
             "Parameter names".to_owned(),
@@ -221,25 +221,25 @@ impl Master {
         ))
     }
 
-    pub(crate) fn subscribe_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn subscribe_param(&mut self, of: Args<'_>) -> MethodResult {
         let [api, key] = of.params()?;
         let api = checks::api("caller_api", api)?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let subscribed = names::param_key(&key);
         let value = self.params.get(&subscribed);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
-        let kind = Shared::ParamSubscribers;
+        let kind = SharedRegistration::ParamSubscribers;
         let bumped = self.registry.register(kind, &subscribed, of.caller_id, api);
         self.notify_bumped(of.caller_id, bumped, of.notices);
         Ok((1, format!("Subscribed to parameter [{key}]"), value))
     }
 
-    pub(crate) fn unsubscribe_param(&mut self, of: Args<'_>) -> Answer {
+    pub(crate) fn unsubscribe_param(&mut self, of: Args<'_>) -> MethodResult {
         let [api, key] = of.params()?;
         let api = checks::api("caller_api", api)?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let subscribed = names::param_key(&key);
-        let kind = Shared::ParamSubscribers;
+        let kind = SharedRegistration::ParamSubscribers;
         self.registry
             .unregister(kind, &subscribed, of.caller_id, api);
         Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
@@ -248,9 +248,9 @@ impl Master {
     /// Queues the topic's list of publishers for its subscribers, and returns the addresses of the
     /// subscribers.
     fn notify_publishers(&self, topic: &str, notices: &mut dyn NoticeSink) -> Vec<String> {
-        let subscribers = self.registry.apis(Shared::Subscribers, topic);
+        let subscribers = self.registry.apis(SharedRegistration::Subscribers, topic);
         if !subscribers.is_empty() {
-            let publishers = self.registry.apis(Shared::Publishers, topic);
+            let publishers = self.registry.apis(SharedRegistration::Publishers, topic);
             notices.publisher_update(&subscribers, topic, &publishers);
         }
         subscribers

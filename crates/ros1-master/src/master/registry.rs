@@ -9,7 +9,7 @@ pub type Registrations = IndexMap<String, Vec<String>>;
 
 /// The kinds of registration that several nodes can share under one key.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Shared {
+pub(crate) enum SharedRegistration {
     Publishers,
     Subscribers,
     ParamSubscribers,
@@ -38,11 +38,11 @@ impl Node {
             && self.services.is_empty()
     }
 
-    pub(crate) fn keys(&mut self, kind: Shared) -> &mut IndexSet<String> {
+    pub(crate) fn keys(&mut self, kind: SharedRegistration) -> &mut IndexSet<String> {
         match kind {
-            Shared::Publishers => &mut self.publications,
-            Shared::Subscribers => &mut self.subscriptions,
-            Shared::ParamSubscribers => &mut self.param_subscriptions,
+            SharedRegistration::Publishers => &mut self.publications,
+            SharedRegistration::Subscribers => &mut self.subscriptions,
+            SharedRegistration::ParamSubscribers => &mut self.param_subscriptions,
         }
     }
 }
@@ -65,24 +65,24 @@ pub struct Registry {
 }
 
 impl Registry {
-    pub(crate) fn shared(&self, kind: Shared) -> &Registrations {
+    pub(crate) fn shared(&self, kind: SharedRegistration) -> &Registrations {
         match kind {
-            Shared::Publishers => &self.publishers,
-            Shared::Subscribers => &self.subscribers,
-            Shared::ParamSubscribers => &self.param_subscribers,
+            SharedRegistration::Publishers => &self.publishers,
+            SharedRegistration::Subscribers => &self.subscribers,
+            SharedRegistration::ParamSubscribers => &self.param_subscribers,
         }
     }
 
-    fn shared_mut(&mut self, kind: Shared) -> &mut Registrations {
+    fn shared_mut(&mut self, kind: SharedRegistration) -> &mut Registrations {
         match kind {
-            Shared::Publishers => &mut self.publishers,
-            Shared::Subscribers => &mut self.subscribers,
-            Shared::ParamSubscribers => &mut self.param_subscribers,
+            SharedRegistration::Publishers => &mut self.publishers,
+            SharedRegistration::Subscribers => &mut self.subscribers,
+            SharedRegistration::ParamSubscribers => &mut self.param_subscribers,
         }
     }
 
     /// The addresses of the nodes registered under `key`, in order.
-    pub(crate) fn apis(&self, kind: Shared, key: &str) -> Vec<String> {
+    pub(crate) fn apis(&self, kind: SharedRegistration, key: &str) -> Vec<String> {
         let callers = self.shared(kind).get(key).map_or(&[][..], Vec::as_slice);
         callers
             .iter()
@@ -94,7 +94,7 @@ impl Registry {
     /// any.
     pub(crate) fn register(
         &mut self,
-        kind: Shared,
+        kind: SharedRegistration,
         key: &str,
         caller_id: &str,
         caller_api: &str,
@@ -168,7 +168,7 @@ impl Registry {
     /// Unregisters a node from a key. Returns the message, and whether there was anything to unregister.
     pub(crate) fn unregister(
         &mut self,
-        kind: Shared,
+        kind: SharedRegistration,
         key: &str,
         caller_id: &str,
         caller_api: &str,

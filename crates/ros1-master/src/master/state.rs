@@ -8,7 +8,7 @@ use thiserror::Error;
 
 use super::notice::NoticeSink;
 use super::params::Params;
-use super::registry::{Node, Registry, Shared};
+use super::registry::{Node, Registry, SharedRegistration};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
 use super::{Method, Request, names};
@@ -200,12 +200,12 @@ impl Master {
 
     /// Addresses of the publishers of a topic, in order.
     pub fn publishers_of(&self, topic: &str) -> Vec<String> {
-        self.registry.apis(Shared::Publishers, topic)
+        self.registry.apis(SharedRegistration::Publishers, topic)
     }
 
     /// Addresses of the subscribers of a topic, in order.
     pub fn subscribers_of(&self, topic: &str) -> Vec<String> {
-        self.registry.apis(Shared::Subscribers, topic)
+        self.registry.apis(SharedRegistration::Subscribers, topic)
     }
 
     /// The topics that have subscribers.
@@ -264,11 +264,11 @@ impl Master {
         let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();
         Counts {
             nodes: self.registry.nodes.len(),
-            publishers: sum(Shared::Publishers),
-            subscribers: sum(Shared::Subscribers),
+            publishers: sum(SharedRegistration::Publishers),
+            subscribers: sum(SharedRegistration::Subscribers),
             services: self.registry.services.len(),
             params: self.params.leaves(),
-            param_subscribers: sum(Shared::ParamSubscribers),
+            param_subscribers: sum(SharedRegistration::ParamSubscribers),
         }
     }
 
@@ -374,9 +374,12 @@ impl Master {
             || !snapshot.services.is_empty()
             || nodes.values().any(|node| !node.services.is_empty());
         for (kind, registrations) in [
-            (Shared::Publishers, &snapshot.publishers),
-            (Shared::Subscribers, &snapshot.subscribers),
-            (Shared::ParamSubscribers, &snapshot.param_subscribers),
+            (SharedRegistration::Publishers, &snapshot.publishers),
+            (SharedRegistration::Subscribers, &snapshot.subscribers),
+            (
+                SharedRegistration::ParamSubscribers,
+                &snapshot.param_subscribers,
+            ),
         ] {
             for (key, callers) in registrations {
                 if callers.is_empty() {

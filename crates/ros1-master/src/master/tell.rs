@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::registry::Shared;
+use super::registry::SharedRegistration;
 use super::{CALLER_ID, Master, Method, Request, names, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
@@ -64,12 +64,15 @@ impl Master {
     /// All subscriptions to parameters that are set: address of the subscriber, and key with a trailing
     /// slash.
     pub fn param_subscribers(&self) -> Vec<(String, Arc<str>)> {
-        let subscribers = self.registry.shared(Shared::ParamSubscribers).keys();
+        let subscribers = self
+            .registry
+            .shared(SharedRegistration::ParamSubscribers)
+            .keys();
         let set = subscribers.filter(|key| self.is_set(key));
         let all = set.flat_map(|key| {
             let apis = self
                 .registry
-                .apis(Shared::ParamSubscribers, key)
+                .apis(SharedRegistration::ParamSubscribers, key)
                 .into_iter();
             let key = Arc::<str>::from(key.as_str());
             apis.map(move |api| (api, key.clone()))
@@ -79,14 +82,20 @@ impl Master {
 
     /// Whether a node at an address that `at` accepts subscribes to a topic.
     pub fn subscribes(&self, at: impl Fn(&str) -> bool, topic: &str) -> bool {
-        let nodes = self.registry.shared(Shared::Subscribers).get(topic);
+        let nodes = self
+            .registry
+            .shared(SharedRegistration::Subscribers)
+            .get(topic);
         self.any_at(&at, nodes)
     }
 
     /// Whether a node at an address that `at` accepts subscribes to `key`, to a namespace above it, or to a
     /// key below it.
     pub fn subscribes_param(&self, at: impl Fn(&str) -> bool, key: &str) -> bool {
-        let subscribers = self.registry.shared(Shared::ParamSubscribers).iter();
+        let subscribers = self
+            .registry
+            .shared(SharedRegistration::ParamSubscribers)
+            .iter();
         let mut related = subscribers.filter(|(subscribed, _)| {
             key.starts_with(subscribed.as_str()) || subscribed.starts_with(key)
         });

@@ -3,7 +3,7 @@
 use super::{
     super::{
         computers::{Cluster, Unusable},
-        facts::Facts,
+        facts::SetupFacts,
     },
     Findings,
 };
@@ -12,7 +12,7 @@ use crate::cluster::survey;
 const SUBJECT: &str = "--cluster";
 
 impl Findings {
-    pub(super) fn cluster(&mut self, facts: &Facts) {
+    pub(super) fn cluster(&mut self, facts: &SetupFacts) {
         let cluster = match facts.cluster.as_deref() {
             None => return,
             Some(Ok(cluster)) => cluster,

@@ -2,8 +2,8 @@
 
 use super::{
     super::{
-        facts::{Facts, Host, Port},
-        ros::Server,
+        facts::{Host, Port, SetupFacts},
+        ros::Responder,
     },
     Findings, list, named,
 };
@@ -16,7 +16,7 @@ const BYPASS: &str = "unprotected";
 const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 
 impl Findings {
-    pub(super) fn port(&mut self, facts: &Facts) {
+    pub(super) fn port(&mut self, facts: &SetupFacts) {
         let Ok(Port {
             number,
             error,
@@ -38,7 +38,7 @@ impl Findings {
             all => all.iter().map(named).collect::<Vec<_>>().join(", "),
         };
         match &taken.server {
-            Server::Rosrescue {
+            Responder::Rosrescue {
                 version,
                 unprotected,
                 ..
@@ -64,7 +64,7 @@ impl Findings {
                     );
                 }
             }
-            Server::Master(pid) => {
+            Responder::Master(pid) => {
                 let pid = pid.map_or_else(String::new, |pid| format!("kill {pid}, or "));
                 self.bad(
                     "port",
@@ -83,7 +83,7 @@ impl Findings {
         }
     }
 
-    pub(super) fn master_uri(&mut self, facts: &Facts) {
+    pub(super) fn master_uri(&mut self, facts: &SetupFacts) {
         const SUBJECT: &str = "ROS_MASTER_URI";
         let Some(uri) = &facts.env.master_uri else {
             return self.warn(
@@ -145,10 +145,10 @@ impl Findings {
     }
 
     /// Findings about a master that answers on another computer.
-    pub(super) fn elsewhere(&mut self, facts: &Facts, uri: &str) {
+    pub(super) fn elsewhere(&mut self, facts: &SetupFacts, uri: &str) {
         const SUBJECT: &str = "ROS_MASTER_URI";
         match &facts.elsewhere {
-            Some(Server::Rosrescue { version, .. }) => self.ok(
+            Some(Responder::Rosrescue { version, .. }) => self.ok(
                 SUBJECT,
                 format!("{uri} is rosrescue {version} on another computer; only nodes run here"),
             ),
@@ -171,7 +171,7 @@ impl Findings {
     }
 
     /// Checks `ROS_IP` and `ROS_HOSTNAME`.
-    pub(super) fn address(&mut self, facts: &Facts) {
+    pub(super) fn address(&mut self, facts: &SetupFacts) {
         let env = &facts.env;
         for (subject, value) in [("ROS_HOSTNAME", &env.hostname), ("ROS_IP", &env.ip)] {
             let Some(value) = value else { continue };
@@ -208,7 +208,7 @@ impl Findings {
     }
 
     /// Checks the name that nodes of this computer register.
-    pub(super) fn own_name(&mut self, facts: &Facts) {
+    pub(super) fn own_name(&mut self, facts: &SetupFacts) {
         let (own, env) = (&facts.own, &facts.env);
         let is_set = env.hostname.is_some() || env.ip.is_some();
         let (subject, name) = match is_set {
@@ -253,7 +253,7 @@ impl Findings {
     }
 
     /// Checks whether the address in `ROS_IP` may change.
-    pub(super) fn lease(&mut self, facts: &Facts) {
+    pub(super) fn lease(&mut self, facts: &SetupFacts) {
         let Some(lease) = &facts.lease else { return };
         let how = match (lease.is_leased, lease.is_wireless) {
             (true, true) => "a leased (DHCP) address of Wi-Fi",
@@ -272,7 +272,7 @@ impl Findings {
     }
 
     /// Reports running nodes of another master.
-    pub(super) fn strays(&mut self, facts: &Facts) {
+    pub(super) fn strays(&mut self, facts: &SetupFacts) {
         for (process, uri) in &facts.strays {
             let port = ros_env::MasterUri::parse(uri).ok().map(|uri| uri.port);
             if facts.behind.as_ref().map(|behind| behind.uri.port) == port && port.is_some() {
@@ -295,7 +295,7 @@ impl Findings {
     }
 
     /// Reports clients that talk directly to the master behind a `proxy`.
-    pub(super) fn bypass(&mut self, facts: &Facts) {
+    pub(super) fn bypass(&mut self, facts: &SetupFacts) {
         let Some(behind) = &facts.behind else { return };
         let uri = &behind.uri;
         for who in &behind.bypassing {
@@ -330,7 +330,7 @@ impl Findings {
         }
     }
 
-    pub(super) fn nodes(&mut self, facts: &Facts) {
+    pub(super) fn nodes(&mut self, facts: &SetupFacts) {
         for (host, nodes) in &facts.node_hosts {
             let nodes = nodes.join(", ");
             if let Err(why) = &host.addresses {
@@ -373,7 +373,7 @@ fn leads(host: &Host) -> String {
 }
 
 /// Another computer of the robot, if one is known.
-fn other_computer(facts: &Facts) -> Option<String> {
+fn other_computer(facts: &SetupFacts) -> Option<String> {
     let hosts = facts.node_hosts.iter().map(|(host, _)| host);
     let mut far = hosts.chain(&facts.master_host);
     let far = far.find(|host| host.addresses.is_ok() && !host.is_here)?;

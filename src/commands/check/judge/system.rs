@@ -2,10 +2,10 @@
 
 use super::{
     super::{
-        facts::{Clock, Disk, Facts, Port},
+        facts::{CheckpointDisk, Clock, Port, SetupFacts},
         launch::Launches,
-        ros::Server,
-        units::Kind,
+        ros::Responder,
+        units::UnitKind,
     },
     Findings, named,
 };
@@ -30,11 +30,11 @@ const EARLIEST: f64 = 1_704_067_200.0;
 /// A clock that is this many seconds behind existing files was set back.
 const BEHIND_FILES: f64 = 120.0;
 impl Findings {
-    pub(super) fn disk(&mut self, disk: &Disk, port: Option<&Port>) {
+    pub(super) fn disk(&mut self, disk: &CheckpointDisk, port: Option<&Port>) {
         const SUBJECT: &str = "checkpoint";
         let (path, folder) = (disk.checkpoint.display(), disk.folder.display());
         let runs = port.and_then(|port| port.taken.as_ref());
-        let runs = runs.is_some_and(|taken| matches!(taken.server, Server::Rosrescue { .. }));
+        let runs = runs.is_some_and(|taken| matches!(taken.server, Responder::Rosrescue { .. }));
         if let (Some(holder), false) = (disk.holder, runs) {
             let who = holder
                 .pid
@@ -134,7 +134,7 @@ impl Findings {
         }
     }
 
-    pub(super) fn ros(&mut self, facts: &Facts) {
+    pub(super) fn ros(&mut self, facts: &SetupFacts) {
         match &facts.rosmaster {
             None => {}
             Some(Err(why)) => self.bad("rosmaster", why.clone(), "core needs it"),
@@ -172,19 +172,19 @@ impl Findings {
             return;
         };
         match server {
-            Server::Master(_) => {
+            Responder::Master(_) => {
                 let speaks = facts.proxied_speaks.as_deref();
                 let speaks = speaks
                     .map(|speaks| format!(": {speaks}"))
                     .unwrap_or_default();
                 self.ok("master", format!("{uri} answers{speaks}"));
             }
-            Server::Rosrescue { .. } => self.bad(
+            Responder::Rosrescue { .. } => self.bad(
                 "master",
                 format!("--master {uri} is a rosrescue"),
                 "give the address of the real rosmaster",
             ),
-            Server::Other => {
+            Responder::Other => {
                 let todo = "give the address of the real rosmaster";
                 self.bad(
                     "master",
@@ -192,7 +192,7 @@ impl Findings {
                     todo,
                 );
             }
-            Server::Nobody | Server::Silent => self.warn(
+            Responder::Nobody | Responder::Silent => self.warn(
                 "master",
                 format!("no answer from {uri}"),
                 "start it: at its first start, proxy lets calls wait for a master",
@@ -201,7 +201,7 @@ impl Findings {
     }
 
     /// Reports masters beside rosrescue.
-    pub(super) fn masters(&mut self, facts: &Facts) {
+    pub(super) fn masters(&mut self, facts: &SetupFacts) {
         let port = facts.port.as_ref().ok().map(|port| port.number);
         let proxied = facts.proxied.as_ref().map(|(uri, _)| uri.port);
         let others = facts.masters.iter().filter(|process| {
@@ -219,25 +219,25 @@ impl Findings {
         }
     }
 
-    pub(super) fn systemd(&mut self, facts: &Facts) {
+    pub(super) fn systemd(&mut self, facts: &SetupFacts) {
         let mut own = 0;
         for unit in &facts.units {
             let name = &unit.name;
             match (unit.kind, unit.is_enabled) {
-                (Kind::Rosrescue, true) => {
+                (UnitKind::Rosrescue, true) => {
                     own += 1;
                     self.ok("systemd", format!("{name} starts at boot"));
                 }
-                (Kind::Rosrescue, false) => {
+                (UnitKind::Rosrescue, false) => {
                     let todo = format!("systemctl enable {name}");
                     self.note("systemd", format!("{name} does not start at boot"), todo);
                 }
-                (Kind::Roscore, true) if facts.proxied.is_none() => {
+                (UnitKind::Roscore, true) if facts.proxied.is_none() => {
                     let todo = format!("systemctl disable --now {name}");
                     let what = format!("{name} starts another master at boot");
                     self.bad("systemd", what, todo);
                 }
-                (Kind::Roslaunch, true) => self.warn(
+                (UnitKind::Roslaunch, true) => self.warn(
                     "systemd",
                     format!("{name} runs roslaunch, which starts a master if it finds none"),
                     "add --wait to its roslaunch, and After=rosrescue.service to the unit",
@@ -245,7 +245,12 @@ impl Findings {
                 _ => {}
             }
         }
-        if own == 0 && facts.units.iter().all(|unit| unit.kind != Kind::Rosrescue) {
+        if own == 0
+            && facts
+                .units
+                .iter()
+                .all(|unit| unit.kind != UnitKind::Rosrescue)
+        {
             let todo = "`rosrescue install` adds one that starts at boot";
             self.note("systemd", "there is no rosrescue service", todo);
         }

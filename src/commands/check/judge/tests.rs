@@ -7,10 +7,10 @@ use std::{path::PathBuf, time::Duration};
 use super::{
     super::{
         Finding, Severity,
-        facts::{Clock, Disk, Environment, Facts, Host, Port, Process, Taken},
+        facts::{CheckpointDisk, Clock, Environment, Host, Port, PortInUse, Process, SetupFacts},
         launch::Launches,
-        ros::{Program, Server},
-        units::{Kind, Unit},
+        ros::{Program, Responder},
+        units::{Unit, UnitKind},
     },
     judge,
 };
@@ -31,8 +31,8 @@ fn nowhere(name: &str) -> Host {
 }
 
 /// A robot without problems.
-fn robot() -> Facts {
-    Facts {
+fn robot() -> SetupFacts {
+    SetupFacts {
         version: "1.0.0",
         proxied: None,
         proxied_speaks: None,
@@ -51,7 +51,7 @@ fn robot() -> Facts {
         elsewhere: None,
         elsewhere_host: None,
         node_hosts: Vec::new(),
-        disk: Disk {
+        disk: CheckpointDisk {
             checkpoint: PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml"),
             folder: PathBuf::from("/home/r"),
             space: Ok((10 << 30, false)),
@@ -75,7 +75,7 @@ fn robot() -> Facts {
         })),
         has_rosout: true,
         strange_python: None,
-        units: vec![unit("rosrescue.service", Kind::Rosrescue, true)],
+        units: vec![unit("rosrescue.service", UnitKind::Rosrescue, true)],
         launches: Launches::default(),
         memory: Some(4 << 30),
         strays: Vec::new(),
@@ -86,7 +86,7 @@ fn robot() -> Facts {
     }
 }
 
-fn unit(name: &str, kind: Kind, is_enabled: bool) -> Unit {
+fn unit(name: &str, kind: UnitKind, is_enabled: bool) -> Unit {
     Unit {
         name: name.to_owned(),
         kind,
@@ -102,15 +102,15 @@ fn process(pid: u32, name: &str, port: u16) -> Process {
     }
 }
 
-fn taken(server: Server) -> Option<Taken> {
-    Some(Taken {
+fn taken(server: Responder) -> Option<PortInUse> {
+    Some(PortInUse {
         by: vec![process(7, "who", 11311)],
         server,
     })
 }
 
-fn rosrescue(unprotected: Option<&str>) -> Server {
-    Server::Rosrescue {
+fn rosrescue(unprotected: Option<&str>) -> Responder {
+    Responder::Rosrescue {
         version: "1.0.0".to_owned(),
         uri: "http://robot:11311/".to_owned(),
         unprotected: unprotected.map(str::to_owned),
@@ -119,12 +119,12 @@ fn rosrescue(unprotected: Option<&str>) -> Server {
     }
 }
 
-fn port(facts: &mut Facts) -> &mut Port {
+fn port(facts: &mut SetupFacts) -> &mut Port {
     facts.port.as_mut().unwrap()
 }
 
 /// The warnings and problems that remain after `spoil` has broken one thing.
-fn said(spoil: impl FnOnce(&mut Facts)) -> Vec<Finding> {
+fn said(spoil: impl FnOnce(&mut SetupFacts)) -> Vec<Finding> {
     let mut facts = robot();
     spoil(&mut facts);
     let mut found = judge(&facts);
@@ -134,7 +134,7 @@ fn said(spoil: impl FnOnce(&mut Facts)) -> Vec<Finding> {
 
 /// Asserts that `spoil` causes exactly one finding, with these words and something to do.
 #[track_caller]
-fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut Facts)) {
+fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut SetupFacts)) {
     let found = said(spoil);
     let [finding] = found.as_slice() else {
         panic!("{found:?}");

@@ -3,7 +3,7 @@
 use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
-use super::{Checkpoint, EncodeError, Entry, Session, frame, yaml};
+use super::{Checkpoint, EncodeError, RecordContent, Session, frame, yaml};
 use crate::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
@@ -179,18 +179,22 @@ fn integer(count: u64) -> Value {
 }
 
 /// Writes the line of a record without its check sum.
-pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
+pub(super) fn write_record(
+    out: &mut Vec<u8>,
+    seq: u64,
+    entry: &RecordContent,
+) -> Result<(), EncodeError> {
     out.extend_from_slice(b"- {seq: ");
     decimal(out, seq);
     match entry {
-        Entry::Call { call, pending } => {
+        RecordContent::Call { call, pending } => {
             out.extend_from_slice(b", ");
             write_call(out, call)?;
             if *pending {
                 out.extend_from_slice(b", pending: true");
             }
         }
-        Entry::Session(session) => {
+        RecordContent::Session(session) => {
             out.extend_from_slice(b", session: {");
             for (nth, (name, value)) in session_members(session).iter().enumerate() {
                 if nth > 0 {
@@ -290,7 +294,7 @@ fn read_displaced(value: Value) -> Option<Displaced> {
 }
 
 /// Reverses [`write_record`], except for the number, which the caller has read.
-pub(super) fn read_record(line: &str) -> Result<Entry, String> {
+pub(super) fn read_record(line: &str) -> Result<RecordContent, String> {
     let entries = match yaml::read(line)? {
         Value::Array(entries) => entries,
         _ => Vec::new(),
@@ -299,11 +303,11 @@ pub(super) fn read_record(line: &str) -> Result<Entry, String> {
         return Err("it is not a record".to_owned());
     };
     if entry.contains_key("session") {
-        return read_session(members(&mut entry, "session")?).map(Entry::Session);
+        return read_session(members(&mut entry, "session")?).map(RecordContent::Session);
     }
     let pending = entry.get("pending") == Some(&Value::Bool(true));
     let call = read_call(&mut entry)?;
-    Ok(Entry::Call { call, pending })
+    Ok(RecordContent::Call { call, pending })
 }
 
 fn read_call(members: &mut Struct) -> Result<Call, String> {

@@ -15,8 +15,8 @@ use std::io::{BufRead, Write};
 use std::ops::Range;
 
 use super::{
-    Checkpoint, Damage, DecodeError, Decoded, EncodeError, Encoded, Entry, Record, SnapshotError,
-    document,
+    Checkpoint, Damage, Decoded, EncodeError, Encoded, FormatError, Record, RecordContent,
+    SnapshotError, document,
 };
 
 /// The version of the format that this program writes.
@@ -55,7 +55,7 @@ pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Enco
 }
 
 /// Appends the line of a record without its check sums.
-pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
+pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &RecordContent) -> Result<(), EncodeError> {
     let start = out.len();
     let written = document::write_record(out, seq, entry);
     if written.is_err() {
@@ -173,7 +173,7 @@ pub struct Framed<'a> {
 /// # Errors
 ///
 /// If it is not a checkpoint of this format.
-pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
+pub fn decode(bytes: &[u8]) -> Result<Decoded, FormatError> {
     let framed = scan(bytes)?;
     let checkpoint = framed.checkpoint();
     let mut damaged = framed.damaged.clone();
@@ -192,7 +192,7 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
 /// # Errors
 ///
 /// If it is not a checkpoint of this format.
-pub fn scan(bytes: &[u8]) -> Result<Framed<'_>, DecodeError> {
+pub fn scan(bytes: &[u8]) -> Result<Framed<'_>, FormatError> {
     let header = read_header(bytes)?;
     let mut framed = Framed {
         header,
@@ -201,12 +201,12 @@ pub fn scan(bytes: &[u8]) -> Result<Framed<'_>, DecodeError> {
     };
     framed.scan_lines();
     if header.is_none() && framed.lines.is_empty() && !resembles(bytes) {
-        return Err(DecodeError::NotACheckpoint);
+        return Err(FormatError::NotACheckpoint);
     }
     Ok(framed)
 }
 
-fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
+fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
     let head = bytes
         .get(..bytes.len().min(HEADER_BYTES_MAX))
         .unwrap_or_default();
@@ -232,7 +232,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     };
     match version.parse() {
         Ok(FORMAT_VERSION) => {}
-        Ok(version) => return Err(DecodeError::NewerVersion { version }),
+        Ok(version) => return Err(FormatError::NewerVersion { version }),
         Err(_) => return Ok(None),
     }
     let field = |name: &str| {

@@ -17,7 +17,7 @@ fn file() -> (Vec<u8>, Vec<usize>) {
         ];
         let record = Record {
             seq: seq as u64,
-            entry: Entry::call(Call::new("setParam", params)),
+            entry: RecordContent::call(Call::new("setParam", params)),
         };
         bytes.extend(encode_record(&record, encoded.stamp).unwrap());
         starts.push(bytes.len());
@@ -96,7 +96,7 @@ fn numbers_too_high_to_continue_counting_are_damage() {
     assert_eq!(header(u64::MAX, 1), Err(SnapshotError::Header));
     let encoded = encode_checkpoint(&checkpoint(0), 1).unwrap();
     for (seq, whole) in [(most, true), (most + 1, false), (u64::MAX, false)] {
-        let entry = Entry::Session(Session::default());
+        let entry = RecordContent::Session(Session::default());
         let line = encode_record(&Record { seq, entry }, encoded.stamp).unwrap();
         let decoded = decode(&[encoded.bytes.as_slice(), &line].concat()).unwrap();
         assert_eq!(

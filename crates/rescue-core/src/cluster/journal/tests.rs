@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::{
-    checkpoint::format::{Checkpoint, Entry, Session},
+    checkpoint::format::{Checkpoint, RecordContent, Session},
     xmlrpc::Call,
 };
 
@@ -15,7 +15,7 @@ fn record(seq: u64, bytes: usize) -> Record {
         "setParam",
         vec!["/n".into(), format!("/p{seq}").as_str().into(), value],
     );
-    let entry = Entry::call(call);
+    let entry = RecordContent::call(call);
     Record { seq, entry }
 }
 
@@ -89,7 +89,7 @@ fn what_is_written_is_read_whatever_its_size() {
     };
     let session = Record {
         seq: 1,
-        entry: Entry::Session(session),
+        entry: RecordContent::Session(session),
     };
     assert_eq!(through(std::slice::from_ref(&session)).0, [session]);
 }
@@ -101,7 +101,7 @@ fn a_record_that_is_too_large_is_refused_with_a_reason() {
     assert!(matches!(error, JournalError::TooLarge { .. }));
     assert!(error.to_string().contains("in parts"), "{error}");
     assert_eq!(check_size(20 << 20), Ok(()));
-    assert_eq!(pack(&keys, &[]), Ok(Batch::default()));
+    assert_eq!(pack(&keys, &[]), Ok(JournalBatch::default()));
 }
 
 #[test]
@@ -185,4 +185,21 @@ fn the_journal_after_a_record_is_the_rest() {
     assert!(after.contains(&keys.journal(u64::MAX)) && !after.contains(&keys.leader()));
     let [journal, _] = keys.behind(9);
     assert!(journal.contains(&keys.journal(9)) && !journal.contains(&keys.journal(10)));
+}
+
+#[test]
+fn the_rest_of_the_keys_lacks_only_the_known_journal() {
+    let keys = Keys::new("robot");
+    let rest = keys.small_after(7);
+    let has = |key: &String| rest.iter().any(|range| range.contains(key));
+    let others = [
+        keys.leader(),
+        keys.alive(),
+        keys.snapshot(),
+        keys.member("a"),
+    ];
+    assert!(others.iter().all(has));
+    assert!((1..8).all(|seq| !has(&keys.journal(seq))));
+    assert!([8, 9, u64::MAX].iter().all(|&seq| has(&keys.journal(seq))));
+    assert!(rest.iter().all(|range| keys.small().contains(&range.start)));
 }

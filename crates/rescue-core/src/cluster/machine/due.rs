@@ -1,10 +1,10 @@
-//! What is due, and when.
+//! The deadlines of the machine, and what it does at them.
 
 use std::time::{Duration, Instant};
 
 use super::{
-    Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, Reign, Role, Session,
-    Settings,
+    ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, JournalSession, Leadership,
+    Machine, Op, PATIENCE, RETRY, Role, Settings,
 };
 
 impl Machine {
@@ -12,28 +12,30 @@ impl Machine {
     pub fn deadline(&self) -> Option<Instant> {
         let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
         let send = self.send_at().filter(|_| !under_way);
-        [send, self.alone_at(), self.lapses_at()]
+        let flight = self.flight.as_ref().filter(|_| under_way);
+        let given_up = flight.map(|flight| flight.sent + ANSWER_LIMIT + RETRY);
+        [send, given_up, self.alone_at(), self.lapses_at()]
             .into_iter()
             .flatten()
             .min()
     }
 
-    /// What is due at `now`.
+    /// Does what is due at `now`.
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()
-            && self.session != Session::Unknown
+            && self.session != JournalSession::Unknown
             && self.is_sole(now)
-            && let Some(reign) = &mut self.reign
+            && let Some(leadership) = &mut self.leadership
         {
-            reign.caught_up = true;
+            leadership.caught_up = true;
             self.follow_to(self.view.seq());
             self.become_role(Role::Leading, actions);
         }
         if self.lapses_at().is_some_and(|at| at <= now)
-            && let Some(reign) = &mut self.reign
+            && let Some(leadership) = &mut self.leadership
         {
-            reign.lapsed = true;
+            leadership.lapsed = true;
         }
         if self.alone_at().is_some_and(|at| at <= now) {
             self.become_role(Role::Alone, actions);
@@ -50,6 +52,7 @@ impl Machine {
             let (number, op) = (self.numbers, flight.op.clone());
             self.flight = Some(Flight {
                 number,
+                sent: now,
                 silent: false,
                 ..flight
             });
@@ -59,16 +62,16 @@ impl Machine {
 
     fn next(&mut self, now: Instant) -> Flight {
         let guard = self.view.guard();
-        let op = match self.reign {
-            Some(reign) => {
-                let seq = match reign.caught_up {
+        let op = match self.leadership {
+            Some(leadership) => {
+                let seq = match leadership.caught_up {
                     true => self.recorded,
                     false => self.view.seq(),
                 };
                 let whole = seq == self.committed && self.role == Role::Leading;
                 Op::Beat {
                     guard,
-                    beat: reign.beat + 1,
+                    beat: leadership.beat + 1,
                     seq,
                     released: self.releasing.clone().filter(|_| whole),
                     settled: self.session.settled_by(seq),
@@ -90,37 +93,41 @@ impl Machine {
             number: 0,
             op,
             first: now,
+            sent: now,
             silent: false,
         }
     }
 
     /// When the next request is due, unless one is under way.
     fn send_at(&self) -> Option<Instant> {
-        let due = match self.reign {
-            Some(reign) => self.beat_at(reign)?,
+        let due = match self.leadership {
+            Some(leadership) => self.beat_at(leadership)?,
             None => match self.observed {
-                Some(observed) => observed + self.vacant_after(),
+                Some(observed) => {
+                    let vacant = observed + self.vacant_after();
+                    self.claim_not_before.map_or(vacant, |at| at.max(vacant))
+                }
                 None => self.started?,
             },
         };
         Some(self.retry_at.map_or(due, |at| at.max(due)))
     }
 
-    fn beat_at(&self, reign: Reign) -> Option<Instant> {
-        let Some(sent) = reign.sent.filter(|_| self.releasing.is_none()) else {
+    fn beat_at(&self, leadership: Leadership) -> Option<Instant> {
+        let Some(sent) = leadership.sent.filter(|_| self.releasing.is_none()) else {
             return self.observed;
         };
         let pause = self.settings.ttl / BEATS;
-        let waiting = reign.caught_up && self.recorded > self.committed;
+        let waiting = leadership.caught_up && self.recorded > self.committed;
         Some(match self.settings.commit {
             Commit::Always if waiting => sent,
-            Commit::Interval if reign.full => sent,
+            Commit::Interval if leadership.full => sent,
             Commit::Interval if waiting => sent + COMMIT_INTERVAL.min(pause),
             _ => sent + pause,
         })
     }
 
-    /// How long after it was seen in its present state leading is open to this computer.
+    /// How long after the keys were first seen in their present state this computer may claim.
     fn vacant_after(&self) -> Duration {
         let own = &self.settings;
         let Settings { name, id, ttl, .. } = own;
@@ -133,11 +140,11 @@ impl Machine {
             .as_ref()
             .and_then(|alive| alive.released.as_ref());
         match released {
-            // It has just given up itself.
+            // It has just given up leadership itself.
             _ if leader.id == *id => *ttl,
             Some(to) if to.is_empty() || to == name => Duration::ZERO,
             Some(_) => *ttl / BEATS,
-            // An earlier process on this computer. It cannot live: there is one at a time.
+            // An earlier process of this computer. It is dead, because only one runs at a time.
             None if own.is_of_this_computer(&leader.name, &leader.uri, &leader.boot) => {
                 Duration::ZERO
             }
@@ -145,7 +152,7 @@ impl Machine {
         }
     }
 
-    /// When this computer is alone, unless it hears of etcd or of the leader.
+    /// When this computer counts as cut off, unless etcd or the leader answers before.
     fn alone_at(&self) -> Option<Instant> {
         let patience = self.settings.ttl + PATIENCE;
         let silent = self.heard.or(self.started)? + patience;
@@ -156,11 +163,11 @@ impl Machine {
                 Some((false, since)) => Some(silent.min(since + patience)),
                 None => Some(silent),
             },
-            // Until then nothing is acknowledged that is not committed, unless nobody else can lead.
-            Role::Leading => Some(self.reign?.sent? + patience),
+            // Until then, only committed writes are acknowledged, unless no other computer can lead.
+            Role::Leading => Some(self.leadership?.sent? + patience),
             Role::Alone => None,
         };
-        // What happened while this process stood still is not known: etcd is asked first.
+        // After a pause of this process, etcd is asked first what has happened meanwhile.
         Some(at?.max(self.resumed.map_or(at?, |resumed| resumed + PATIENCE)))
     }
 }

@@ -1,21 +1,21 @@
-//! What this process has begun.
+//! The present term and the request under way.
 
 use std::time::Instant;
 
 use super::Op;
 
-/// This process leads, as far as it knows.
+/// The term in which this process leads, as far as it knows.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Reign {
+pub(super) struct Leadership {
     pub(super) term: u64,
-    /// When the last transaction that etcd has made was sent. None if that is not known.
+    /// When the last successful transaction was sent. `None` if unknown.
     pub(super) sent: Option<Instant>,
     pub(super) beat: u64,
-    /// The mirror held the whole journal when it began to lead.
+    /// Whether the mirror had the whole journal when the term began.
     pub(super) caught_up: bool,
-    /// The last beat did not take all records that there were.
+    /// Whether records were left over after the last beat.
     pub(super) full: bool,
-    /// Another computer can lead since the last beat.
+    /// Whether another computer may have led since the last beat.
     pub(super) lapsed: bool,
 }
 
@@ -26,7 +26,9 @@ pub(super) struct Flight {
     pub(super) op: Op,
     /// When it was sent for the first time.
     pub(super) first: Instant,
-    /// It got no answer, and is not under way now.
+    /// When it was sent for the last time.
+    pub(super) sent: Instant,
+    /// Whether it got no answer and is not under way now.
     pub(super) silent: bool,
 }
 

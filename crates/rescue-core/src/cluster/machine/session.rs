@@ -1,24 +1,24 @@
-//! Whether the session that the journal holds goes on.
+//! Decides whether the journal's session continues.
 //!
-//! A robot that is switched on in the morning must not go on with yesterday's state, so a computer that has
-//! claimed leads only when that is decided. Others that see it lead take its word.
+//! A robot that is switched on in the morning must not continue with yesterday's state. So a computer whose claim has
+//! succeeded leads only once that is decided. The others accept its decision.
 
 use super::types::Alive;
 
-/// What is known of the journal's session.
+/// What is known about the journal's session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Session {
-    /// Nothing: no other computer was seen leading it. Whoever leads next has to decide.
+pub enum JournalSession {
+    /// Nothing: no computer was seen leading it. The next leader has to decide.
     #[default]
     Unknown,
-    /// It goes on.
+    /// It continues.
     GoesOn,
-    /// It ended with this record. Whoever leads replaces the state by an empty one, as the next record.
+    /// It ended with this record. The leader replaces the state by an empty one, as the next record.
     Over(u64),
 }
 
-impl Session {
-    /// The shell has decided about the journal up to record `seq`, unless others were quicker.
+impl JournalSession {
+    /// Applies the shell's decision about the journal up to record `seq`, unless another computer was faster.
     pub(super) fn decided(&mut self, seq: u64, goes_on: bool) {
         if *self == Self::Unknown {
             *self = match goes_on {
@@ -28,7 +28,7 @@ impl Session {
         }
     }
 
-    /// etcd shows `alive`. `other_lives`: another computer has just written it.
+    /// Handles `alive` as etcd shows it. `other_lives` says whether another computer has just written it.
     pub(super) fn see(&mut self, alive: &Alive, other_lives: bool) {
         let replaced = matches!(*self, Self::Over(last) if alive.seq > last);
         if replaced || other_lives && alive.settled {
@@ -36,7 +36,7 @@ impl Session {
         }
     }
 
-    /// Whether the journal's session goes on once record `seq` is in it.
+    /// Whether the session is decided once record `seq` is in the journal.
     pub(super) fn settled_by(self, seq: u64) -> bool {
         match self {
             Self::Unknown => false,

@@ -60,7 +60,7 @@ fn following(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
     let (number, op) = sent(&machine.on(now, Input::Start(0)));
     assert_eq!(op, Op::Read);
-    let answer = Answer::Is(led("b", 5, 6));
+    let answer = EtcdAnswer::Is(led("b", 5, 6));
     let actions = machine.on(now, Input::Answer { number, answer });
     let follows = [Action::Become(Role::Following), Action::CatchUp(10)];
     assert_eq!(actions, follows);
@@ -72,7 +72,7 @@ fn following(alone: WhenAlone) -> (Machine, Instant) {
 fn leading(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
-    let nobody = Answer::Is(View::default());
+    let nobody = EtcdAnswer::Is(View::default());
     let claimed = machine.on(
         now,
         Input::Answer {
@@ -82,14 +82,14 @@ fn leading(alone: WhenAlone) -> (Machine, Instant) {
     );
     let (number, op) = sent(&claimed);
     let claim = Op::Claim {
-        guard: Guard::default(),
+        guard: RevisionGuard::default(),
         claim: 1,
         seq: 0,
         settled: false,
     };
     assert_eq!(op, claim);
     let (revision, seq) = (1, 0);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     machine.on(now, Input::Answer { number, answer });
     assert_eq!(machine.role(), Role::CatchingUp);
     let goes_on = true;
@@ -107,7 +107,7 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
     assert_eq!(machine.on(later + TTL - ms(1), Input::Wake), []);
     let (_, op) = sent(&machine.on(later + TTL, Input::Wake));
     let claim = Op::Claim {
-        guard: Guard {
+        guard: RevisionGuard {
             leader: 5,
             alive: 7,
         },
@@ -125,7 +125,7 @@ fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
     let mut before = led("a", 5, 6);
     before.leader.as_mut().unwrap().id = "a-0".to_owned();
-    let answer = Answer::Is(before);
+    let answer = EtcdAnswer::Is(before);
     let (_, op) = sent(&machine.on(now, Input::Answer { number, answer }));
     assert!(matches!(op, Op::Claim { .. }), "{op:?}");
 }
@@ -141,7 +141,7 @@ fn a_computer_of_the_same_name_at_another_address_is_not_deposed_while_it_lives(
         leader.uri = "http://10.0.0.9:11311/".to_owned();
         view
     };
-    let answer = Answer::Is(namesake(6));
+    let answer = EtcdAnswer::Is(namesake(6));
     let actions = machine.on(now, Input::Answer { number, answer });
     assert_eq!(machine.role(), Role::Following, "{actions:?}");
     for beat in 1..9 {
@@ -186,7 +186,7 @@ fn writes_travel_in_one_transaction_after_the_one_that_is_under_way() {
     assert_eq!(machine.on(now, Input::Recorded(2)), []);
     assert_eq!(machine.on(now, Input::Recorded(3)), []);
     let (revision, seq) = (2, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(now, Input::Answer { number, answer });
     assert_eq!(actions[0], Action::Acknowledge(1));
     let (_, op) = sent(&actions);
@@ -207,13 +207,13 @@ fn writes_travel_in_one_transaction_after_the_one_that_is_under_way() {
 fn an_answer_that_was_lost_is_seen_in_the_keys() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, first) = sent(&machine.on(now, Input::Recorded(1)));
-    let answer = Answer::Silence;
+    let answer = EtcdAnswer::Silence;
     assert_eq!(machine.on(now, Input::Answer { number, answer }), []);
     let (number, again) = sent(&machine.on(now + RETRY, Input::Wake));
     assert_eq!(again, first);
     let mut made = led("a", 1, 2);
     made.alive.as_mut().unwrap().seq = 1;
-    let answer = Answer::Is(made);
+    let answer = EtcdAnswer::Is(made);
     let actions = machine.on(now + RETRY, Input::Answer { number, answer });
     assert_eq!(actions, [Action::Acknowledge(1)]);
 }
@@ -223,7 +223,7 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
     for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
         let (mut machine, now) = leading(alone);
         sent(&machine.on(now, Input::Recorded(1)));
-        // Nobody else can lead before that.
+        // No other computer can lead before that.
         assert!(machine.may_have_master());
         assert_eq!(machine.deadline(), Some(now + TTL));
         machine.on(now + TTL, Input::Wake);
@@ -235,7 +235,6 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
         let actions = machine.on(lapses, Input::Wake);
         assert_eq!(actions[0], Action::Become(Role::Alone));
         assert_eq!(actions.contains(&Action::Acknowledge(1)), answers);
-        assert_eq!(machine.takes_writes(), answers);
         // Another one leads: what was answered is handed back.
         let actions = machine.on(lapses, Input::View(led("b", 5, 6)));
         let hands_back = Action::Yield {
@@ -254,20 +253,56 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let late = now + TTL + PATIENCE;
     wake_until(&mut machine, late);
     assert_eq!(machine.role(), Role::Alone);
-    let answer = Answer::Silence;
+    let answer = EtcdAnswer::Silence;
     machine.on(late, Input::Answer { number, answer });
     let (number, _) = sent(&machine.on(late + RETRY, Input::Wake));
     let (revision, seq) = (2, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(late + RETRY, Input::Answer { number, answer });
     // What was made is older than the time to live: only the next one tells.
     let (number, _) = sent(&actions);
     assert_eq!(machine.role(), Role::Alone);
     let (revision, seq) = (3, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(late + ms(200), Input::Answer { number, answer });
     assert_eq!(actions, [Action::Become(Role::Leading)]);
     assert!(machine.may_have_master());
+}
+
+/// With `--alone refuse` it recorded nothing while it was cut off, and starts again after the journal's last record.
+#[test]
+fn a_leader_that_refused_to_serve_alone_does_not_wait_for_records_that_it_gave_up() {
+    let (mut machine, now) = leading(WhenAlone::Refuse);
+    let (number, _) = sent(&machine.on(now, Input::Recorded(3)));
+    let late = now + TTL + PATIENCE;
+    wake_until(&mut machine, late);
+    assert_eq!(machine.role(), Role::Alone);
+    // The first record is in the journal.
+    let (revision, seq) = (2, 1);
+    let answer = EtcdAnswer::Applied { revision, seq };
+    let actions = machine.on(late, Input::Answer { number, answer });
+    let (number, _) = sent(&actions);
+    let (revision, seq) = (3, 1);
+    let answer = EtcdAnswer::Applied { revision, seq };
+    let actions = machine.on(late + ms(200), Input::Answer { number, answer });
+    let hands_back = Action::Yield {
+        committed: 1,
+        acknowledged: 1,
+    };
+    assert_eq!(actions, [hands_back, Action::Become(Role::Leading)]);
+    assert_eq!(machine.deadline(), Some(late + TTL / BEATS));
+    // It can hand over.
+    let (_, op) = sent(&machine.on(late + ms(200), Input::HandOver(String::new())));
+    assert!(
+        matches!(
+            op,
+            Op::Beat {
+                released: Some(_),
+                ..
+            }
+        ),
+        "{op:?}"
+    );
 }
 
 #[test]
@@ -275,7 +310,7 @@ fn a_leader_that_etcd_answers_late_goes_on_as_if_nothing_had_been() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
     let (revision, seq) = (2, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(now + TTL + ms(200), Input::Answer { number, answer });
     assert_eq!(actions[0], Action::Acknowledge(1));
     assert_eq!(machine.role(), Role::Leading);
@@ -308,7 +343,7 @@ fn a_leader_that_stood_still_asks_etcd_before_it_is_alone() {
         lease.is_some_and(|until| until <= now + long),
         "it may not act"
     );
-    let answer = Answer::Is(led("b", 5, 6));
+    let answer = EtcdAnswer::Is(led("b", 5, 6));
     let actions = machine.on(now + long, Input::Answer { number, answer });
     assert!(actions.contains(&Action::Become(Role::Following)));
     assert_eq!(machine.lease(now + long), Some(now + long));
@@ -329,7 +364,6 @@ fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
     assert_eq!(machine.role(), Role::Following);
     let actions = machine.on(long, Input::Peer(false));
     assert_eq!(actions[0], Action::Become(Role::Alone));
-    assert!(machine.takes_writes());
     machine.on(long, Input::Recorded(11));
     let actions = machine.on(long + TTL, Input::Peer(true));
     let hands_back = Action::Yield {
@@ -359,14 +393,13 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
     machine.on(now, Input::HandOver(String::new()));
-    assert!(!machine.takes_writes());
     let (revision, seq) = (2, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let (number, op) = sent(&machine.on(now, Input::Answer { number, answer }));
     let released = Some(String::new());
     assert!(matches!(op, Op::Beat { released: of, .. } if of == released));
     let (revision, seq) = (3, 1);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(now, Input::Answer { number, answer });
     assert_eq!(actions[0], Action::Become(Role::Following));
     assert_eq!(actions.last(), Some(&Action::Released));
@@ -379,13 +412,13 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
 fn claimed() -> (Machine, Instant) {
     let (mut machine, now) = machine(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
-    let answer = Answer::Is(led("b", 5, 6));
+    let answer = EtcdAnswer::Is(led("b", 5, 6));
     machine.on(now, Input::Answer { number, answer });
     machine.on(now, Input::Followed(10));
     let (number, op) = sent(&machine.on(now + TTL, Input::Wake));
     assert!(matches!(op, Op::Claim { settled: false, .. }), "{op:?}");
     let (revision, seq) = (7, 10);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     machine.on(now + TTL, Input::Answer { number, answer });
     (machine, now + TTL)
 }
@@ -399,7 +432,10 @@ fn undecided(name: &str, term: u64, revision: u64) -> View {
 
 #[test]
 fn who_claims_leads_when_it_is_decided_whether_the_session_goes_on_and_not_before() {
-    for (goes_on, session) in [(true, Session::GoesOn), (false, Session::Over(10))] {
+    for (goes_on, session) in [
+        (true, JournalSession::GoesOn),
+        (false, JournalSession::Over(10)),
+    ] {
         let (mut machine, now) = claimed();
         // The watch shows its own claim; and it has all that there is.
         let mut view = undecided("a", 7, 7);
@@ -424,9 +460,9 @@ fn a_session_that_is_over_ends_once() {
     // The empty state is the next record.
     assert!(matches!(op, Op::Beat { settled: true, .. }), "{op:?}");
     let (revision, seq) = (8, 11);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     machine.on(now, Input::Answer { number, answer });
-    assert_eq!(machine.session(), Session::GoesOn);
+    assert_eq!(machine.session(), JournalSession::GoesOn);
     // Another one leads for a while.
     let mut view = led("b", 9, 10);
     view.alive.as_mut().unwrap().seq = 11;
@@ -435,10 +471,10 @@ fn a_session_that_is_over_ends_once() {
     let (number, op) = sent(&machine.on(now + TTL, Input::Wake));
     assert!(matches!(op, Op::Claim { settled: true, .. }), "{op:?}");
     let (revision, seq) = (11, 11);
-    let answer = Answer::Applied { revision, seq };
+    let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(now + TTL, Input::Answer { number, answer });
     assert_eq!(actions.last(), Some(&Action::Become(Role::Leading)));
-    assert_eq!(machine.session(), Session::GoesOn);
+    assert_eq!(machine.session(), JournalSession::GoesOn);
 }
 
 #[test]
@@ -448,11 +484,11 @@ fn what_was_not_decided_before_another_one_leads_is_decided_by_that_one() {
     machine.on(now, Input::Decided { seq, goes_on });
     // Deposed before the empty state was in the journal, by one that has not decided either.
     machine.on(now, Input::View(undecided("b", 8, 8)));
-    assert_eq!(machine.session(), Session::Over(10));
+    assert_eq!(machine.session(), JournalSession::Over(10));
     machine.on(now, Input::View(undecided("b", 8, 9)));
-    assert_eq!(machine.session(), Session::Over(10));
+    assert_eq!(machine.session(), JournalSession::Over(10));
     machine.on(now, Input::View(led("b", 8, 10)));
-    assert_eq!(machine.session(), Session::GoesOn);
+    assert_eq!(machine.session(), JournalSession::GoesOn);
 }
 
 #[test]
@@ -460,15 +496,15 @@ fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
     let (mut machine, now) = machine(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
     // Of yesterday.
-    let answer = Answer::Is(led("b", 5, 6));
+    let answer = EtcdAnswer::Is(led("b", 5, 6));
     machine.on(now, Input::Answer { number, answer });
     machine.on(now, Input::View(undecided("c", 7, 7)));
     machine.on(now, Input::View(undecided("c", 7, 8)));
-    assert_eq!(machine.session(), Session::Unknown);
+    assert_eq!(machine.session(), JournalSession::Unknown);
     machine.on(now, Input::View(led("c", 7, 9)));
-    assert_eq!(machine.session(), Session::GoesOn);
+    assert_eq!(machine.session(), JournalSession::GoesOn);
     // A decision that comes late changes nothing.
     let (seq, goes_on) = (10, false);
     machine.on(now, Input::Decided { seq, goes_on });
-    assert_eq!(machine.session(), Session::GoesOn);
+    assert_eq!(machine.session(), JournalSession::GoesOn);
 }

@@ -1,6 +1,6 @@
 //! Inputs and actions of the machine.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -9,14 +9,14 @@ use serde::{Deserialize, Serialize};
 pub enum Commit {
     /// When a majority of etcd has it.
     Always,
-    /// At once, while nobody else can lead; it is committed within 200 ms.
+    /// At once, while no other computer can lead. It is committed within 200 ms.
     Interval,
 }
 
 /// What a computer does with writes while it is cut off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WhenAlone {
-    /// It answers them, and sends them to the leader when it can.
+    /// It answers them, and sends them to the leader later.
     Serve,
     /// It lets them wait.
     Refuse,
@@ -24,38 +24,38 @@ pub enum WhenAlone {
 
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// This computer. No other one has this name.
+    /// The unique name of this computer.
     pub name: String,
-    /// This process. No other one, earlier or later, has this id.
+    /// The unique id of this process.
     pub id: String,
-    /// Where nodes and other computers find it.
+    /// The address for nodes and other computers.
     pub uri: String,
-    /// The kernel's id of this boot, by which copies of one disk differ; empty if the address is an IP address,
-    /// since no two computers can have the same one.
+    /// The kernel's id of this boot, which differs between copies of one disk. Empty if the address is an IP address,
+    /// which is unique anyway.
     pub boot: String,
-    /// Of rosrescue.
+    /// The version of rosrescue.
     pub version: String,
-    /// How long the leader may be silent.
+    /// The time to live: how long the leader may be silent.
     pub ttl: Duration,
     pub commit: Commit,
     pub alone: WhenAlone,
 }
 
 impl Settings {
-    /// Whether a process of this computer, the present or an earlier one, has this name, address and boot.
+    /// Whether this name, address and boot belong to a process of this computer, present or earlier.
     pub fn is_of_this_computer(&self, name: &str, uri: &str, boot: &str) -> bool {
         let same_boot = boot.is_empty() || self.boot.is_empty() || self.boot == boot;
         self.name == name && self.uri == uri && same_boot
     }
 }
 
-/// What the key `leader` holds.
+/// The content of the key `leader`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Leader {
     /// The revision of the key.
     pub term: u64,
     pub name: String,
-    /// The process, and which claim of it this was.
+    /// The id of the process, and the number of its claim.
     pub id: String,
     pub claim: u64,
     pub uri: String,
@@ -63,18 +63,18 @@ pub struct Leader {
     pub version: String,
 }
 
-/// What the key `alive` holds.
+/// The content of the key `alive`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Alive {
     /// The revision of the key.
     pub revision: u64,
-    /// Which transaction of the leader wrote it.
+    /// The number of the leader's transaction that wrote it.
     pub beat: u64,
     /// The journal's last record.
     pub seq: u64,
-    /// The leader has given up leading in favour of this computer, or of any if it is empty.
+    /// Set if the leader has given up leadership: the computer that should lead next, or empty for any.
     pub released: Option<String>,
-    /// The session goes on that the journal holds. If not, that is still to be decided.
+    /// Whether the journal's session is known to continue. If not, that must still be decided.
     pub settled: bool,
 }
 
@@ -88,8 +88,8 @@ pub struct View {
 
 impl View {
     /// The revisions that a transaction expects.
-    pub fn guard(&self) -> Guard {
-        Guard {
+    pub fn guard(&self) -> RevisionGuard {
+        RevisionGuard {
             leader: self.leader.as_ref().map_or(0, |leader| leader.term),
             alive: self.alive.as_ref().map_or(0, |alive| alive.revision),
         }
@@ -101,29 +101,29 @@ impl View {
     }
 }
 
-/// A transaction succeeds only if both keys have these revisions; 0: there is no such key.
+/// The revisions that both keys must have for a transaction to succeed. 0 stands for a missing key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub struct Guard {
+pub struct RevisionGuard {
     pub leader: u64,
     pub alive: u64,
 }
 
-/// A request to etcd. One is under way at a time.
+/// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read both keys; not from a member that may be behind.
+    /// Read both keys, not from a member that may be behind.
     Read,
     /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
     Claim {
-        guard: Guard,
+        guard: RevisionGuard,
         claim: u64,
         seq: u64,
         settled: bool,
     },
-    /// Write `alive`, and the records after the last beat up to `seq`, or up to an earlier one if they are too
-    /// many. One that is sent again may have other records: at most one of them is made.
+    /// Write `alive`, and the records after the last beat up to `seq`, or fewer if they are too many. A repeated beat
+    /// may carry other records; at most one of them succeeds.
     Beat {
-        guard: Guard,
+        guard: RevisionGuard,
         beat: u64,
         seq: u64,
         released: Option<String>,
@@ -131,38 +131,40 @@ pub enum Op {
     },
 }
 
-/// What etcd has answered.
+/// The answer of etcd.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Answer {
-    /// The transaction was made, at this revision; the journal ends with this record.
+pub enum EtcdAnswer {
+    /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The transaction was not made, or it was a read: this is how the keys are.
+    /// The transaction failed, or it was a read. These are the keys.
     Is(View),
-    /// Nobody answered, or nobody could tell; it may have been made, or still be.
+    /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,
 }
 
 /// What happened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Input {
-    /// The mirror holds the journal up to this record, as this computer's checkpoint has it.
+    /// The machine starts. The checkpoint contains the journal up to this record.
     Start(u64),
-    /// To request `number`.
-    Answer { number: u64, answer: Answer },
-    /// The watch shows the keys.
+    /// The answer to request `number`.
+    Answer { number: u64, answer: EtcdAnswer },
+    /// The watch delivers the keys.
     View(View),
-    /// The mirror holds the journal up to this record.
+    /// The mirror contains the journal up to this record.
     Followed(u64),
-    /// Whether the session goes on that the journal holds up to record `seq`. It is needed when this computer
-    /// catches up and [`Machine::session`](super::Machine::session) is unknown.
+    /// Whether the journal's session continues, decided at record `seq`. Needed when this computer catches up and
+    /// [`Machine::session`](super::Machine::session) is unknown.
     Decided { seq: u64, goes_on: bool },
-    /// The ledger holds calls of this computer up to this record, to be committed, or made while alone.
+    /// The ledger has recorded this computer's calls up to this record.
     Recorded(u64),
-    /// Whether the rosrescue of the leader answers this one, and says that it leads.
+    /// Whether the leader's rosrescue answered a probe, and said that it leads.
     Peer(bool),
-    /// Give up leading, in favour of this computer, or of any if it is empty.
+    /// etcd has lost its data and shows `view`. Do not claim before `until`.
+    Lost { view: View, until: Instant },
+    /// Give up leadership to this computer, or to any if the name is empty.
     HandOver(String),
-    /// The time of [`Machine::deadline`](super::Machine::deadline) has come.
+    /// The deadline of [`Machine::deadline`](super::Machine::deadline) has passed.
     Wake,
 }
 
@@ -171,9 +173,9 @@ pub enum Input {
 pub enum Role {
     /// Nothing is known yet.
     Joining,
-    /// Calls go to the leader. While there is none, reads are answered by the mirror and writes wait.
+    /// Calls go to the leader. While there is none, the mirror answers reads and writes wait.
     Following,
-    /// It has claimed with success, reads the rest of the journal, and decides whether its session goes on.
+    /// Its claim has succeeded. It reads the rest of the journal, and decides whether its session continues.
     CatchingUp,
     Leading,
     /// Cut off from the majority, or from the leader.
@@ -181,7 +183,7 @@ pub enum Role {
 }
 
 impl Role {
-    /// All of them.
+    /// All roles.
     pub const ALL: [Self; 5] = [
         Self::Joining,
         Self::Following,
@@ -190,7 +192,7 @@ impl Role {
         Self::Alone,
     ];
 
-    /// As in JSON and in metrics.
+    /// The role's name in JSON and in metrics.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Joining => "joining",
@@ -202,27 +204,26 @@ impl Role {
     }
 }
 
-/// What the shell must do, in order.
+/// An action for the shell. Actions must be carried out in order.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Action {
-    /// Send a request; its answer is [`Input::Answer`] with this number, after [`super::ANSWER_LIMIT`] at the
-    /// latest.
+    /// Send a request. Its answer is [`Input::Answer`] with this number, within [`super::ANSWER_LIMIT`].
     Send {
         number: u64,
         op: Op,
     },
-    /// Bring the mirror to this record of the journal, and say so by [`Input::Followed`].
+    /// Bring the mirror up to this record of the journal, then pass in [`Input::Followed`].
     CatchUp(u64),
     Become(Role),
     /// Answer the calls up to this record.
     Acknowledge(u64),
-    /// Calls of this computer after `committed` are in no journal. Those up to `acknowledged` were answered:
-    /// they are merged with what the journal holds by now, and sent to whoever leads. The others are calls
-    /// that still wait. The mirror must be made anew from the journal.
+    /// This computer's calls after `committed` are not in the journal. Those up to `acknowledged` were answered, so
+    /// they are merged with the journal and sent to the next leader. The others still wait. The mirror must be
+    /// rebuilt from the journal.
     Yield {
         committed: u64,
         acknowledged: u64,
     },
-    /// Another one may lead now.
+    /// Another computer may lead now.
     Released,
 }

@@ -1,14 +1,15 @@
-//! The writes of a time alone: of each subject as many as make its last state.
+//! The writes of a period of being cut off, reduced to those that make the last state of each subject.
 
 use std::collections::{BTreeMap, HashMap};
 
 use super::changes::param_of;
 use crate::{
+    cluster::mutant::Mutant,
     master::{Method, Request, names},
     xmlrpc::{self, Value},
 };
 
-/// What a registration or unregistration is about.
+/// The subject of a registration or unregistration.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Place {
     what: &'static str,
@@ -16,26 +17,26 @@ struct Place {
     caller: String,
 }
 
-/// The last registration at a place, with its address, and the unregistrations after it.
+/// The last registration of a subject, with its address, and the unregistrations after it.
 #[derive(Clone, Debug, Default)]
 struct Registered {
     registration: Option<(u64, String)>,
     unregistrations: Vec<(u64, String)>,
 }
 
-/// Writes to be sent, in order. Those that later ones have made superfluous are left out.
+/// Writes to be sent, in order, without those that later ones made superfluous.
 #[derive(Clone, Debug, Default)]
-pub struct Pending {
+pub struct WritesToSend {
     calls: BTreeMap<u64, Request>,
     last: u64,
     /// Parameters by path, and whether they are set or deleted.
     params: BTreeMap<(String, bool), u64>,
     registered: HashMap<Place, Registered>,
-    /// Other calls, as they are encoded.
+    /// Other calls, in encoded form.
     others: HashMap<String, u64>,
 }
 
-impl Pending {
+impl WritesToSend {
     /// Adds a write that was answered. The entries of a multicall are writes of their own.
     pub fn add(&mut self, call: &Request) {
         for call in call.calls() {
@@ -53,10 +54,14 @@ impl Pending {
             let mut below: Vec<_> = below.map(|(of, number)| (*number, of.clone())).collect();
             below.sort();
             if !sets {
-                // What is deleted must be there first, with the namespaces that setting it has made.
+                // A deletion needs its parameter and the namespaces that setting it created.
                 let last = below.iter().rposition(|(_, (_, sets))| *sets);
                 last.map(|last| below.remove(last));
             }
+            let below = match Mutant::KeepsEachWrite.lives() {
+                true => Vec::new(),
+                false => below,
+            };
             for (number, of) in below {
                 self.params.remove(&of);
                 self.calls.remove(&number);
@@ -76,7 +81,7 @@ impl Pending {
                 });
             } else {
                 if at.registration.as_ref().is_some_and(|(_, of)| *of != api) {
-                    // Of an earlier process of the node: the master refuses it.
+                    // It belongs to an earlier process of the node, so the master refuses it.
                     return;
                 }
                 let before = at.unregistrations.iter().position(|(_, of)| *of == api);
@@ -96,7 +101,7 @@ impl Pending {
         self.calls.insert(number, call.clone());
     }
 
-    /// In the order in which they were answered.
+    /// The writes in the order in which they were answered.
     pub fn calls(&self) -> impl Iterator<Item = &Request> {
         self.calls.values()
     }
@@ -110,7 +115,7 @@ impl Pending {
     }
 }
 
-/// What `call` is about, at which address, and whether it registers.
+/// The subject and address of `call`, and whether it registers.
 fn place(call: &Request) -> Option<(Place, String, bool)> {
     let (what, name, api, registers) = match call.method() {
         Method::RegisterPublisher => ("publisher", 1, 3, true),
@@ -132,7 +137,7 @@ fn place(call: &Request) -> Option<(Place, String, bool)> {
     Some((place, call.text(api)?.to_owned(), registers))
 }
 
-/// About how many bytes a call takes.
+/// The approximate size of a call in bytes.
 pub fn weight(call: &Request) -> usize {
     call.params().iter().map(Value::size).sum()
 }

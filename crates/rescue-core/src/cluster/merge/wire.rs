@@ -1,4 +1,4 @@
-//! How a computer that was alone asks the leader to make its writes, and what it is answered.
+//! The request by which a computer that was cut off sends its writes to the leader, and its answer.
 
 use std::sync::Arc;
 
@@ -8,17 +8,17 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The method.
+/// The method's name.
 pub const METHOD: &str = "rosrescue/merge";
-/// The method of several calls in one.
+/// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
 
-/// Writes that were answered alone.
+/// A portion of writes that were answered while cut off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all portions of a time alone are sent.
+    /// The name under which all portions of one period are sent.
     pub id: Arc<str>,
-    /// They conflict with nothing that was changed up to this record of the journal.
+    /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,
     pub calls: Vec<Request>,
 }
@@ -34,7 +34,7 @@ impl Ask {
         )
     }
 
-    /// None if `request` is something else.
+    /// Reads a request. `None` if it is another method.
     pub fn read(request: &Request) -> Option<Self> {
         let is_it = matches!(request.method(), Method::Unknown(name) if **name == *METHOD);
         let calls = request.params().get(3).filter(|_| is_it)?;
@@ -47,18 +47,18 @@ impl Ask {
     }
 }
 
-/// What has become of one write.
+/// The outcome of one write.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Outcome {
-    /// It was made, or what it sets is there.
+pub enum WriteOutcome {
+    /// It was made, or its value is already set.
     Holds,
-    /// The master has refused it.
+    /// The master refused it.
     Refused(String),
-    /// Others have changed the same.
+    /// Others have changed the same subject.
     Lost { why: String, present: Option<Value> },
 }
 
-impl From<&Lost> for Outcome {
+impl From<&Lost> for WriteOutcome {
     fn from(lost: &Lost) -> Self {
         Self::Lost {
             why: lost.why.to_string(),
@@ -72,15 +72,15 @@ impl From<&Lost> for Outcome {
 
 /// The leader's answer.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Answer {
-    /// It does not know all that was changed after the record: judge anew.
+pub enum MergeAnswer {
+    /// The leader no longer knows all changes after the record, so the writes must be judged again.
     Again,
-    /// For each write.
-    Done(Vec<Outcome>),
+    /// The outcome of each write.
+    Done(Vec<WriteOutcome>),
 }
 
-impl Answer {
-    /// What has become of writes with these verdicts, when the master has answered those that ran with `reply`.
+impl MergeAnswer {
+    /// The answer for writes with these verdicts, after the master answered those that ran with `reply`.
     pub fn of(verdicts: &[Verdict], reply: &Reply) -> Self {
         let results = match reply {
             Reply::Value(Value::Array(results)) => results.as_slice(),
@@ -88,12 +88,12 @@ impl Answer {
         };
         let mut results = results.iter();
         let outcomes = verdicts.iter().map(|verdict| match verdict {
-            Verdict::Holds => Outcome::Holds,
+            Verdict::Holds => WriteOutcome::Holds,
             Verdict::Lost(lost) => lost.into(),
-            // Without a result it was made: the master could not write the whole answer.
+            // A write without a result was made; the master could not encode the whole answer.
             Verdict::Runs => match results.next().and_then(entry_reply) {
-                Some(reply) if !is_success(&reply) => Outcome::Refused(text(&reply)),
-                _ => Outcome::Holds,
+                Some(reply) if !is_success(&reply) => WriteOutcome::Refused(text(&reply)),
+                _ => WriteOutcome::Holds,
             },
         });
         Self::Done(outcomes.collect())
@@ -111,7 +111,7 @@ impl Answer {
         Reply::Value(vec![code.into(), text.into(), Value::Array(outcomes)].into())
     }
 
-    /// The answer for `count` writes; none if it is no answer to this, as from one that does not know the method.
+    /// Reads the answer for `count` writes. `None` for anything else, such as the answer of an older version.
     pub fn read(reply: &Reply, count: usize) -> Option<Self> {
         let Reply::Value(Value::Array(answer)) = reply else {
             return None;
@@ -127,23 +127,23 @@ impl Answer {
     }
 }
 
-fn value(outcome: &Outcome) -> Value {
+fn value(outcome: &WriteOutcome) -> Value {
     let (code, text, present) = match outcome {
-        Outcome::Holds => (1, "", None),
-        Outcome::Refused(text) => (0, text.as_str(), None),
-        Outcome::Lost { why, present } => (-1, why.as_str(), present.clone()),
+        WriteOutcome::Holds => (1, "", None),
+        WriteOutcome::Refused(text) => (0, text.as_str(), None),
+        WriteOutcome::Lost { why, present } => (-1, why.as_str(), present.clone()),
     };
     let parts = [Value::Int(code), text.into()].into_iter().chain(present);
     Value::Array(parts.collect())
 }
 
-fn outcome(value: &Value) -> Option<Outcome> {
+fn outcome(value: &Value) -> Option<WriteOutcome> {
     let parts = value.as_array()?;
     let text = || Some(parts.get(1)?.as_str()?.to_owned());
     Some(match parts.first()?.as_int()? {
-        1 => Outcome::Holds,
-        0 => Outcome::Refused(text()?),
-        -1 => Outcome::Lost {
+        1 => WriteOutcome::Holds,
+        0 => WriteOutcome::Refused(text()?),
+        -1 => WriteOutcome::Lost {
             why: text()?,
             present: parts.get(2).cloned(),
         },
@@ -151,7 +151,7 @@ fn outcome(value: &Value) -> Option<Outcome> {
     })
 }
 
-/// The words of a refusal.
+/// The text of a refusal.
 fn text(reply: &Reply) -> String {
     match reply {
         Reply::Fault { text, .. } => text.clone(),
@@ -201,28 +201,28 @@ mod tests {
             Value::Array(vec![reply.into()])
         };
         let reply = Reply::Value(vec![result(1, "done"), result(-1, "no")].into());
-        let answer = Answer::of(&verdicts, &reply);
-        let expected = Answer::Done(vec![
-            Outcome::Holds,
-            Outcome::Lost {
+        let answer = MergeAnswer::of(&verdicts, &reply);
+        let expected = MergeAnswer::Done(vec![
+            WriteOutcome::Holds,
+            WriteOutcome::Lost {
                 why: "the parameter `/a` was changed meanwhile".to_owned(),
                 present: Some(Value::Int(2)),
             },
-            Outcome::Holds,
-            Outcome::Refused("no".to_owned()),
+            WriteOutcome::Holds,
+            WriteOutcome::Refused("no".to_owned()),
         ]);
         assert_eq!(answer, expected);
-        assert_eq!(Answer::read(&answer.to_reply(), 4), Some(expected));
-        assert_eq!(Answer::read(&answer.to_reply(), 3), None);
-        let again = Answer::Again.to_reply();
-        assert_eq!(Answer::read(&again, 4), Some(Answer::Again));
+        assert_eq!(MergeAnswer::read(&answer.to_reply(), 4), Some(expected));
+        assert_eq!(MergeAnswer::read(&answer.to_reply(), 3), None);
+        let again = MergeAnswer::Again.to_reply();
+        assert_eq!(MergeAnswer::read(&again, 4), Some(MergeAnswer::Again));
     }
 
     #[test]
     fn who_does_not_know_the_method_has_not_answered() {
         let (code, text) = (1, "method is not supported".to_owned());
-        assert_eq!(Answer::read(&Reply::Fault { code, text }, 1), None);
+        assert_eq!(MergeAnswer::read(&Reply::Fault { code, text }, 1), None);
         let reply: Vec<Value> = vec![(-1).into(), "what?".into(), 0.into()];
-        assert_eq!(Answer::read(&Reply::Value(reply.into()), 1), None);
+        assert_eq!(MergeAnswer::read(&Reply::Value(reply.into()), 1), None);
     }
 }

@@ -1,29 +1,107 @@
-//! A computer of the simulation: the machine, and a shell that is as simple as it can be.
+//! A computer of the simulation: the member of production, and what the shell holds for it.
 
 use std::time::{Duration, Instant};
 
-use super::super::machine::{Commit, Machine, Role, Settings, WhenAlone};
-use super::etcd::{Write, name};
+use super::world::Plan;
+use crate::{
+    cluster::{
+        cut_off::CutOff,
+        journal::Keys,
+        machine::Settings,
+        member::{Member, Own},
+        merge::wire,
+        sharing::{Sharing, Source},
+        standing::{Place, Standing},
+    },
+    master::{Master, Notice, Request},
+};
 
-/// Parameters that are written.
-pub(super) const KEYS: usize = 6;
-/// Most records of a beat. So small that beats are full now and then.
-pub(super) const RECORDS_MAX: u64 = 20;
-
-/// For each parameter, the call that wrote it last, and one more.
-pub(super) type State = [usize; KEYS];
-
-/// A record of this computer that may be in no journal.
+/// A call that was run here, and whose answer waits.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Own {
-    pub(super) write: Write,
-    /// Who waits for the answer.
+pub(super) struct Unanswered {
+    pub(super) seq: u64,
+    /// It has changed something.
+    pub(super) recorded: bool,
+    pub(super) call: usize,
+    /// The computer whose node made it.
     pub(super) origin: usize,
 }
 
+/// A computer, its process, and the number of what it asks.
+pub(super) type Asker = (usize, u64, u64);
+
+/// The mirror, and what of it is given to the others.
+#[derive(Debug, Default)]
+pub(super) struct Ledger {
+    pub(super) mirror: Master,
+    pub(super) sharing: Option<Sharing>,
+    pub(super) unanswered: Vec<Unanswered>,
+    /// Merged portions that wait for the journal up to a record: who has asked, and the answer.
+    pub(super) merges: Vec<(u64, Asker, wire::MergeAnswer)>,
+    /// Counts the times that calls are recorded here.
+    pub(super) leadership: u64,
+    pub(super) agreed: u64,
+    pub(super) lease: Option<Instant>,
+}
+
+impl Ledger {
+    pub(super) fn has_lease(&self, now: Instant) -> bool {
+        self.lease.is_none_or(|until| now < until)
+    }
+
+    /// Runs a call, and records it if it changes anything. Returns the number of the record that its answer waits for,
+    /// and what nodes are notified of; none if calls are recorded elsewhere.
+    pub(super) fn run(
+        &mut self,
+        call: &Request,
+        source: &Source,
+    ) -> Option<(u64, bool, Vec<Notice>)> {
+        let sharing = self.sharing.as_mut()?;
+        let changes = self.mirror.would_change(call);
+        let mut notices = Vec::new();
+        self.mirror.apply_telling(call, &mut notices);
+        if changes {
+            sharing.record(call, source);
+        }
+        Some((sharing.last(), changes, notices))
+    }
+
+    /// Nothing is recorded any more. Returns the portions that are not answered.
+    pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
+        self.sharing = None;
+        self.leadership += 1;
+        self.agreed = 0;
+        self.unanswered.clear();
+        std::mem::take(&mut self.merges)
+    }
+
+    pub(super) fn lead(&mut self, seq: u64, held: &Master, state: Option<Master>) {
+        if let Some(state) = state {
+            self.mirror = state;
+        }
+        let mut sharing = Sharing::after(seq);
+        if self.mirror != *held {
+            sharing.record_state(&self.mirror);
+        }
+        self.sharing = Some(sharing);
+        self.agreed = seq;
+    }
+}
+
+/// What is on the disk.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Disk {
+    pub(super) own: Own,
+    pub(super) kept: Option<(Master, Vec<Request>)>,
+}
+
+#[derive(Debug)]
 pub(super) struct Computer {
-    pub(super) machine: Machine,
+    pub(super) name: String,
+    pub(super) member: Member,
     pub(super) up: bool,
+    /// It has ended because of another computer of its name.
+    pub(super) refused: bool,
     /// Counts its processes.
     pub(super) life: u64,
     /// It does nothing before this moment.
@@ -35,58 +113,116 @@ pub(super) struct Computer {
     clock: Instant,
     /// The next wake-up; earlier ones are void.
     pub(super) wake: u64,
-    // On the disk, as the checkpoint is:
-    /// The state of the journal's first `followed` records,
-    pub(super) base: State,
-    pub(super) followed: u64,
-    /// records after those,
-    pub(super) own: Vec<Own>,
-    /// of which so many were answered.
-    pub(super) answered: usize,
-    /// Answered calls that are in no journal, and the state when they began.
-    pub(super) pending: Vec<Write>,
-    pub(super) cut_off: State,
-    // In memory:
-    /// Calls of its nodes that wait.
-    pub(super) waiting: Vec<Write>,
+    pub(super) ledger: Ledger,
+    pub(super) disk: Disk,
+    /// As the disk was synced last.
+    pub(super) synced: Disk,
+    pub(super) synced_at: u64,
+    /// The number of its master's process.
+    pub(super) master: Option<u64>,
+    pub(super) own_only: bool,
+    /// How often it was cut off since it owed nothing.
+    pub(super) times_alone: usize,
+    /// How much of the journal it held when it was cut off, by its number and in the log.
+    pub(super) cut: (u64, usize),
+    pub(super) standing: Standing,
+    /// Calls of its nodes that wait, and until when no answer to them is missed.
+    pub(super) waiting: Vec<(usize, u64)>,
+    /// The furthest place that a leader's answer told of.
+    pub(super) told: Place,
+    /// Whether there is a watch, its number, and what it has shown.
+    pub(super) watching: bool,
     pub(super) watch: u64,
     pub(super) watch_at: u64,
-    pub(super) role: Role,
+    pub(super) watched: (u64, u64),
+}
+
+fn member(name: &str, index: usize, life: u64, plan: &Plan, disk: &Disk) -> Member {
+    let settings = Settings {
+        name: name.to_owned(),
+        id: format!("{index} {life}"),
+        uri: uri(index),
+        boot: String::new(),
+        version: String::new(),
+        ttl: plan.ttl,
+        commit: plan.commit,
+        alone: plan.alone,
+    };
+    let left = match &disk.kept {
+        Some((base, calls)) => CutOff::left(base.clone(), calls.iter().cloned()),
+        None => CutOff::default(),
+    };
+    let id = settings.id.clone();
+    Member::new(settings, Keys::new("robot"), disk.own.clone(), left, id)
+}
+
+pub(super) fn uri(index: usize) -> String {
+    format!("http://computer{index}:11311/")
 }
 
 impl Computer {
-    pub(super) fn new(index: usize, settings: &(Commit, WhenAlone, Duration), drift: i64) -> Self {
+    pub(super) fn new(index: usize, plan: &Plan, drift: i64) -> Self {
+        let name = match plan.twins && index == 1 {
+            true => "computer0".to_owned(),
+            false => format!("computer{index}"),
+        };
+        let disk = Disk::default();
         Self {
-            machine: machine(index, 0, settings),
+            member: member(&name, index, 0, plan, &disk),
+            name,
             up: true,
+            refused: false,
             life: 0,
             hangs_until: 0,
             undisturbed_since: 0,
             drift,
-            clock: Instant::now(),
+            clock: Instant::now() + Duration::from_secs(1),
             wake: 0,
-            base: [0; KEYS],
-            followed: 0,
-            own: Vec::new(),
-            answered: 0,
-            pending: Vec::new(),
-            cut_off: [0; KEYS],
+            ledger: Ledger::default(),
+            synced: disk.clone(),
+            synced_at: 0,
+            disk,
+            master: None,
+            own_only: false,
+            times_alone: 0,
+            cut: (0, 0),
+            standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
+            told: Place::default(),
+            watching: false,
             watch: 0,
             watch_at: 0,
-            role: Role::Joining,
+            watched: (0, 0),
         }
     }
 
-    /// Starts it anew, after its end. What was on its way in its memory is lost, what was answered is not.
-    pub(super) fn start(&mut self, index: usize, settings: &(Commit, WhenAlone, Duration)) {
+    /// Starts it anew, after its end. What was in its memory is lost.
+    pub(super) fn start(&mut self, index: usize, plan: &Plan) {
         self.life += 1;
         self.up = true;
         self.hangs_until = 0;
-        self.machine = machine(index, self.life, settings);
-        self.role = Role::Joining;
+        self.disk.own.restored = true;
+        let own = &self.disk.own;
+        self.told = Place {
+            seq: 1,
+            ..Place::default()
+        };
+        self.ledger = Ledger {
+            mirror: own.state.clone(),
+            leadership: self.ledger.leadership + 1,
+            ..Ledger::default()
+        };
+        self.member = member(&self.name, index, self.life, plan, &self.disk);
+        (self.master, self.own_only, self.watching) = (None, false, false);
+        self.watch += 1;
+        self.standing = Standing::Nobody { known: true };
         self.waiting.clear();
-        self.hand_back(self.answered);
+    }
+
+    /// An answer of a leader tells of a place.
+    pub(super) fn tell_of(&mut self, place: Place) {
+        let epoch = self.member.place().epoch;
+        self.told = self.told.max(Place { epoch, ..place });
     }
 
     /// Its clock at a moment of the world, in microseconds.
@@ -98,53 +234,17 @@ impl Computer {
 
     /// The first moment of the world at which its clock shows `local`.
     pub(super) fn moment(&self, local: Instant) -> u64 {
-        let local = local.duration_since(self.clock).as_nanos() as i128;
+        let local = local.saturating_duration_since(self.clock).as_nanos() as i128;
         let at = local * 1000 / i128::from(1_000_000 + self.drift) + 1;
         u64::try_from(at).unwrap()
     }
 
-    /// The mirror: the journal, and what is not in it yet.
-    pub(super) fn state(&self, key_of: impl Fn(Write) -> usize) -> State {
-        let mut state = self.base;
-        for own in &self.own {
-            state[key_of(own.write)] = own.write + 1;
+    /// What the checkpoint holds now.
+    pub(super) fn write_disk(&mut self) {
+        let own = &mut self.disk.own;
+        own.state = self.ledger.mirror.clone();
+        if let Some(sharing) = &self.ledger.sharing {
+            own.seq = sharing.last();
         }
-        state
     }
-
-    /// The journal holds all up to `seq`, and this computer does, too.
-    pub(super) fn follow(&mut self, journal: &[Write], seq: u64, key_of: impl Fn(Write) -> usize) {
-        for write in journal
-            .iter()
-            .take(seq as usize)
-            .skip(self.followed as usize)
-        {
-            self.base[key_of(*write)] = write + 1;
-        }
-        self.followed = self.followed.max(seq);
-    }
-
-    /// Of the records after the journal's, `answered` become pending writes; the others wait again.
-    pub(super) fn hand_back(&mut self, answered: usize) {
-        if answered > 0 && self.pending.is_empty() {
-            self.cut_off = self.base;
-        }
-        let own = std::mem::take(&mut self.own);
-        self.pending
-            .extend(own.iter().take(answered).map(|own| own.write));
-        self.answered = 0;
-    }
-}
-
-fn machine(index: usize, life: u64, settings: &(Commit, WhenAlone, Duration)) -> Machine {
-    Machine::new(Settings {
-        name: name(index),
-        id: format!("{index} {life}"),
-        uri: String::new(),
-        boot: String::new(),
-        version: String::new(),
-        ttl: settings.2,
-        commit: settings.0,
-        alone: settings.1,
-    })
 }

@@ -1,50 +1,155 @@
-//! A model of etcd: both keys and the journal. Transactions are linearizable; what reaches it when, and what
-//! of its answers arrives, is the world's affair.
+//! A model of etcd: both keys, the journal, and values beside. Transactions are linearizable; what reaches it when,
+//! and what of its answers arrives, is the world's affair.
 
-use super::super::machine::{Alive, Answer, Guard, Leader, Op, View};
+use std::collections::BTreeMap;
 
-/// A call that writes, and what becomes of it.
-pub(super) type Write = usize;
+use super::history::value_of;
+use crate::{
+    checkpoint::format::{self, Record, RecordContent as JournalEntry},
+    cluster::{
+        journal::{self, Keys, Manifest, Progress, Put},
+        machine::{Alive, EtcdAnswer, Leader, Op, Settings, View},
+        member::{Entry, Heard, Read, Said},
+    },
+    master::{Displaced, Master, Request},
+};
 
-/// A request as it travels: the records of a beat are in it.
+/// A request as it travels.
 #[derive(Clone, Debug)]
-pub(super) struct Request {
+pub(super) struct Sent {
     pub(super) from: usize,
     /// The process that sent it.
     pub(super) life: u64,
     pub(super) number: u64,
+    pub(super) settings: Settings,
     pub(super) op: Op,
-    pub(super) records: Vec<Write>,
+    pub(super) entry: Option<Put>,
+    pub(super) parts: Vec<Put>,
     /// When its sender gives up.
     pub(super) until: u64,
 }
 
-#[derive(Debug, Default)]
+/// What an entry of the journal holds.
+#[derive(Clone, Debug)]
+pub(super) enum Held {
+    Records(Vec<Record>),
+    State(Box<Master>),
+}
+
+#[derive(Debug)]
 pub(super) struct Etcd {
+    pub(super) keys: Keys,
     view: View,
-    /// The journal. Record 1 is the first.
-    pub(super) journal: Vec<Write>,
-    /// The names of those who have led, in order.
-    pub(super) reigns: Vec<usize>,
+    /// By the last record of each.
+    entries: BTreeMap<u64, (Held, usize)>,
+    snapshot: Option<(u64, Master, Vec<Displaced>)>,
+    /// What the journal leads to.
+    pub(super) state: Master,
+    values: BTreeMap<String, Vec<u8>>,
+    members: BTreeMap<String, (Said, u64)>,
+    /// The names of those who have claimed, in order.
+    pub(super) claims: Vec<usize>,
+    /// All that was ever added, and when.
+    pub(super) log: Vec<(u64, Held)>,
+    pub(super) now: u64,
+    /// All data was lost once.
+    pub(super) lost: bool,
 }
 
 impl Etcd {
-    pub(super) fn view(&self) -> View {
-        self.view.clone()
+    pub(super) fn new() -> Self {
+        Self {
+            keys: Keys::new("robot"),
+            view: View::default(),
+            entries: BTreeMap::new(),
+            snapshot: None,
+            state: Master::default(),
+            values: BTreeMap::new(),
+            members: BTreeMap::new(),
+            claims: Vec::new(),
+            log: Vec::new(),
+            now: 0,
+            lost: false,
+        }
+    }
+
+    /// Whether the journal has this call.
+    pub(super) fn holds(&self, call: &Request) -> bool {
+        self.log.iter().rev().any(|(_, held)| match held {
+            Held::Records(records) => records.iter().any(|record| match &record.entry {
+                JournalEntry::Call { call: of, .. } => of.params == *call.params(),
+                JournalEntry::Session(_) => false,
+            }),
+            Held::State(_) => false,
+        })
+    }
+
+    /// The value of a parameter before this place in the log, which counts a thousand places for each entry.
+    pub(super) fn value_at(&self, number: usize, place: usize) -> Option<i32> {
+        let mut state = Master::default();
+        for (index, (_, held)) in self.log.iter().enumerate() {
+            match held {
+                Held::State(of) if index * 1000 < place => state = (**of).clone(),
+                Held::State(_) => {}
+                Held::Records(records) => {
+                    let first = records.iter().take(place.saturating_sub(index * 1000));
+                    for record in first {
+                        if let JournalEntry::Call { call, .. } = &record.entry {
+                            state.apply_telling(&Request::from(call.clone()), &mut ());
+                        }
+                    }
+                }
+            }
+        }
+        value_of(&state, number)
+    }
+
+    pub(super) fn view(&self) -> &View {
+        &self.view
+    }
+
+    pub(super) fn seq(&self) -> u64 {
+        self.view.seq()
+    }
+
+    /// All data is lost.
+    pub(super) fn lose(&mut self) {
+        *self = Self {
+            claims: std::mem::take(&mut self.claims),
+            log: std::mem::take(&mut self.log),
+            now: self.now,
+            lost: true,
+            ..Self::new()
+        };
+    }
+
+    /// Writes the parts of something large.
+    pub(super) fn put(&mut self, parts: Vec<Put>) {
+        for part in parts {
+            self.view.revision += 1;
+            self.values.insert(part.key, part.value);
+        }
+    }
+
+    /// A computer says how it is.
+    pub(super) fn say(&mut self, name: &str, said: Said) {
+        self.view.revision += 1;
+        let revision = self.view.revision;
+        self.members.insert(name.to_owned(), (said, revision));
     }
 
     /// Makes the transaction, if the keys are as it expects.
-    pub(super) fn run(&mut self, request: &Request) -> Answer {
-        let expected = match &request.op {
-            Op::Read => return Answer::Is(self.view()),
+    pub(super) fn run(&mut self, sent: &Sent) -> EtcdAnswer {
+        let expected = match &sent.op {
+            Op::Read => return EtcdAnswer::Is(self.view.clone()),
             Op::Claim { guard, .. } | Op::Beat { guard, .. } => *guard,
         };
         if self.view.guard() != expected {
-            return Answer::Is(self.view());
+            return EtcdAnswer::Is(self.view.clone());
         }
         self.view.revision += 1;
         let revision = self.view.revision;
-        match &request.op {
+        match &sent.op {
             Op::Read => {}
             Op::Claim {
                 claim,
@@ -52,22 +157,19 @@ impl Etcd {
                 settled,
                 ..
             } => {
-                assert_eq!(
-                    *seq,
-                    self.journal.len() as u64,
-                    "a claim knows the journal's end"
-                );
-                self.reigns.push(request.from);
+                assert_eq!(*seq, self.seq(), "a claim knows the journal's end");
+                self.claims.push(sent.from);
+                let of = sent.settings.clone();
                 self.view.leader = Some(Leader {
                     term: revision,
-                    name: name(request.from),
-                    id: format!("{} {}", request.from, request.life),
+                    name: of.name,
+                    id: of.id,
                     claim: *claim,
-                    uri: String::new(),
-                    boot: String::new(),
-                    version: String::new(),
+                    uri: of.uri,
+                    boot: of.boot,
+                    version: of.version,
                 });
-                self.set_alive(0, None, *settled);
+                self.set_alive(0, *seq, None, *settled);
             }
             Op::Beat {
                 beat,
@@ -75,30 +177,136 @@ impl Etcd {
                 settled,
                 ..
             } => {
-                self.journal.extend(&request.records);
-                self.set_alive(*beat, released.clone(), *settled);
+                let mut seq = self.seq();
+                if let Some(put) = &sent.entry {
+                    seq = self.add(put);
+                }
+                self.set_alive(*beat, seq, released.clone(), *settled);
             }
         }
-        let seq = self.journal.len() as u64;
-        Answer::Applied { revision, seq }
+        let seq = self.seq();
+        EtcdAnswer::Applied { revision, seq }
     }
 
-    fn set_alive(&mut self, beat: u64, released: Option<String>, settled: bool) {
+    fn set_alive(&mut self, beat: u64, seq: u64, released: Option<String>, settled: bool) {
+        let revision = self.view.revision;
         self.view.alive = Some(Alive {
-            revision: self.view.revision,
+            revision,
             beat,
-            seq: self.journal.len() as u64,
+            seq,
             released,
             settled,
         });
     }
 
-    /// A guard that no key has.
-    pub(super) fn changed_since(&self, guard: Guard) -> bool {
-        self.view.guard() != guard
+    /// Adds an entry to the journal. Returns its number.
+    fn add(&mut self, put: &Put) -> u64 {
+        let seq = self.keys.seq_of(&put.key).unwrap();
+        let (held, bytes) = match Manifest::read(&put.value) {
+            None => {
+                let records = journal::records(&put.key, &put.value).unwrap();
+                (Held::Records(records), put.value.len())
+            }
+            Some(manifest) => {
+                let parts = self.values.range(self.keys.parts(&manifest));
+                let parts: Vec<_> = parts.map(|(_, value)| value.clone()).collect();
+                let whole = manifest.assemble(&self.keys, &parts).unwrap();
+                match manifest.is_state() {
+                    false => {
+                        let records = journal::records(&put.key, &whole).unwrap();
+                        (Held::Records(records), whole.len())
+                    }
+                    true => {
+                        let checkpoint = format::decode(&whole).unwrap().checkpoint.unwrap();
+                        let state = Master::from_snapshot(checkpoint.snapshot).unwrap();
+                        (Held::State(Box::new(state)), whole.len())
+                    }
+                }
+            }
+        };
+        match &held {
+            Held::State(state) => self.state = (**state).clone(),
+            Held::Records(records) => {
+                assert_eq!(records[0].seq, self.seq() + 1, "the journal has no gap");
+                for record in records {
+                    if let JournalEntry::Call { call, .. } = &record.entry {
+                        let call = Request::from(call.clone());
+                        self.state.apply_telling(&call, &mut ());
+                    }
+                }
+            }
+        }
+        self.log.push((self.now, held.clone()));
+        self.entries.insert(seq, (held, bytes));
+        seq
     }
-}
 
-pub(super) fn name(computer: usize) -> String {
-    format!("computer{computer}")
+    /// A snapshot replaces the journal.
+    pub(super) fn compact(&mut self) {
+        if self.seq() > 0 {
+            self.view.revision += 1;
+            self.snapshot = Some((self.seq(), self.state.clone(), Vec::new()));
+            self.entries.clear();
+        }
+    }
+
+    /// What follows on `known`.
+    pub(super) fn read(&self, known: Progress) -> Read {
+        let mut read = Read {
+            view: self.view.clone(),
+            state: None,
+            records: Vec::new(),
+            progress: known,
+            heard: self.heard(0),
+        };
+        if let Some((seq, state, displaced)) = &self.snapshot
+            && *seq > known.seq
+        {
+            read.progress = Progress::after_snapshot(*seq, 1000);
+            read.state = Some((state.clone(), displaced.clone()));
+        }
+        for (seq, (held, bytes)) in self.entries.range(read.progress.seq + 1..) {
+            match held {
+                Held::State(state) => {
+                    read.progress.take_state(*seq, *bytes);
+                    read.state = Some(((**state).clone(), Vec::new()));
+                    read.records.clear();
+                }
+                Held::Records(records) => {
+                    let new = read.progress.take(records.clone(), *bytes);
+                    read.records.extend(new.unwrap());
+                }
+            }
+        }
+        read
+    }
+
+    /// The entries of the journal after `seq`, as a watch shows them; none if they are gone.
+    pub(super) fn entries_after(&self, seq: u64, upto: u64) -> Option<Vec<Entry>> {
+        let first = self.snapshot.as_ref().map_or(0, |(seq, ..)| *seq);
+        if seq < first {
+            return None;
+        }
+        let entries = self.entries.range(seq + 1..=upto.max(seq + 1));
+        let entries = entries.map(|(seq, (held, bytes))| match held {
+            Held::State(_) => Entry::Apart(*seq),
+            Held::Records(records) => Entry::Records {
+                records: records.clone(),
+                bytes: *bytes,
+            },
+        });
+        Some(entries.collect())
+    }
+
+    /// What computers have said after a revision.
+    pub(super) fn heard(&self, after: u64) -> Vec<Heard> {
+        let members = self.members.iter();
+        let new = members.filter(|(_, (_, revision))| *revision > after);
+        let heard = new.map(|(name, (said, revision))| Heard {
+            name: name.clone(),
+            said: Some(said.clone()),
+            revision: *revision,
+        });
+        heard.collect()
+    }
 }

@@ -1,12 +1,30 @@
-//! Computers, the network between them, and what befalls them, in microseconds.
+//! Computers, the network between them, and what befalls them, in microseconds. The shell around the members is here:
+//! it carries out their actions, as `app::cluster` does.
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
-use std::time::Duration;
+use std::{
+    cmp::Reverse,
+    collections::{BinaryHeap, HashMap, VecDeque},
+    time::Duration,
+};
 
-use super::super::machine::{ANSWER_LIMIT, Action, Answer, Commit, Input, Op, Role};
-use super::computer::{Computer, KEYS, RECORDS_MAX};
-use super::etcd::{Etcd, Request, Write};
+use super::{
+    computer::{Asker, Computer, Unanswered, uri},
+    etcd::{Etcd, Sent},
+    history::{History, KEYS, Read, key, subscriptions, value_of},
+};
+use crate::{
+    cluster::{
+        journal::Progress,
+        machine::{ANSWER_LIMIT, Commit, EtcdAnswer, Role, View, WhenAlone},
+        member::{Action, Input, News},
+        merge::wire::{self, Ask, WriteOutcome},
+        sharing::Source,
+        standing::{Pass, Place, Standing},
+    },
+    dice::Dice,
+    master::{Notice, Request},
+    xmlrpc::{Reply, Value},
+};
 
 mod calls;
 mod faults;
@@ -14,59 +32,76 @@ mod faults;
 pub(super) use faults::{Counts, Plan};
 use faults::{Fault, Network};
 
-use crate::dice::Dice;
-
-const COMPUTERS: usize = 3;
-const MS: u64 = 1000;
+pub(super) const COMPUTERS: usize = 3;
+pub(super) const MS: u64 = 1000;
 /// How often a computer looks after what waits.
 const POLL: u64 = 40 * MS;
+/// A master takes so long to start.
+const MASTER_STARTS: u64 = 120 * MS;
 
-#[derive(Clone, Debug)]
+#[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "a test")]
 enum Event {
-    Start(usize),
     Wake(usize),
     Poll(usize),
-    Flush(usize),
-    /// A request reaches etcd. None waits for its answer any more if it is late.
-    Request(Request, bool),
-    Answer(usize, u64, u64, Answer),
-    Watch(usize, u64, super::super::machine::View, u64),
-    Load(usize, u64),
-    /// Whether the session goes on is decided.
-    Decided(usize, u64),
-    /// A node of this computer writes.
-    Write(usize),
-    /// A call of the first reaches the second.
-    Forward(usize, usize, Write),
+    Input(usize, u64, Input),
+    /// A request reaches etcd. Nobody waits for its answer if it is late.
+    Request(Box<Sent>, bool),
+    Watch(usize, u64, View),
+    Load(usize, u64, Progress, u64),
+    /// A node of this computer does something.
+    Client(usize),
+    /// A call of the first reaches the second, as the leader of a term.
+    Forward(usize, usize, u64, usize),
     /// The answer to a call reaches the computer of its node.
-    Done(usize, Write),
+    Done(usize, u64, usize, Place),
+    /// A read of the first reaches the second.
+    Ask(usize, u64, usize, u64, usize),
+    /// The value, and whether the journal may lack it.
+    Told(usize, u64, usize, (Option<i32>, bool), Place),
+    /// The leader has not answered a read in time.
+    Late(usize, u64, usize),
+    Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
+    Probe(usize, u64, usize, u64, u64),
+    Put(usize, u64, u64, Vec<crate::cluster::journal::Put>),
+    /// A node is told a parameter's value, by a computer or by its master.
+    Notify {
+        from: usize,
+        master: Option<u64>,
+        to: usize,
+        key: usize,
+        value: Option<i32>,
+    },
+    /// A master tries again to tell a node there what it could not.
+    Retry(usize, u64, usize),
+    /// All nodes are told the state, by a computer in this time that it records calls.
+    TellAll(usize, u64, Option<u64>),
+    Sync(usize),
     Fault,
     End(Fault),
 }
 
-/// What has become of a call.
-#[derive(Clone, Copy, Debug, Default)]
-struct Call {
-    key: usize,
-    made: u64,
-    /// Answered by a leader,
-    led: bool,
-    /// or by a computer that was alone.
-    alone: bool,
-    reported: bool,
-}
+/// Parameters and the values that a node is told.
+type Told = VecDeque<(usize, Option<i32>)>;
 
 pub(super) struct World {
-    plan: Plan,
-    dice: Dice,
-    now: u64,
+    pub(super) plan: Plan,
+    pub(super) dice: Dice,
+    pub(super) now: u64,
     order: u64,
     events: BinaryHeap<Reverse<(u64, u64)>>,
-    what: std::collections::HashMap<u64, Event>,
-    etcd: Etcd,
+    what: HashMap<u64, Event>,
+    pub(super) etcd: Etcd,
     network: Network,
-    computers: Vec<Computer>,
-    calls: Vec<Call>,
+    pub(super) computers: Vec<Computer>,
+    pub(super) history: History,
+    masters: u64,
+    /// What a master has not been able to tell a node, in order: it tells each node one thing at a time.
+    stuck: HashMap<(usize, u64, usize), Told>,
+    /// When the last notification from one to another arrives.
+    channels: [[u64; COMPUTERS]; COMPUTERS],
+    /// A node there must be told the state when it answers again.
+    owed: [[bool; COMPUTERS]; COMPUTERS],
     /// The highest term in which a call was answered.
     term: u64,
     pub(super) counts: Counts,
@@ -75,10 +110,9 @@ pub(super) struct World {
 impl World {
     pub(super) fn new(plan: Plan) -> Self {
         let mut dice = Dice(plan.seed);
-        let settings = (plan.commit, plan.alone, plan.ttl);
         let computers = (0..COMPUTERS).map(|index| {
             let drift = dice.below(100_000) as i64 - 50_000;
-            Computer::new(index, &settings, drift)
+            Computer::new(index, &plan, drift)
         });
         let mut world = Self {
             computers: computers.collect(),
@@ -87,18 +121,33 @@ impl World {
             now: 0,
             order: 0,
             events: BinaryHeap::new(),
-            what: std::collections::HashMap::new(),
-            etcd: Etcd::default(),
+            what: HashMap::new(),
+            etcd: Etcd::new(),
             network: Network::default(),
-            calls: Vec::new(),
+            history: History::default(),
+            masters: 0,
+            stuck: HashMap::new(),
+            channels: Default::default(),
+            owed: Default::default(),
             term: 0,
             counts: Counts::default(),
         };
         for index in 0..COMPUTERS {
-            let start = world.dice.below(30) * MS;
-            world.at(start, Event::Start(index));
+            let computer = &mut world.computers[index];
+            computer.disk.own.state = subscriptions();
+            computer.synced = computer.disk.clone();
+            let plan = world.plan.clone();
+            world.computers[index].start(index, &plan);
+            let mut start = world.dice.below(30) * MS;
+            if world.plan.twins && index == 1 {
+                // Two that start together notice each other only when one of them leads.
+                start += (1 + world.dice.below(5)) * 1000 * MS;
+            }
+            let life = world.computers[index].life;
+            world.at(start, Event::Input(index, life, Input::Begin));
             world.at(start, Event::Poll(index));
-            world.at(start, Event::Write(index));
+            world.at(start, Event::Client(index));
+            world.at(start, Event::Sync(index));
         }
         world.at(500 * MS, Event::Fault);
         world
@@ -115,13 +164,19 @@ impl World {
         self.at(self.now + delay, event);
     }
 
+    fn trace(&self, text: impl FnOnce() -> String) {
+        if self.plan.traced {
+            println!("{:>9} us {}", self.now, text());
+        }
+    }
+
     pub(super) fn run(&mut self, time: Duration) {
         let end = self.now + time.as_micros() as u64;
-        while self.step(end) {}
+        while self.history.broken.is_none() && self.step(end) {}
         self.now = end;
     }
 
-    fn step(&mut self, end: u64) -> bool {
+    pub(super) fn step(&mut self, end: u64) -> bool {
         let Some(Reverse((moment, order))) = self.events.peek().copied() else {
             return false;
         };
@@ -132,18 +187,22 @@ impl World {
         self.now = moment;
         let event = self.what.remove(&order).unwrap();
         let at = match &event {
-            Event::Start(at)
-            | Event::Wake(at)
+            Event::Wake(at)
             | Event::Poll(at)
-            | Event::Flush(at)
-            | Event::Answer(at, ..)
-            | Event::Watch(at, ..) => Some(*at),
-            Event::Load(at, _)
-            | Event::Decided(at, _)
-            | Event::Write(at)
-            | Event::Done(at, _)
-            | Event::Forward(_, at, _) => Some(*at),
-            Event::Request(..) | Event::Fault | Event::End(_) => None,
+            | Event::Input(at, ..)
+            | Event::Watch(at, ..)
+            | Event::Load(at, ..)
+            | Event::Client(at)
+            | Event::Forward(_, at, ..)
+            | Event::Done(at, ..)
+            | Event::Ask(_, _, at, ..)
+            | Event::Told(at, ..)
+            | Event::Late(at, ..)
+            | Event::Merge(_, _, Some(at), ..)
+            | Event::Merge(at, _, None, ..)
+            | Event::Probe(_, _, at, ..)
+            | Event::TellAll(at, _, None) => Some(*at),
+            _ => None,
         };
         match at.map(|at| self.computers[at].hangs_until) {
             Some(until) if until > self.now => {
@@ -158,10 +217,6 @@ impl World {
 
     fn happen(&mut self, event: Event) {
         match event {
-            Event::Start(at) => {
-                let followed = self.computers[at].followed;
-                self.input(at, Input::Start(followed));
-            }
             Event::Wake(at) => {
                 if self.computers[at].up && self.computers[at].wake <= self.now {
                     self.input(at, Input::Wake);
@@ -173,138 +228,265 @@ impl World {
                     self.poll(at);
                 }
             }
-            Event::Flush(at) => {
-                if self.computers[at].up {
-                    self.flush(at);
-                }
-            }
-            Event::Request(request, awaited) => self.request(request, awaited),
-            Event::Answer(at, life, number, answer) => {
+            Event::Input(at, life, input) => {
                 if self.lives(at, life) {
-                    self.input(at, Input::Answer { number, answer });
+                    self.input(at, input);
                 }
             }
-            Event::Watch(at, watch, view, seq) => {
+            Event::Request(sent, awaited) => self.request(sent, awaited),
+            Event::Watch(at, watch, view) => self.watched(at, watch, view),
+            Event::Load(at, life, known, until) => self.load(at, life, known, until),
+            Event::Client(at) => self.client(at),
+            Event::Forward(from, to, term, call) => {
+                let computer = &self.computers[to];
+                // Who has the answer to an earlier try has closed the connection of a later one.
+                if computer.up
+                    && !self.history.is_heard(call)
+                    && self.network.joins(from, to)
+                    && computer.standing.answers_others(term)
+                {
+                    self.run_call(to, call, from);
+                    self.input_changes(to);
+                }
+            }
+            Event::Done(at, life, call, place) => {
+                if self.lives(at, life) {
+                    self.computers[at].tell_of(place);
+                    self.done(at, call);
+                }
+            }
+            Event::Ask(from, life, to, term, read) => {
+                let computer = &self.computers[to];
+                if computer.up
+                    && self.network.joins(from, to)
+                    && computer.standing.answers_others(term)
+                {
+                    let value = self.value(to, self.history.reads[read].key);
+                    let seq = computer.ledger.agreed;
+                    let early = self.is_early(to);
+                    let delay = self.delay();
+                    self.after(
+                        delay,
+                        Event::Told(from, life, read, (value, early), place(term, seq)),
+                    );
+                }
+            }
+            Event::Told(at, life, read, (value, early), place) => {
+                if self.lives(at, life) && self.history.reads[read].done.is_none() {
+                    self.computers[at].tell_of(place);
+                    self.read_done(read, value, early);
+                }
+            }
+            Event::Late(at, life, read) => {
+                if self.lives(at, life) && self.history.reads[read].done.is_none() {
+                    self.read_late(at, life, read);
+                }
+            }
+            Event::Merge(from, life, to, term, (number, ask)) => {
+                self.merge((from, life, number), to, term, ask);
+            }
+            Event::Probe(from, life, to, term, number) => {
+                let there = &self.computers[to];
+                let leads = there.up
+                    && self.network.joins(from, to)
+                    && self.network.joins(to, from)
+                    && there.standing.answers_others(term);
+                let delay = self.delay();
+                let input = Input::Probed { number, leads };
+                self.after(delay, Event::Input(from, life, input));
+            }
+            Event::Put(at, life, term, parts) => {
+                let reaches = self.network.reaches_etcd(at);
+                let leads = self.etcd.view().guard().leader == term;
+                if reaches && leads {
+                    self.etcd.put(parts);
+                }
+                let delay = self.delay();
+                let prepared = Input::Prepared(reaches.then_some(leads));
+                self.after(delay, Event::Input(at, life, prepared));
+            }
+            Event::Notify {
+                from,
+                master,
+                to,
+                key,
+                value,
+            } => self.notify(from, master, to, key, value),
+            Event::Retry(from, master, to) => self.retry(from, master, to),
+            Event::TellAll(at, leadership, master) => {
                 let computer = &self.computers[at];
-                if computer.up && computer.watch == watch {
-                    if !self.network.reaches_etcd(at) {
-                        self.computers[at].watch += 1;
-                        return;
-                    }
-                    self.loaded(at, seq);
-                    self.input(at, Input::View(view));
+                let present = computer.up && computer.ledger.leadership == leadership;
+                if present && master.is_none_or(|of| computer.master == Some(of)) {
+                    (0..COMPUTERS).for_each(|to| self.tell_state(at, to));
                 }
             }
-            Event::Load(at, life) => {
-                if !self.lives(at, life) {
-                } else if self.network.reaches_etcd(at) {
-                    self.loaded(at, self.etcd.journal.len() as u64);
-                } else {
-                    self.after(100 * MS, Event::Load(at, life));
-                }
+            Event::Sync(at) => {
+                let pause = (50 + self.dice.below(400)) * MS;
+                self.after(pause, Event::Sync(at));
+                let computer = &mut self.computers[at];
+                computer.synced = computer.disk.clone();
+                computer.synced_at = self.now;
             }
-            Event::Decided(at, life) => {
-                if self.lives(at, life) {
-                    let (seq, goes_on) = (self.computers[at].followed, true);
-                    self.input(at, Input::Decided { seq, goes_on });
-                }
-            }
-            Event::Write(at) => {
-                let pause = self.dice.below(300) * MS;
-                self.after(pause, Event::Write(at));
-                if self.computers[at].up && !self.network.healed_for(self.now, 2_000 * MS) {
-                    let key = self.dice.below(KEYS as u64) as usize;
-                    self.calls.push(Call {
-                        key,
-                        made: self.now,
-                        ..Call::default()
-                    });
-                    self.computers[at].waiting.push(self.calls.len() - 1);
-                    self.flush(at);
-                }
-            }
-            Event::Forward(from, to, write) => {
-                let leads = self.computers[to].up && self.computers[to].role == Role::Leading;
-                let takes = self.computers[to].machine.takes_writes();
-                if leads && takes && self.network.joins(from, to) {
-                    self.record(to, write, from);
-                }
-            }
-            Event::Done(at, write) => self.done(at, write),
             Event::Fault => self.fault(),
             Event::End(fault) => self.end(fault),
         }
     }
 
-    fn lives(&self, at: usize, life: u64) -> bool {
+    pub(super) fn lives(&self, at: usize, life: u64) -> bool {
         self.computers[at].up && self.computers[at].life == life
     }
 
     /// A request reaches etcd, or does not.
-    fn request(&mut self, request: Request, awaited: bool) {
-        let (at, life, number) = (request.from, request.life, request.number);
+    fn request(&mut self, sent: Box<Sent>, awaited: bool) {
+        let (at, life, number) = (sent.from, sent.life, sent.number);
+        let silence = |number| {
+            let answer = EtcdAnswer::Silence;
+            Event::Input(at, life, Input::Answer { number, answer })
+        };
         if !self.network.reaches_etcd(at) {
-            if awaited && self.now < request.until {
+            if awaited && self.now < sent.until {
                 // The client asks another endpoint.
-                self.after(250 * MS, Event::Request(request, true));
+                self.after(250 * MS, Event::Request(sent, true));
             } else if awaited {
-                self.after(0, Event::Answer(at, life, number, Answer::Silence));
+                self.after(0, silence(number));
             }
             return;
         }
-        let before = self.etcd.view().guard();
-        let answer = self.etcd.run(&request);
-        if self.etcd.changed_since(before) {
-            for other in 0..COMPUTERS {
-                let lag = self.lag();
-                self.watch(other, lag);
-            }
+        let before = self.etcd.view().clone();
+        if !sent.parts.is_empty() {
+            self.etcd.put(sent.parts.clone());
+        }
+        self.etcd.now = self.now;
+        let answer = self.etcd.run(&sent);
+        if *self.etcd.view() != before {
+            self.show_watches();
         }
         if !awaited {
             return;
         }
         if self.plan.faults && self.dice.one_in(60) {
-            // The answer is lost.
-            self.after(50 * MS, Event::Answer(at, life, number, Answer::Silence));
+            // The answer is lost. Now and then nobody notices.
+            if !self.dice.one_in(10) {
+                self.after(50 * MS, silence(number));
+            }
             return;
         }
-        let delay = self.delay();
-        self.after(delay, Event::Answer(at, life, number, answer));
+        let delay = self.delay() + self.network.etcd_slow(self.now);
+        let answer = Input::Answer { number, answer };
+        self.after(delay, Event::Input(at, life, answer));
     }
 
-    /// The watch of a computer will show the present state.
-    fn watch(&mut self, at: usize, lag: u64) {
-        let (view, seq) = (self.etcd.view(), self.etcd.journal.len() as u64);
+    /// Each watch will show the present state.
+    fn show_watches(&mut self) {
+        for at in 0..COMPUTERS {
+            if self.computers[at].watching {
+                self.show_watch(at);
+            }
+        }
+    }
+
+    fn show_watch(&mut self, at: usize) {
+        let lag = self.lag();
+        let view = self.etcd.view().clone();
         let computer = &mut self.computers[at];
         computer.watch_at = computer.watch_at.max(self.now + lag);
         let (moment, watch) = (computer.watch_at, computer.watch);
-        self.at(moment, Event::Watch(at, watch, view, seq));
+        self.at(moment, Event::Watch(at, watch, view));
     }
 
-    /// The mirror of a computer that does not lead is brought to a record of the journal.
-    fn loaded(&mut self, at: usize, seq: u64) {
+    fn watched(&mut self, at: usize, watch: u64, view: View) {
         let computer = &mut self.computers[at];
-        if matches!(computer.role, Role::Following | Role::CatchingUp) {
-            let calls = &self.calls;
-            computer.follow(&self.etcd.journal, seq, |write| calls[write].key);
-            let followed = computer.followed;
-            self.input(at, Input::Followed(followed));
+        if !computer.up || computer.watch != watch || !computer.watching {
+            return;
+        }
+        if !self.network.reaches_etcd(at) {
+            computer.watch += 1;
+            return;
+        }
+        let (seq, revision) = computer.watched;
+        if self.etcd.view().revision < revision || view.revision > self.etcd.view().revision {
+            // It waits for a revision that is to come.
+            return;
+        }
+        let entries = self.etcd.entries_after(seq, view.seq());
+        let Some(entries) = entries else {
+            computer.watching = false;
+            return self.input(at, Input::WatchEnded);
+        };
+        let heard = self.etcd.heard(revision);
+        computer.watched = (seq.max(view.seq()), view.revision);
+        let input = Input::Watched {
+            view,
+            entries,
+            heard,
+        };
+        self.input(at, input);
+    }
+
+    fn load(&mut self, at: usize, life: u64, known: Progress, until: u64) {
+        if !self.lives(at, life) {
+            return;
+        }
+        let read = match self.network.reaches_etcd(at) {
+            true => {
+                let read = self.etcd.read(known);
+                if read.state.is_some() {
+                    self.history.skips(at, self.now);
+                }
+                Some(read)
+            }
+            false if self.now < until => {
+                return self.after(100 * MS, Event::Load(at, life, known, until));
+            }
+            false => None,
+        };
+        let delay = self.delay();
+        self.after(delay, Event::Input(at, life, Input::Loaded(read)));
+    }
+
+    /// The ledger has changed.
+    fn input_changes(&mut self, at: usize) {
+        let changes = match &mut self.computers[at].ledger.sharing {
+            Some(sharing) => sharing.take(),
+            None => return,
+        };
+        if !changes.is_empty() {
+            self.input(at, Input::Recorded(changes));
         }
     }
 
     fn input(&mut self, at: usize, input: Input) {
-        let local = self.computers[at].local(self.now);
-        let said = self.plan.traced.then(|| format!("{input:?}"));
-        let actions = self.computers[at].machine.on(local, input);
-        if let Some(said) = said.filter(|said| !actions.is_empty() || !said.starts_with("Peer")) {
-            println!("{:>9} us, {at}: {said} -> {actions:?}", self.now);
+        let mut inputs = VecDeque::from([input]);
+        while let Some(input) = inputs.pop_front() {
+            let local = self.computers[at].local(self.now);
+            let said = self.plan.traced.then(|| format!("{input:?}"));
+            let computer = &mut self.computers[at];
+            let actions = computer.member.on(local, input);
+            computer.ledger.lease = computer.member.machine().lease(local);
+            if let Some(mut said) = said
+                && !actions.is_empty()
+            {
+                said.truncate(300);
+                let mut all = format!("{actions:?}");
+                all.truncate(1500);
+                self.trace(|| format!("{at}: {said} -> {all}"));
+            }
+            for action in actions {
+                self.act(at, action, &mut inputs);
+            }
+            let computer = &mut self.computers[at];
+            computer.write_disk();
+            if inputs.is_empty()
+                && let Some(sharing) = &mut computer.ledger.sharing
+            {
+                let changes = sharing.take();
+                if !changes.is_empty() {
+                    inputs.push_back(Input::Recorded(changes));
+                }
+            }
         }
-        for action in actions {
-            self.act(at, action);
-        }
-        self.settle(at);
         let computer = &mut self.computers[at];
-        if let Some(deadline) = computer.machine.deadline() {
+        if let Some(deadline) = computer.member.deadline().filter(|_| computer.up) {
             let moment = computer.moment(deadline).max(self.now);
             if computer.wake <= self.now || moment + 2 * MS < computer.wake {
                 computer.wake = moment + self.dice.below(2 * MS);
@@ -314,108 +496,224 @@ impl World {
         }
     }
 
-    fn act(&mut self, at: usize, action: Action) {
+    fn act(&mut self, at: usize, action: Action, inputs: &mut VecDeque<Input>) {
+        let life = self.computers[at].life;
         match action {
-            Action::Send { number, op } => self.send(at, number, op),
-            Action::CatchUp(_) => {
-                let (delay, life) = (self.delay(), self.computers[at].life);
-                self.after(delay, Event::Load(at, life));
-            }
-            Action::Become(role) => {
-                self.computers[at].role = role;
-                self.counts.alone += u64::from(role == Role::Alone);
-                self.counts.reigns += u64::from(role == Role::Leading);
-                self.after(0, Event::Flush(at));
-                if role == Role::CatchingUp {
-                    let (delay, life) = (self.delay(), self.computers[at].life);
-                    self.after(delay, Event::Decided(at, life));
-                }
-            }
-            Action::Acknowledge(seq) => self.acknowledge(at, seq),
-            Action::Yield {
-                committed,
-                acknowledged,
+            Action::Send {
+                number,
+                op,
+                entry,
+                parts,
+                ..
             } => {
-                self.settle(at);
-                let computer = &mut self.computers[at];
-                assert_eq!(computer.followed, committed, "seed {}", self.plan.seed);
-                if self.plan.traced {
-                    println!("{:>9} us, {at}: hands back {:?}", self.now, computer.own);
-                }
-                computer.hand_back((acknowledged - committed) as usize);
+                let sent = Sent {
+                    from: at,
+                    life,
+                    number,
+                    settings: self.computers[at].member.settings().clone(),
+                    op,
+                    entry,
+                    parts,
+                    until: self.now + ANSWER_LIMIT.as_micros() as u64,
+                };
+                self.send(Box::new(sent));
             }
-            Action::Released => {}
+            Action::Load(known) => {
+                let until = self.now + ANSWER_LIMIT.as_micros() as u64;
+                let delay = self.delay();
+                self.after(delay, Event::Load(at, life, known, until));
+            }
+            Action::Watch(view) => {
+                let computer = &mut self.computers[at];
+                computer.watch += 1;
+                computer.watching = true;
+                computer.watched = (view.seq(), view.revision);
+                if *self.etcd.view() != view {
+                    self.show_watch(at);
+                }
+            }
+            Action::Prepare { term, parts } => {
+                let delay = self.delay();
+                self.after(delay, Event::Put(at, life, term, parts));
+            }
+            Action::Decide { seq, .. } => {
+                let delay = self.delay();
+                let goes_on = true;
+                let input = Input::Decided { seq, goes_on };
+                self.after(delay, Event::Input(at, life, input));
+            }
+            Action::Stand(standing) => self.stand(at, standing),
+            Action::Leave => {
+                for (_, asker, _) in self.computers[at].ledger.leave() {
+                    self.merge_answered(asker, at, None);
+                }
+                self.owed[at] = Default::default();
+            }
+            Action::Lead { seq, held, state } => {
+                let computer = &mut self.computers[at];
+                computer.ledger.lead(seq, &held, state);
+                let leadership = computer.ledger.leadership;
+                self.after(50 * MS, Event::TellAll(at, leadership, None));
+            }
+            Action::Follow(records) => {
+                let computer = &mut self.computers[at];
+                for record in &records {
+                    if let crate::checkpoint::format::RecordContent::Call { call, .. } =
+                        &record.entry
+                    {
+                        let call = Request::from(call.clone());
+                        computer.ledger.mirror.apply_telling(&call, &mut ());
+                        computer.disk.own.seq += 1;
+                    }
+                }
+            }
+            Action::FollowState(state) => self.computers[at].ledger.mirror = state,
+            Action::Acknowledge(seq) => self.agree(at, seq),
+            Action::TakeAsState => {
+                let ledger = &mut self.computers[at].ledger;
+                let mirror = &ledger.mirror;
+                let state = ledger.sharing.as_mut().map(|of| of.take_as_state(mirror));
+                inputs.push_front(Input::AsState(state));
+            }
+            Action::AskForwarded => {
+                let waiting = self.computers[at].waiting.iter();
+                let calls = waiting.map(|(call, _)| self.history.request(*call));
+                inputs.push_front(Input::Forwarded(calls.collect()));
+            }
+            Action::Term(term) => self.computers[at].disk.own.term = term,
+            Action::BeginMaster(_) => {
+                self.masters += 1;
+                let master = self.masters;
+                let computer = &mut self.computers[at];
+                computer.master = Some(master);
+                let leadership = computer.ledger.leadership;
+                self.after(MASTER_STARTS, Event::TellAll(at, leadership, Some(master)));
+            }
+            Action::EndMaster => {
+                let computer = &mut self.computers[at];
+                computer.master = None;
+                let leadership = computer.ledger.leadership;
+                self.after(50 * MS, Event::TellAll(at, leadership, None));
+            }
+            Action::ServeOwnOnly(own_only) => self.computers[at].own_only = own_only,
+            Action::KeepAll { base, calls } => {
+                self.computers[at].disk.kept = Some((base, calls));
+            }
+            Action::Keep(calls) => {
+                if let Some((_, kept)) = &mut self.computers[at].disk.kept {
+                    kept.extend(calls);
+                }
+            }
+            Action::KeepNothing => self.computers[at].disk.kept = None,
+            Action::Merge { number, ask, to } => {
+                let delay = self.delay();
+                let (to, term) = match to {
+                    None => (None, 0),
+                    Some((to, term)) => ((0..COMPUTERS).find(|of| uri(*of) == to), term),
+                };
+                self.after(delay, Event::Merge(at, life, to, term, (number, ask)));
+            }
+            Action::Report(outcomes) => {
+                for (call, outcome) in outcomes {
+                    if !matches!(outcome, WriteOutcome::Holds) {
+                        self.trace(|| format!("{at}: reports {call:?} {outcome:?}"));
+                        self.counts.reported += 1;
+                        self.history.reported(&call);
+                    } else {
+                        self.counts.merged += 1;
+                        self.history.held(&call);
+                    }
+                }
+            }
+            Action::Probe {
+                number,
+                uri: to,
+                term,
+            } => {
+                let delay = self.delay();
+                let to = (0..COMPUTERS).find(|of| uri(*of) == to && *of != at);
+                match to {
+                    Some(to) => self.after(delay, Event::Probe(at, life, to, term, number)),
+                    None => {
+                        let leads = false;
+                        let input = Input::Probed { number, leads };
+                        self.after(delay, Event::Input(at, life, input));
+                    }
+                }
+            }
+            Action::Say => {
+                let computer = &self.computers[at];
+                let said = computer.member.says();
+                if self.network.reaches_etcd(at) {
+                    let name = computer.name.clone();
+                    self.etcd.say(&name, said);
+                    self.show_watches();
+                }
+            }
+            Action::WriteSnapshot { term, progress, .. } => {
+                if self.etcd.view().guard().leader == term && self.network.reaches_etcd(at) {
+                    self.etcd.compact();
+                }
+                let delay = self.delay();
+                let written = Input::SnapshotWritten(Some((progress, 1000)));
+                self.after(delay, Event::Input(at, life, written));
+            }
+            Action::Tell(news) => match news {
+                News::Alone { .. } => {
+                    self.counts.alone += 1;
+                    self.computers[at].times_alone += 1;
+                }
+                News::Leads { .. } => self.counts.reigns += 1,
+                // What was read of what etcd has lost may be lost.
+                News::EtcdLost => self.history.forgets(at, self.now),
+                _ => {}
+            },
+            Action::EndRosout => inputs.push_back(Input::RosoutEnded),
+            Action::EndForNamesake(_) => {
+                self.computers[at].refused = true;
+                self.computers[at].up = false;
+            }
+            Action::End => self.computers[at].up = false,
+            Action::StandIn
+            | Action::TurnAway
+            | Action::TellDisplaced(_)
+            | Action::Forget(_)
+            | Action::HandedOver(_) => {}
         }
     }
 
-    fn send(&mut self, at: usize, number: u64, op: Op) {
-        self.settle(at);
-        let computer = &self.computers[at];
-        let mut records = Vec::new();
-        if let Op::Beat { seq, .. } = &op {
-            let most = if self.plan.faults {
-                RECORDS_MAX
-            } else {
-                u64::MAX
-            };
-            let upto = seq.saturating_sub(computer.followed).min(most);
-            records.extend(computer.own.iter().take(upto as usize).map(|own| own.write));
+    fn stand(&mut self, at: usize, standing: Standing) {
+        let computer = &mut self.computers[at];
+        if standing == Standing::Alone {
+            computer.ledger.unanswered.retain(|of| of.origin == at);
+            let cut = computer.member.seq();
+            computer.cut = (cut, self.etcd.log.len());
         }
-        let (from, life) = (at, computer.life);
-        let request = Request {
-            from,
-            life,
-            number,
-            op,
-            records,
-            until: self.now + ANSWER_LIMIT.as_micros() as u64,
-        };
+        computer.standing = standing;
+        for (_, missed) in &mut computer.waiting {
+            *missed = self.now;
+        }
+    }
+
+    fn send(&mut self, sent: Box<Sent>) {
+        let well = self.etcd.log.is_empty() || self.network.healed_for(self.now, 0);
+        if self.plan.faults && !well && self.dice.one_in(400) {
+            // Who was to send it is gone, and nobody says so.
+            return;
+        }
         if self.plan.faults && self.dice.one_in(40) {
             // It arrives late, or twice.
             let late = self.dice.below(3000) * MS;
-            self.after(late, Event::Request(request.clone(), false));
+            self.after(late, Event::Request(sent.clone(), false));
             if self.dice.one_in(2) {
-                let silence = Event::Answer(at, life, number, Answer::Silence);
-                self.after(50 * MS, silence);
+                let (number, answer) = (sent.number, EtcdAnswer::Silence);
+                let silence = Input::Answer { number, answer };
+                self.after(50 * MS, Event::Input(sent.from, sent.life, silence));
                 return;
             }
         }
         let delay = self.delay();
-        self.after(delay, Event::Request(request, true));
-    }
-
-    /// Whom a computer takes for the leader: one that says so itself.
-    fn peer_of(&self, at: usize) -> Option<usize> {
-        (0..COMPUTERS).find(|other| {
-            let peer = &self.computers[*other];
-            let leads = peer.up && peer.hangs_until <= self.now && peer.role == Role::Leading;
-            let newer = peer.machine.term() > self.computers[at].machine.term();
-            *other != at && leads && newer && self.network.joins(at, *other)
-        })
-    }
-
-    fn poll(&mut self, at: usize) {
-        let due = self.computers[at].watch_at < self.now && self.network.reaches_etcd(at);
-        if due && self.computers[at].machine.view().revision < self.etcd.view().revision {
-            // The watch is made anew.
-            self.computers[at].watch += 1;
-            let lag = self.lag();
-            self.watch(at, lag);
-        }
-        if matches!(
-            self.computers[at].role,
-            Role::Following | Role::Alone | Role::Joining
-        ) {
-            let leads = self.peer_of(at).is_some();
-            self.input(at, Input::Peer(leads));
-        }
-        self.flush(at);
-    }
-
-    /// The one delay of the network.
-    fn delay(&mut self) -> u64 {
-        let slow = self.network.slow(self.now);
-        MS / 2 + self.dice.below(20 * MS) + slow
+        self.after(delay, Event::Request(sent, true));
     }
 
     fn lag(&mut self) -> u64 {
@@ -428,8 +726,10 @@ impl World {
     }
 
     pub(super) fn leaders(&self) -> Vec<usize> {
-        let leads =
-            |at: &usize| self.computers[*at].up && self.computers[*at].role == Role::Leading;
+        let leads = |at: &usize| {
+            let computer = &self.computers[*at];
+            computer.up && computer.member.role() == Role::Leading
+        };
         (0..COMPUTERS).filter(leads).collect()
     }
 
@@ -437,40 +737,62 @@ impl World {
     pub(super) fn until_another_leads(&mut self, before: usize) -> Duration {
         let start = self.now;
         while self.leaders().iter().all(|leader| *leader == before) {
-            assert!(
-                self.step(start + 20_000 * MS),
-                "seed {}: nobody leads",
-                self.plan.seed
-            );
+            let goes_on = self.step(start + 20_000 * MS);
+            assert!(goes_on, "seed {}: nobody leads", self.plan.seed);
         }
         Duration::from_micros(self.now - start)
     }
 
-    /// What must be so some time after the last failure.
-    pub(super) fn check(&self) {
-        let seed = self.plan.seed;
-        let leaders = self.leaders();
-        assert_eq!(leaders.len(), 1, "seed {seed}: leaders {leaders:?}");
-        let journal = &self.etcd.journal;
-        for (at, computer) in self.computers.iter().enumerate() {
-            let led = leaders.contains(&at) || computer.role == Role::Following;
-            assert!(led, "seed {seed}: {at} is {:?}", computer.role);
-            assert_eq!(computer.followed, journal.len() as u64, "seed {seed}: {at}");
-            let state = |at: usize| self.computers[at].state(|write| self.calls[write].key);
-            assert_eq!(state(at), state(leaders[0]), "seed {seed}: {at}");
-            let left = (
-                computer.own.len(),
-                computer.pending.len(),
-                computer.waiting.len(),
-            );
-            assert_eq!(left, (0, 0, 0), "seed {seed}: {at}");
+    /// What must be so some time after the last failure; if it is not, what is wrong.
+    pub(super) fn verdict(&self) -> Result<(), String> {
+        if let Some(why) = &self.history.broken {
+            return Err(why.clone());
         }
-        let arrived: std::collections::HashSet<_> = journal.iter().copied().collect();
-        for (write, call) in self.calls.iter().enumerate() {
-            let known = arrived.contains(&write);
-            let may_be_reported = call.alone || self.plan.commit == Commit::Interval;
-            let lost = (call.led || call.alone) && !known && !(may_be_reported && call.reported);
-            assert!(!lost, "seed {seed}: call {write} is lost: {call:?}");
+        let leaders = self.leaders();
+        if leaders.len() != 1 {
+            return Err(format!("leaders {leaders:?}"));
+        }
+        for (at, computer) in self.computers.iter().enumerate() {
+            if computer.refused {
+                continue;
+            }
+            let role = computer.member.role();
+            if !matches!(role, Role::Leading | Role::Following) {
+                return Err(format!("{at} is {role:?}"));
+            }
+            if computer.member.seq() != self.etcd.seq() {
+                let (seq, last) = (computer.member.seq(), self.etcd.seq());
+                return Err(format!("{at} has followed to {seq} of {last}"));
+            }
+            if computer.ledger.mirror != self.etcd.state {
+                return Err(format!("the state of {at} is not that of the journal"));
+            }
+            if computer.member.uncommitted() > 0 || computer.member.kept().is_some() {
+                return Err(format!("{at} still owes writes"));
+            }
+            if !computer.waiting.is_empty() {
+                return Err(format!("calls wait at {at}: {:?}", computer.waiting));
+            }
+        }
+        if self.plan.twins {
+            let refused = self.computers.iter().filter(|of| of.refused).count();
+            if refused != 1 {
+                return Err(format!("{refused} of two computers of one name have ended"));
+            }
+            return Ok(());
+        }
+        self.history.check(&self.etcd, self.plan.commit)
+    }
+
+    /// Panics if anything is wrong.
+    pub(super) fn check(&self) {
+        if let Err(why) = self.verdict() {
+            panic!("seed {}: {why}", self.plan.seed);
         }
     }
+}
+
+fn place(term: u64, seq: u64) -> Place {
+    let epoch = 0;
+    Place { epoch, term, seq }
 }

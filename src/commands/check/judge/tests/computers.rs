@@ -6,7 +6,7 @@ use super::{
     super::super::{
         Severity::{Problem, Warning},
         computers::{Cluster, Unusable},
-        facts::Facts,
+        facts::SetupFacts,
     },
     one, said,
 };
@@ -34,7 +34,7 @@ fn cluster() -> Cluster {
     }
 }
 
-fn given(facts: &mut Facts, spoil: impl FnOnce(&mut Cluster)) {
+fn given(facts: &mut SetupFacts, spoil: impl FnOnce(&mut Cluster)) {
     let mut cluster = cluster();
     spoil(&mut cluster);
     facts.cluster = Some(Arc::new(Ok(cluster)));
@@ -74,7 +74,7 @@ fn a_wrong_endpoint_is_a_warning_while_a_majority_answers_and_a_problem_otherwis
 
 #[test]
 fn a_robot_that_etcd_does_not_know_while_it_knows_another_one() {
-    let unknown = |facts: &mut Facts, others: &[&str]| {
+    let unknown = |facts: &mut SetupFacts, others: &[&str]| {
         given(facts, |of| {
             of.leader = None;
             of.others = others.iter().map(|other| (*other).to_owned()).collect();

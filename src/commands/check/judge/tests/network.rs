@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
-        facts::{Behind, Facts, Lease, Taken},
-        ros::Server,
+        facts::{Lease, PortInUse, SetupFacts, UpstreamMaster},
+        ros::Responder,
     },
     host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
 };
@@ -32,21 +32,21 @@ fn who_has_the_port() {
         "port",
         "a master without rosrescue: who (process 7, port 11311)",
         |facts| {
-            port(facts).taken = taken(Server::Master(Some(7)));
+            port(facts).taken = taken(Responder::Master(Some(7)));
             facts.masters = vec![process(7, "rosmaster", 11311)];
         },
     );
     one(Problem, "port", "a program that is not a master", |facts| {
-        port(facts).taken = taken(Server::Other);
+        port(facts).taken = taken(Responder::Other);
     });
     one(
         Problem,
         "port",
         "a process that only root can see",
         |facts| {
-            port(facts).taken = Some(Taken {
+            port(facts).taken = Some(PortInUse {
                 by: Vec::new(),
-                server: Server::Silent,
+                server: Responder::Silent,
             });
         },
     );
@@ -82,7 +82,7 @@ fn who_has_the_port() {
 
 #[test]
 fn traps_of_ros_master_uri() {
-    let uri = |facts: &mut Facts, uri: &str| facts.env.master_uri = Some(uri.to_owned());
+    let uri = |facts: &mut SetupFacts, uri: &str| facts.env.master_uri = Some(uri.to_owned());
     one(Warning, "ROS_MASTER_URI", "is not set", |facts| {
         facts.env.master_uri = None;
         facts.master_host = None;
@@ -125,7 +125,7 @@ fn traps_of_ros_master_uri() {
 
 #[test]
 fn traps_of_ros_ip_and_ros_hostname() {
-    let ip = |facts: &mut Facts, ip: &str| facts.env.ip = Some(ip.to_owned());
+    let ip = |facts: &mut SetupFacts, ip: &str| facts.env.ip = Some(ip.to_owned());
     one(Problem, "ROS_IP", "`10.0.0.7 ` begins or ends", |facts| {
         ip(facts, "10.0.0.7 ");
         facts.own = nowhere("10.0.0.7 ");
@@ -215,7 +215,7 @@ fn names_that_lead_nowhere_or_elsewhere() {
 /// On a computer with nodes alone, the check does not ask for what serves the robot.
 #[test]
 fn another_computer_of_the_robot() {
-    let elsewhere = |facts: &mut Facts| {
+    let elsewhere = |facts: &mut SetupFacts| {
         facts.env.master_uri = Some("http://base:11311/".to_owned());
         facts.master_host = Some(host("base", "10.0.0.9", false));
         facts.elsewhere = Some(rosrescue(None));
@@ -258,7 +258,7 @@ fn another_computer_of_the_robot() {
         "a master without rosrescue",
         |facts| {
             elsewhere(facts);
-            facts.elsewhere = Some(Server::Master(None));
+            facts.elsewhere = Some(Responder::Master(None));
             facts.elsewhere_host = None;
         },
     );
@@ -268,7 +268,7 @@ fn another_computer_of_the_robot() {
         "is another computer (10.0.0.9)",
         |facts| {
             elsewhere(facts);
-            facts.elsewhere = Some(Server::Nobody);
+            facts.elsewhere = Some(Responder::Nobody);
             facts.rosmaster = robot().rosmaster;
             facts.disk.refused = None;
             facts.units = robot().units;
@@ -308,7 +308,7 @@ fn addresses_that_may_change_and_nodes_of_another_master() {
 #[test]
 fn clients_that_bypass_rosrescue_are_reported() {
     let behind = |bypassing: &[&str], is_open| {
-        Some(Behind {
+        Some(UpstreamMaster {
             uri: MasterUri::parse("http://robot:11312").unwrap(),
             bypassing: bypassing.iter().map(|&who| who.to_owned()).collect(),
             is_open,

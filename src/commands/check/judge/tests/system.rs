@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
-        facts::Facts,
+        facts::SetupFacts,
         launch::Setting,
-        ros::Server,
-        units::Kind,
+        ros::Responder,
+        units::UnitKind,
     },
     one, process, rosrescue, said, unit,
 };
@@ -16,7 +16,7 @@ use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
 
 #[test]
 fn where_the_checkpoint_goes() {
-    let mount = |facts: &mut Facts, of: &str, source: &str| {
+    let mount = |facts: &mut SetupFacts, of: &str, source: &str| {
         facts.disk.mount = Some((of.to_owned(), source.to_owned()));
     };
     one(
@@ -129,21 +129,21 @@ fn the_ros_that_is_installed() {
 
 #[test]
 fn the_master_of_a_proxy() {
-    let proxy = |facts: &mut Facts, server| {
+    let proxy = |facts: &mut SetupFacts, server| {
         facts.rosmaster = None;
         facts.proxied = Some((MasterUri::parse("http://robot:11411").unwrap(), server));
         facts.masters = vec![process(9, "rosmaster", 11411)];
         // A master at that address is intended.
         facts
             .units
-            .push(unit("roscore.service", Kind::Roscore, true));
+            .push(unit("roscore.service", UnitKind::Roscore, true));
     };
-    assert_eq!(said(|facts| proxy(facts, Server::Master(Some(9)))), []);
+    assert_eq!(said(|facts| proxy(facts, Responder::Master(Some(9)))), []);
     one(Warning, "master", "no answer from", |facts| {
-        proxy(facts, Server::Nobody)
+        proxy(facts, Responder::Nobody)
     });
     one(Problem, "master", "is not a ROS master", |facts| {
-        proxy(facts, Server::Other)
+        proxy(facts, Responder::Other)
     });
     one(Problem, "master", "is a rosrescue", |facts| {
         proxy(facts, rosrescue(None))
@@ -153,21 +153,21 @@ fn the_master_of_a_proxy() {
 #[test]
 fn units_of_systemd() {
     let with = |kind, is_enabled| {
-        move |facts: &mut Facts| facts.units.push(unit("robot.service", kind, is_enabled))
+        move |facts: &mut SetupFacts| facts.units.push(unit("robot.service", kind, is_enabled))
     };
     one(
         Problem,
         "systemd",
         "robot.service starts another master",
-        with(Kind::Roscore, true),
+        with(UnitKind::Roscore, true),
     );
     one(
         Warning,
         "systemd",
         "robot.service runs roslaunch",
-        with(Kind::Roslaunch, true),
+        with(UnitKind::Roslaunch, true),
     );
-    assert_eq!(said(with(Kind::Roscore, false)), []);
+    assert_eq!(said(with(UnitKind::Roscore, false)), []);
     one(Note, "systemd", "no rosrescue service", |facts| {
         facts.units.clear()
     });

@@ -1,10 +1,10 @@
-//! Random times alone, with a leader that goes on, is replaced, forgets, and whose answers get lost.
+//! Random periods of being cut off, with a leader that continues, is replaced, forgets, and whose answers get lost.
 
 use super::super::{
-    Changes, Pending, Verdict,
+    Changes, Verdict, WritesToSend,
     changes::{param_of, value_at},
     judge, merge,
-    wire::{Answer, Outcome},
+    wire::{MergeAnswer, WriteOutcome},
 };
 use crate::{
     master::{Master, Method, Request, is_success, names},
@@ -70,9 +70,9 @@ impl There {
     }
 
     /// Makes a portion as the write queue does.
-    fn merge(&mut self, seq: usize, calls: &[Request]) -> Answer {
+    fn merge(&mut self, seq: usize, calls: &[Request]) -> MergeAnswer {
         if seq < self.known {
-            return Answer::Again;
+            return MergeAnswer::Again;
         }
         let mut changes = Changes::default();
         for (by, call) in &self.journal[seq..] {
@@ -92,7 +92,7 @@ impl There {
             fault @ Reply::Fault { .. } => panic!("{fault:?}"),
         });
         let results = results.collect::<Vec<_>>();
-        Answer::of(&verdicts, &Reply::Value(results.into()))
+        MergeAnswer::of(&verdicts, &Reply::Value(results.into()))
     }
 }
 
@@ -141,7 +141,8 @@ fn play(seed: u64, counts: &mut Counts) {
     }
     let base = there.journal.len();
     let mut here = there.state.clone();
-    let (mut changes, mut pending, mut written) = (Changes::default(), Pending::default(), vec![]);
+    let (mut changes, mut pending, mut written) =
+        (Changes::default(), WritesToSend::default(), vec![]);
     // One was on its way when the cable was cut.
     let first = dice.write("/here", &mut ours);
     if dice.one_in(2) {
@@ -199,18 +200,18 @@ fn play(seed: u64, counts: &mut Counts) {
                 counts.unanswered += 1;
                 continue;
             }
-            let Answer::Done(outcomes) = answer else {
+            let MergeAnswer::Done(outcomes) = answer else {
                 counts.again += 1;
                 break;
             };
             for (call, outcome) in portion.iter().zip(outcomes) {
                 match outcome {
-                    Outcome::Holds => held.push(call.clone()),
-                    Outcome::Lost { .. } => reported.push(call.clone()),
-                    Outcome::Refused(_) if *call.method() == Method::DeleteParam => {
+                    WriteOutcome::Holds => held.push(call.clone()),
+                    WriteOutcome::Lost { .. } => reported.push(call.clone()),
+                    WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {
                         counts.refused += 1;
                     }
-                    Outcome::Refused(why) => panic!("seed {seed}: {why}"),
+                    WriteOutcome::Refused(why) => panic!("seed {seed}: {why}"),
                 }
             }
             left.drain(..count);
@@ -263,7 +264,7 @@ fn play(seed: u64, counts: &mut Counts) {
             assert!(was_so, "seed {seed}: {call:?} was lost without a word");
         }
     }
-    // Where nobody else has written, all is as it was here.
+    // Where no other computer has written, all is as it was here.
     for key in KEYS {
         let this = Request::new(Method::DeleteParam, ["/here", key]);
         let about = written.iter().filter(|call| related(call, &this));

@@ -1,147 +1,398 @@
-//! Calls that write: who records and answers them, and what becomes of those that were answered alone.
+//! What nodes call and hear: writes, reads, merges and notifications.
 
-use std::time::Duration;
-
-use super::super::super::machine::{Commit, Input, Role, WhenAlone};
-use super::super::computer::Own;
-use super::super::etcd::Write;
-use super::{Event, World};
+use super::*;
 
 impl World {
-    /// What the leader knows to be in the journal is a part of it.
-    pub(super) fn settle(&mut self, at: usize) {
-        let computer = &mut self.computers[at];
-        while computer.machine.term().is_some() && computer.followed < computer.machine.committed()
-        {
-            let own = computer.own.remove(0);
-            let journaled = self.etcd.journal[computer.followed as usize];
-            assert_eq!(own.write, journaled, "seed {}", self.plan.seed);
-            computer.base[self.calls[own.write].key] = own.write + 1;
-            computer.followed += 1;
-            computer.answered = computer.answered.saturating_sub(1);
-        }
-    }
-
-    pub(super) fn record(&mut self, at: usize, write: Write, origin: usize) {
-        let computer = &mut self.computers[at];
-        if computer.own.iter().any(|own| own.write == write) {
-            return;
-        }
-        computer.own.push(Own { write, origin });
-        let seq = computer.followed + computer.own.len() as u64;
-        self.input(at, Input::Recorded(seq));
-    }
-
-    pub(super) fn acknowledge(&mut self, at: usize, seq: u64) {
+    pub(super) fn poll(&mut self, at: usize) {
         let computer = &self.computers[at];
-        let alone = computer.role == Role::Alone;
-        let upto = seq.saturating_sub(computer.followed) as usize;
-        let answered: Vec<_> = computer.own[computer.answered.min(upto)..upto].to_vec();
-        self.computers[at].answered = upto;
-        for Own { write, origin } in answered {
-            if self.plan.traced {
-                println!("{:>9} us, {at}: answers {write} of {origin}", self.now);
+        let behind = computer.watching
+            && computer.watch_at < self.now
+            && computer.watched.1 != self.etcd.view().revision;
+        if behind && self.network.reaches_etcd(at) {
+            // The watch is made anew.
+            self.computers[at].watch += 1;
+            self.show_watch(at);
+        }
+        for to in 0..COMPUTERS {
+            if self.owed[at][to] && self.network.joins(at, to) {
+                self.owed[at][to] = false;
+                self.tell_state(at, to);
             }
-            self.counts.acknowledged += 1;
-            let call = &mut self.calls[write];
-            // A beat of a leader that is alone may still arrive.
-            let committed = self.etcd.journal.contains(&write);
-            call.alone |= alone;
-            call.led |= !alone;
-            if !alone {
-                let computer = &self.computers[at];
-                let term = computer.machine.term().unwrap();
-                // What is in the journal is safe, whoever says so.
-                let sole = term >= self.term && self.plan.commit == Commit::Interval;
-                assert!(
-                    committed || sole,
-                    "seed {}: two leaders answer",
-                    self.plan.seed
-                );
-                self.term = self.term.max(term);
-            }
-            let delay = self.delay();
-            if origin == at {
-                self.done(at, write);
-            } else if self.network.joins(at, origin) {
-                self.after(delay, Event::Done(origin, write));
-            }
+        }
+        self.flush(at);
+        let computer = &self.computers[at];
+        // Besides its times alone, the writes that it answered as a leader before it was deposed.
+        let times = computer.times_alone + 1;
+        if computer.standing == Standing::Alone && computer.member.uncommitted() > KEYS * times {
+            self.history.breaks("what is kept grows with each write");
+        }
+        if computer.standing != Standing::Alone && computer.disk.kept.is_none() {
+            self.computers[at].times_alone = 0;
         }
     }
 
-    /// Does what can be done about the calls that wait, and about pending ones.
+    /// Does what can be done about the calls that wait.
     pub(super) fn flush(&mut self, at: usize) {
-        let computer = &self.computers[at];
-        let waiting = computer.waiting.clone();
-        match computer.role {
-            _ if computer.machine.takes_writes() => {
-                waiting
-                    .into_iter()
-                    .for_each(|write| self.record(at, write, at));
-            }
-            Role::Following => {
-                if let Some(to) = self.peer_of(at) {
-                    for write in waiting {
+        let waiting = self.computers[at].waiting.clone();
+        for (call, missed) in waiting {
+            match self.computers[at].standing.clone() {
+                standing if standing.answers() => self.run_call(at, call, at),
+                Standing::Follows { uri: to, term } if missed <= self.now => {
+                    let to = (0..COMPUTERS).find(|of| uri(*of) == to);
+                    if let Some(to) = to.filter(|to| self.network.joins(at, *to)) {
                         let delay = self.delay();
-                        self.after(delay, Event::Forward(at, to, write));
-                    }
-                }
-            }
-            _ => {}
-        }
-        self.merge(at);
-    }
-
-    /// Sends the first pending write, unless what it is about was changed meanwhile.
-    pub(super) fn merge(&mut self, at: usize) {
-        loop {
-            let computer = &mut self.computers[at];
-            let Some(write) = computer.pending.first().copied() else {
-                return;
-            };
-            if computer.followed < computer.machine.view().seq() {
-                return;
-            }
-            let key = self.calls[write].key;
-            let (was, is) = (computer.cut_off[key], computer.base[key]);
-            let own = computer.pending.iter().any(|pending| pending + 1 == is);
-            if was != is && !own {
-                computer.pending.remove(0);
-                self.calls[write].reported = true;
-                if self.plan.traced {
-                    println!("{:>9} us, {at}: reports {write}", self.now);
-                }
-                self.counts.reported += 1;
-                continue;
-            }
-            match computer.role {
-                Role::Leading if computer.machine.takes_writes() => self.record(at, write, at),
-                Role::Following => {
-                    if let Some(to) = self.peer_of(at) {
-                        let delay = self.delay();
-                        self.after(delay, Event::Forward(at, to, write));
+                        self.after(delay, Event::Forward(at, to, term, call));
+                        for (waits, missed) in &mut self.computers[at].waiting {
+                            if *waits == call {
+                                *missed = self.now + 1000 * MS;
+                            }
+                        }
                     }
                 }
                 _ => {}
             }
+        }
+        self.input_changes(at);
+    }
+
+    /// Runs a call where it is recorded.
+    pub(super) fn run_call(&mut self, at: usize, call: usize, origin: usize) {
+        let source = match origin == at {
+            true => Source::Here,
+            false => Source::Forwarded,
+        };
+        let request = self.history.request(call);
+        let computer = &mut self.computers[at];
+        let local = computer.local(self.now);
+        let waits = computer.ledger.unanswered.iter();
+        let waits = waits.filter(|of| of.call == call && of.origin == origin);
+        if waits.count() > 0 || !computer.ledger.has_lease(local) {
             return;
+        }
+        let Some((seq, recorded, notices)) = computer.ledger.run(&request, &source) else {
+            return;
+        };
+        computer.ledger.unanswered.push(Unanswered {
+            seq,
+            recorded,
+            call,
+            origin,
+        });
+        let agreed = computer.ledger.agreed;
+        self.tell_notices(at, notices);
+        self.agree(at, agreed);
+    }
+
+    pub(super) fn agree(&mut self, at: usize, seq: u64) {
+        let computer = &mut self.computers[at];
+        let ledger = &mut computer.ledger;
+        ledger.agreed = ledger.agreed.max(seq);
+        let agreed = ledger.agreed;
+        let (answered, left): (Vec<_>, Vec<_>) = std::mem::take(&mut ledger.unanswered)
+            .into_iter()
+            .partition(|of| of.seq <= agreed);
+        ledger.unanswered = left;
+        let merges = std::mem::take(&mut ledger.merges).into_iter();
+        let (merged, left): (Vec<_>, Vec<_>) = merges.partition(|(seq, ..)| *seq <= agreed);
+        ledger.merges = left;
+        for (_, asker, answer) in merged {
+            self.merge_answered(asker, at, Some(answer));
+        }
+        for Unanswered {
+            recorded,
+            call,
+            origin,
+            ..
+        } in answered
+        {
+            self.counts.acknowledged += 1;
+            let alone = self.computers[at].member.role() == Role::Alone;
+            let term = self.computers[at].member.machine().term();
+            if let Some(term) = term.filter(|_| !alone) {
+                // What is in the journal is safe, whoever says so.
+                let committed = self.etcd.holds(&self.history.request(call));
+                if recorded && !committed && term < self.term {
+                    self.history.breaks("two leaders answer");
+                }
+                let always = self.plan.commit == Commit::Always;
+                if recorded && !committed && always && !self.etcd.lost {
+                    self.history
+                        .breaks("a leader answers what no journal holds");
+                }
+                self.term = self.term.max(term);
+            }
+            let cut = self.computers[at].cut;
+            self.history
+                .answered(at, call, self.now, alone.then_some(cut), recorded);
+            let place = place(term.unwrap_or(0), agreed);
+            let life = self.computers[origin].life;
+            if origin == at {
+                self.done(at, call);
+            } else if self.network.joins(at, origin) {
+                let delay = self.delay();
+                self.after(delay, Event::Done(origin, life, call, place));
+            } else {
+                self.history.unheard(call);
+            }
         }
     }
 
     /// A call of this computer's nodes was answered.
-    pub(super) fn done(&mut self, at: usize, write: Write) {
+    pub(super) fn done(&mut self, at: usize, call: usize) {
         let computer = &mut self.computers[at];
-        if computer.up {
-            let waits = computer.waiting.contains(&write);
-            let made = self.calls[write].made;
-            if waits && self.plan.alone == WhenAlone::Serve && computer.undisturbed_since <= made {
+        let waits = computer.waiting.iter().any(|(of, _)| *of == call);
+        if waits {
+            self.history.heard(call, self.now);
+            let made = self.history.calls[call].made;
+            if self.plan.alone == WhenAlone::Serve && computer.undisturbed_since <= made {
                 let waited = Duration::from_micros(self.now - made);
                 self.counts.waited = self.counts.waited.max(waited);
             }
-            computer.waiting.retain(|waits| *waits != write);
-            let before = computer.pending.len();
-            computer.pending.retain(|waits| *waits != write);
-            self.counts.merged += (before - computer.pending.len()) as u64;
+            computer.waiting.retain(|(of, _)| *of != call);
         }
+    }
+
+    /// The leader makes writes that were answered alone.
+    pub(super) fn merge(&mut self, asker: Asker, to: Option<usize>, term: u64, ask: Ask) {
+        let (from, ..) = asker;
+        let at = to.unwrap_or(from);
+        let there = &self.computers[at];
+        let standing_fits = match to {
+            Some(_) => there.standing.answers_others(term) && self.network.joins(from, at),
+            None => there.ledger.sharing.is_some() && there.standing != Standing::Alone,
+        };
+        let local = there.local(self.now);
+        let fits = there.up && standing_fits && there.ledger.has_lease(local);
+        let mut answer = None;
+        if fits {
+            let calls: Vec<_> = ask.calls.iter().collect();
+            let ledger = &mut self.computers[at].ledger;
+            let mirror = &ledger.mirror;
+            let sharing = ledger.sharing.as_ref();
+            let verdicts = sharing.and_then(|of| of.judge(mirror, ask.seq, &ask.id, &calls));
+            answer = Some(match verdicts {
+                None => wire::MergeAnswer::Again,
+                Some(verdicts) => {
+                    let source = Source::Merge(ask.id.clone());
+                    let mut results = Vec::new();
+                    for (call, verdict) in ask.calls.iter().zip(&verdicts) {
+                        if *verdict == crate::cluster::merge::Verdict::Runs {
+                            let ledger = &mut self.computers[at].ledger;
+                            let ran = ledger.run(call, &source);
+                            results.push(Value::Array(vec![
+                                vec![Value::from(1), "".into(), 0.into()].into(),
+                            ]));
+                            let log = self.etcd.log.len();
+                            self.history.merged(from, call, self.now, log);
+                            if let Some((_, _, notices)) = ran {
+                                self.tell_notices(at, notices);
+                            }
+                        }
+                    }
+                    wire::MergeAnswer::of(&verdicts, &Reply::Value(results.into()))
+                }
+            });
+        }
+        let Some(answer) = answer else {
+            return self.merge_answered(asker, at, None);
+        };
+        // It waits until the journal has them.
+        let ledger = &mut self.computers[at].ledger;
+        let seq = ledger.sharing.as_ref().map_or(0, |of| of.last());
+        let agreed = ledger.agreed;
+        ledger.merges.push((seq, asker, answer));
+        self.input_changes(at);
+        self.agree(at, agreed);
+    }
+
+    pub(super) fn merge_answered(
+        &mut self,
+        (to, life, number): Asker,
+        at: usize,
+        answer: Option<wire::MergeAnswer>,
+    ) {
+        let delay = self.delay();
+        let answer = answer.filter(|_| to == at || self.network.joins(at, to));
+        let merged = Input::Merged { number, answer };
+        self.after(delay, Event::Input(to, life, merged));
+    }
+
+    pub(super) fn client(&mut self, at: usize) {
+        let pause = self.dice.below(300) * MS;
+        self.after(pause, Event::Client(at));
+        if !self.computers[at].up || self.network.healed_for(self.now, 2_000 * MS) {
+            return;
+        }
+        let key = self.dice.below(KEYS as u64) as usize;
+        if self.dice.one_in(3) {
+            return self.begin_read(at, key);
+        }
+        let again = self.dice.one_in(3).then(|| self.dice.below(4));
+        let call = self.history.write(at, key, self.now, again);
+        self.computers[at].waiting.push((call, 0));
+        self.flush(at);
+    }
+
+    /// Whether a leader, or one that was cut off, shows what the journal may lack.
+    pub(super) fn is_early(&self, at: usize) -> bool {
+        let computer = &self.computers[at];
+        let sharing = computer.ledger.sharing.as_ref();
+        let committed = computer.member.machine().committed();
+        sharing.is_some_and(|of| of.last() > committed) || computer.member.uncommitted() > 0
+    }
+
+    pub(super) fn value(&self, at: usize, key: usize) -> Option<i32> {
+        value_of(&self.computers[at].ledger.mirror, key)
+    }
+
+    pub(super) fn begin_read(&mut self, at: usize, key: usize) {
+        let read = self.history.reads.len();
+        self.history.reads.push(Read::new(at, key, self.now));
+        let computer = &self.computers[at];
+        let life = computer.life;
+        match computer.standing.clone() {
+            Standing::Follows { uri: to, term } => {
+                let delay = self.delay();
+                let to = (0..COMPUTERS).find(|of| uri(*of) == to);
+                if let Some(to) = to.filter(|to| self.network.joins(at, *to)) {
+                    self.after(delay, Event::Ask(at, life, to, term, read));
+                }
+                self.after(100 * MS, Event::Late(at, life, read));
+            }
+            _ => self.read_late(at, life, read),
+        }
+    }
+
+    /// The mirror answers, if it may.
+    pub(super) fn read_late(&mut self, at: usize, life: u64, read: usize) {
+        let key = self.history.reads[read].key;
+        let computer = &self.computers[at];
+        let fresh = computer.member.place().shows(computer.told);
+        let (may, alone) = match &computer.standing {
+            Standing::Alone => (true, true),
+            Standing::Leads {
+                pass: Pass::Calls, ..
+            } => (true, false),
+            Standing::Leads { pass, .. } => (fresh && *pass == Pass::Reads, false),
+            Standing::Follows { .. } => (fresh, false),
+            Standing::Nobody { known } => (fresh && *known, false),
+        };
+        if may {
+            let value = self.value(at, key);
+            let early = alone || self.is_early(at);
+            self.read_done(read, value, early);
+        } else if self.now < self.history.reads[read].began + 8_000 * MS {
+            self.after(POLL, Event::Late(at, life, read));
+        }
+    }
+
+    pub(super) fn read_done(&mut self, read: usize, value: Option<i32>, alone: bool) {
+        let read = &mut self.history.reads[read];
+        (read.value, read.done, read.alone) = (value, Some(self.now), alone);
+        self.counts.reads += 1;
+    }
+
+    /// The master, or the mirror in its place, notifies nodes.
+    pub(super) fn tell_notices(&mut self, at: usize, notices: Vec<Notice>) {
+        for notice in notices {
+            if let Notice::ParamUpdate {
+                to,
+                key: name,
+                value,
+            } = notice
+            {
+                let to = (0..COMPUTERS)
+                    .find(|of| super::super::history::node(*of) == to)
+                    .unwrap();
+                let of = (0..KEYS)
+                    .find(|of| format!("{}/", key(*of)) == name)
+                    .unwrap();
+                self.tell_node(at, to, of, value.as_int());
+            }
+        }
+    }
+
+    pub(super) fn tell_state(&mut self, at: usize, to: usize) {
+        for key in 0..KEYS {
+            let value = self.value(at, key);
+            if value.is_some() {
+                self.tell_node(at, to, key, value);
+            }
+        }
+    }
+
+    pub(super) fn tell_node(&mut self, from: usize, to: usize, key: usize, value: Option<i32>) {
+        let computer = &self.computers[from];
+        let local = computer.local(self.now);
+        let by_mirror = computer.master.is_none();
+        if by_mirror && (computer.own_only && to != from || !computer.ledger.has_lease(local)) {
+            return;
+        }
+        let master = computer.master;
+        let delay = MS / 2 + self.dice.below(15 * MS);
+        let at = self.channels[from][to].max(self.now + delay);
+        self.channels[from][to] = at;
+        let notify = Event::Notify {
+            from,
+            master,
+            to,
+            key,
+            value,
+        };
+        self.at(at, notify);
+    }
+
+    pub(super) fn notify(
+        &mut self,
+        from: usize,
+        master: Option<u64>,
+        to: usize,
+        key: usize,
+        value: Option<i32>,
+    ) {
+        if master.is_some_and(|of| self.computers[from].master != Some(of)) {
+            // It has ended.
+            return;
+        }
+        if let Some(master) = master
+            && let Some(stuck) = self.stuck.get_mut(&(from, master, to))
+        {
+            stuck.push_back((key, value));
+            return;
+        }
+        if self.network.joins(from, to) {
+            return self.told(from, to, key, value);
+        }
+        if self.computers[from].ledger.sharing.is_some() {
+            self.owed[from][to] = true;
+        }
+        if let Some(master) = master {
+            let stuck = VecDeque::from([(key, value)]);
+            self.stuck.insert((from, master, to), stuck);
+            self.after(150 * MS, Event::Retry(from, master, to));
+        }
+    }
+
+    /// rosmaster tries again and again.
+    pub(super) fn retry(&mut self, from: usize, master: u64, to: usize) {
+        let lives = self.computers[from].master == Some(master);
+        if lives && !self.network.joins(from, to) {
+            return self.after(150 * MS, Event::Retry(from, master, to));
+        }
+        let stuck = self.stuck.remove(&(from, master, to)).unwrap_or_default();
+        for (key, value) in stuck.into_iter().filter(|_| lives) {
+            self.told(from, to, key, value);
+        }
+    }
+
+    fn told(&mut self, from: usize, to: usize, key: usize, value: Option<i32>) {
+        self.trace(|| format!("{from} tells {to} that {key} is {value:?}"));
+        self.history.told[to][key] = value;
+    }
+
+    /// The one delay of the network.
+    pub(super) fn delay(&mut self) -> u64 {
+        let slow = self.network.slow(self.now);
+        MS / 2 + self.dice.below(20 * MS) + slow
     }
 }

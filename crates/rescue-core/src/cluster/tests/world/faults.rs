@@ -2,8 +2,11 @@
 
 use std::time::Duration;
 
-use super::super::super::machine::{Commit, Input, WhenAlone};
 use super::{COMPUTERS, Event, MS, World};
+use crate::cluster::{
+    machine::{Commit, WhenAlone},
+    member::Input,
+};
 
 #[derive(Clone, Debug)]
 pub(in super::super) struct Plan {
@@ -11,6 +14,8 @@ pub(in super::super) struct Plan {
     pub(in super::super) commit: Commit,
     pub(in super::super) alone: WhenAlone,
     pub(in super::super) faults: bool,
+    /// Two computers have one name.
+    pub(in super::super) twins: bool,
     pub(in super::super) ttl: Duration,
     /// Whether it is printed what happens.
     pub(in super::super) traced: bool,
@@ -21,6 +26,7 @@ pub(in super::super) struct Counts {
     pub(in super::super) reigns: u64,
     pub(in super::super) alone: u64,
     pub(in super::super) acknowledged: u64,
+    pub(in super::super) reads: u64,
     pub(in super::super) merged: u64,
     pub(in super::super) reported: u64,
     /// The longest time that a call waited where nothing hung, while computers that are alone serve.
@@ -32,6 +38,7 @@ impl Counts {
         self.reigns += other.reigns;
         self.alone += other.alone;
         self.acknowledged += other.acknowledged;
+        self.reads += other.reads;
         self.merged += other.merged;
         self.reported += other.reported;
         self.waited = self.waited.max(other.waited);
@@ -41,8 +48,13 @@ impl Counts {
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Fault {
     Kill(usize),
+    /// Its disk goes back to what was synced last.
+    PowerCut(usize),
+    AllPowerCut,
     CutFromEtcd(usize),
     CutPair(usize, usize),
+    /// Nothing of the first reaches the second.
+    CutOneWay(usize, usize),
     /// From the other computers and from etcd.
     CutOff(usize),
     EtcdAway,
@@ -52,11 +64,13 @@ pub(super) enum Fault {
 pub(super) struct Network {
     /// How many failures keep a computer from etcd,
     from_etcd: [u32; COMPUTERS],
-    /// and from another one; the smaller index first.
-    pairs: [[u32; COMPUTERS]; COMPUTERS],
+    /// and one from another one.
+    ways: [[u32; COMPUTERS]; COMPUTERS],
     etcd_away: u32,
     slow_until: u64,
     slow_by: u64,
+    etcd_slow_until: u64,
+    etcd_slow_by: u64,
     healed: Option<u64>,
 }
 
@@ -65,15 +79,21 @@ impl Network {
         self.healed.is_some() || (self.etcd_away == 0 && self.from_etcd[at] == 0)
     }
 
-    pub(super) fn joins(&self, a: usize, b: usize) -> bool {
-        self.healed.is_some() || self.pairs[a.min(b)][a.max(b)] == 0
+    pub(super) fn joins(&self, from: usize, to: usize) -> bool {
+        self.healed.is_some() || self.ways[from][to] == 0
     }
 
     pub(super) fn slow(&self, now: u64) -> u64 {
-        if now < self.slow_until {
-            self.slow_by
-        } else {
-            0
+        match now < self.slow_until {
+            true => self.slow_by,
+            false => 0,
+        }
+    }
+
+    pub(super) fn etcd_slow(&self, now: u64) -> u64 {
+        match now < self.etcd_slow_until {
+            true => self.etcd_slow_by,
+            false => 0,
         }
     }
 
@@ -85,13 +105,18 @@ impl Network {
     fn cut(&mut self, fault: Fault, by: i32) {
         let add = |count: &mut u32| *count = count.checked_add_signed(by).unwrap();
         match fault {
-            Fault::Kill(_) => {}
+            Fault::Kill(_) | Fault::PowerCut(_) | Fault::AllPowerCut => {}
             Fault::CutFromEtcd(at) => add(&mut self.from_etcd[at]),
-            Fault::CutPair(a, b) => add(&mut self.pairs[a.min(b)][a.max(b)]),
+            Fault::CutPair(a, b) => {
+                add(&mut self.ways[a][b]);
+                add(&mut self.ways[b][a]);
+            }
+            Fault::CutOneWay(from, to) => add(&mut self.ways[from][to]),
             Fault::CutOff(at) => {
                 add(&mut self.from_etcd[at]);
                 for other in (0..COMPUTERS).filter(|other| *other != at) {
-                    add(&mut self.pairs[at.min(other)][at.max(other)]);
+                    add(&mut self.ways[at][other]);
+                    add(&mut self.ways[other][at]);
                 }
             }
             Fault::EtcdAway => add(&mut self.etcd_away),
@@ -107,12 +132,16 @@ impl World {
         }
         let pause = (100 + self.dice.below(1500)) * MS;
         self.after(pause, Event::Fault);
+        if self.etcd.log.is_empty() {
+            // The first leader alone has the state in which all begins.
+            return;
+        }
         let at = self.dice.below(COMPUTERS as u64) as usize;
         // Who leads is hit more often.
         let leader = self.leaders().first().copied();
         let at = leader.filter(|_| self.dice.one_in(2)).unwrap_or(at);
         let other = (at + 1 + self.dice.below(COMPUTERS as u64 - 1) as usize) % COMPUTERS;
-        let fault = match self.dice.below(9) {
+        let fault = match self.dice.below(14) {
             0 | 1 => Fault::Kill(at),
             2 => Fault::CutFromEtcd(at),
             3 => Fault::CutPair(at, other),
@@ -123,6 +152,7 @@ impl World {
                 let computer = &mut self.computers[at];
                 computer.hangs_until = computer.hangs_until.max(self.now + time);
                 computer.undisturbed_since = computer.hangs_until;
+                self.trace(|| format!("{at} hangs for {} ms", time / MS));
                 return;
             }
             7 => {
@@ -130,11 +160,24 @@ impl World {
                 self.network.slow_by = self.dice.below(2200) * MS;
                 return;
             }
+            8 => {
+                self.network.etcd_slow_until = self.now + self.dice.below(6000) * MS;
+                self.network.etcd_slow_by = self.dice.below(4000) * MS;
+                return;
+            }
+            9 => Fault::PowerCut(at),
+            10 => match self.dice.one_in(3) {
+                true => Fault::AllPowerCut,
+                false => Fault::CutOneWay(at, other),
+            },
+            11 => {
+                self.etcd.compact();
+                return;
+            }
+            12 => Fault::CutOneWay(other, at),
             _ => return self.hand_over(at),
         };
-        if self.plan.traced {
-            println!("{:>9} us: {fault:?}", self.now);
-        }
+        self.trace(|| format!("{fault:?}"));
         let time = (20 + self.dice.below(4000)) * MS;
         self.strike(fault, time);
     }
@@ -142,9 +185,19 @@ impl World {
     fn strike(&mut self, fault: Fault, time: u64) {
         match fault {
             Fault::Kill(at) => self.kill(at),
+            Fault::PowerCut(at) => self.cut_power(at),
+            Fault::AllPowerCut => (0..COMPUTERS).for_each(|at| self.cut_power(at)),
             _ => self.network.cut(fault, 1),
         }
         self.after(time, Event::End(fault));
+    }
+
+    fn cut_power(&mut self, at: usize) {
+        self.kill(at);
+        let computer = &mut self.computers[at];
+        computer.disk = computer.synced.clone();
+        // Its nodes have died, too.
+        self.history.loses_power(at, computer.synced_at, self.now);
     }
 
     /// One failure of some seconds.
@@ -167,36 +220,52 @@ impl World {
         format!("{fault:?} for {} ms", time / MS)
     }
 
+    /// etcd is stopped, and comes back without its data.
+    pub(in super::super) fn lose_etcd(&mut self) {
+        let time = (20 + self.dice.below(6000)) * MS;
+        self.strike(Fault::EtcdAway, time);
+        self.etcd.lose();
+    }
+
     pub(super) fn end(&mut self, fault: Fault) {
         match fault {
-            Fault::Kill(at) => self.start(at),
+            Fault::Kill(at) | Fault::PowerCut(at) => self.start(at),
+            Fault::AllPowerCut => (0..COMPUTERS).for_each(|at| self.start(at)),
             _ => self.network.cut(fault, -1),
         }
     }
 
     pub(in super::super) fn kill(&mut self, at: usize) {
-        self.computers[at].up = false;
+        let computer = &mut self.computers[at];
+        computer.up = false;
+        computer.master = None;
+        // Nobody waits any more for calls that were made there.
+        for (call, _) in std::mem::take(&mut computer.waiting) {
+            self.history.gives_up(call);
+        }
     }
 
     fn start(&mut self, at: usize) {
-        if !self.computers[at].up {
-            let settings = (self.plan.commit, self.plan.alone, self.plan.ttl);
-            self.computers[at].start(at, &settings);
-            let followed = self.computers[at].followed;
-            self.input(at, Input::Start(followed));
+        if !self.computers[at].up && !self.computers[at].refused {
+            let plan = self.plan.clone();
+            self.history.skips(at, self.now);
+            self.computers[at].start(at, &plan);
+            self.input(at, Input::Begin);
         }
     }
 
     pub(in super::super) fn hand_over(&mut self, at: usize) {
         if self.computers[at].up {
-            self.input(at, Input::HandOver(String::new()));
+            let to = String::new();
+            let refused = None;
+            self.input(at, Input::HandOver { to, refused });
         }
     }
 
     /// All failures end, and no more follow.
     pub(in super::super) fn heal(&mut self) {
         self.network.healed = Some(self.now);
-        self.network.slow_until = 0;
+        (self.network.slow_until, self.network.etcd_slow_until) = (0, 0);
         for at in 0..COMPUTERS {
             self.computers[at].hangs_until = self.computers[at].hangs_until.min(self.now);
             self.start(at);

@@ -1,38 +1,37 @@
-//! Changes of this computer that are not known to be in the journal.
+//! Changes of this computer that may not be in the journal yet. Pure.
 
-use std::{collections::VecDeque, pin::Pin};
+use std::{collections::VecDeque, ops::RangeInclusive};
 
 use crate::{
-    checkpoint::format::{self, Checkpoint, Entry, Record},
-    cluster::journal::{self, JournalError, Keys, Put},
-    ledger::{Change, Source},
-    master,
+    checkpoint::format::{self, Checkpoint, Record, RecordContent},
+    cluster::{
+        journal::{self, JournalError, Keys, Put},
+        sharing::{Change, Source},
+    },
+    master::{self, Master},
     xmlrpc::Value,
 };
 
-/// So many may be on their way at once.
+/// How many changes may be on their way at once.
 const FIRST: usize = journal::BATCH_RECORDS;
-/// Most bytes of those behind them while this computer is alone, about.
+/// The approximate size limit of the changes behind them while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
 
-/// Writes the parts of a change. Gives whether this process still leads, if that is known.
-pub(super) type Preparing = Pin<Box<dyn Future<Output = Option<bool>> + Send>>;
-
-/// In the order of their numbers.
-#[derive(Default)]
-pub(super) struct Outgoing {
+/// The changes, in the order of their numbers.
+#[derive(Debug, Default)]
+pub struct Outgoing {
     changes: VecDeque<Change>,
-    /// The last one that may be given to the journal,
+    /// The last change that may be written to the journal.
     ready: u64,
-    /// and the last one of which all parts are in etcd.
+    /// The last change whose parts are all in etcd.
     written: u64,
-    /// The parts of the one after that are being written.
-    pub(super) preparing: Option<Preparing>,
+    /// Whether the parts of the next change are being written.
+    pub preparing: bool,
 }
 
 impl Outgoing {
-    /// Nothing is left of earlier changes; the next one has a number after `seq`.
-    pub(super) fn start(&mut self, seq: u64) {
+    /// Starts over. The next change has a number after `seq`.
+    pub fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
             written: seq,
@@ -40,51 +39,66 @@ impl Outgoing {
         };
     }
 
-    pub(super) fn add(&mut self, changes: impl IntoIterator<Item = Change>) {
+    pub fn add(&mut self, changes: impl IntoIterator<Item = Change>) {
         self.changes.extend(changes);
     }
 
-    pub(super) fn len(&self) -> usize {
+    /// How many changes are not in the journal yet.
+    pub fn count(&self) -> usize {
         self.changes.len()
     }
 
-    pub(super) fn changes(&self) -> impl Iterator<Item = &Change> {
+    pub fn changes(&self) -> impl Iterator<Item = &Change> {
         self.changes.iter()
     }
 
-    /// Drops all: nobody is given them.
-    pub(super) fn forget(&mut self) {
+    /// Applies the changes with these numbers to `state`.
+    pub fn apply(&self, seqs: RangeInclusive<u64>, state: &mut Master) {
+        for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
+            match change {
+                Change::Call(record, _) => {
+                    if let RecordContent::Call { call, .. } = &record.entry {
+                        state.apply_telling(&call.clone().into(), &mut ());
+                    }
+                }
+                Change::State { state: whole, .. } => *state = (**whole).clone(),
+            }
+        }
+    }
+
+    /// Drops all changes.
+    pub fn forget(&mut self) {
         self.changes.clear();
     }
 
-    /// Whether so many have piled up that a state is to take the place of the later ones.
-    pub(super) fn has_outgrown(&self) -> bool {
+    /// Whether so many changes have piled up that one state should replace the later ones.
+    pub fn has_outgrown(&self) -> bool {
         let later = self.changes.iter().skip(FIRST);
         self.changes.len() > 2 * FIRST || later.map(weight_of).sum::<usize>() > BYTES_MOST
     }
 
-    /// Replaces all but the first ones, which may be on their way, by the state `rest`.
-    pub(super) fn replace_rest(&mut self, rest: Option<Change>) {
+    /// Replaces all changes but the first ones, which may be on their way, by the state `rest`.
+    pub fn replace_rest(&mut self, rest: Option<Change>) {
         if let Some(rest) = rest {
             self.changes.truncate(FIRST);
             self.changes.push_back(rest);
         }
     }
 
-    /// The last one that is ready.
-    pub(super) fn ready(&self) -> u64 {
+    /// The number of the last change that is ready to be written.
+    pub fn ready(&self) -> u64 {
         self.ready
     }
 
-    /// All are ready: this computer is alone, and nobody is given them now.
-    pub(super) fn all_ready(&mut self) {
-        self.preparing = None;
+    /// Marks all changes as ready, because this computer is cut off and writes none of them now.
+    pub fn all_ready(&mut self) {
+        self.preparing = false;
         self.ready = self.changes.back().map_or(self.ready, Change::seq);
     }
 
-    /// Those that need no parts are ready, up to the first one that does. Returns its parts.
-    pub(super) fn prepare(&mut self, keys: &Keys) -> Result<Option<Vec<Put>>, JournalError> {
-        if self.preparing.is_some() {
+    /// Marks changes as ready up to the first one that needs parts, and returns its parts.
+    pub fn prepare(&mut self, keys: &Keys) -> Result<Option<Vec<Put>>, JournalError> {
+        if self.preparing {
             return Ok(None);
         }
         for change in &self.changes {
@@ -101,31 +115,31 @@ impl Outgoing {
         Ok(None)
     }
 
-    /// The parts of the next one have been written.
-    pub(super) fn prepared(&mut self) {
+    /// Notes that the parts of the next change have been written.
+    pub fn prepared(&mut self) {
         let next = self.changes.iter().find(|of| of.seq() > self.ready);
         self.ready = next.map_or(self.ready, Change::seq);
         self.written = self.ready;
     }
 
-    /// The next one cannot be written: a call that changes nothing takes its number.
-    pub(super) fn leave_out_next(&mut self) {
+    /// Replaces the next change, which cannot be written, by a call that changes nothing.
+    pub fn leave_out_next(&mut self) {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
-            let (seq, entry) = (next.seq(), Entry::call(master::get_pid()));
+            let (seq, entry) = (next.seq(), RecordContent::call(master::get_pid()));
             *next = Change::Call(Record { seq, entry }, Source::Here);
         }
     }
 
-    /// The parts of the next beat's entry that are not in etcd: it was made while this computer was alone.
-    pub(super) fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
+    /// The parts of the next beat's entry that are not in etcd, because it was made while this computer was cut off.
+    pub fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
         let first = self.changes.front().filter(|of| of.seq() > self.written);
         let parts = first.map(|change| parts(keys, change));
         parts.and_then(Result::ok).unwrap_or_default()
     }
 
-    /// What the next beat adds to the journal, up to `seq`.
-    pub(super) fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
+    /// The journal entry of the next beat, up to `seq`.
+    pub fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
         if let Some(first @ Change::State { .. }) =
             self.changes.front().filter(|of| of.seq() <= seq)
         {
@@ -138,14 +152,14 @@ impl Outgoing {
         Ok(journal::pack(keys, &records.collect::<Vec<_>>())?.entry)
     }
 
-    /// Takes out all.
-    pub(super) fn take_all(&mut self) -> Vec<Change> {
-        self.preparing = None;
+    /// Removes and returns all changes.
+    pub fn take_all(&mut self) -> Vec<Change> {
+        self.preparing = false;
         self.changes.drain(..).collect()
     }
 
-    /// Takes out those that are in the journal, up to `seq`.
-    pub(super) fn committed(&mut self, seq: u64) -> Vec<Change> {
+    /// Removes and returns the changes up to `seq`, which are in the journal.
+    pub fn committed(&mut self, seq: u64) -> Vec<Change> {
         let count = self.changes.iter().take_while(|of| of.seq() <= seq).count();
         self.ready = self.ready.max(seq);
         self.written = self.written.max(seq);
@@ -160,12 +174,12 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
     }
 }
 
-/// About how many bytes a change takes.
+/// The approximate size of a change in bytes.
 fn weight_of(change: &Change) -> usize {
     match change {
         Change::Call(record, _) => match &record.entry {
-            Entry::Call { call, .. } => call.params.iter().map(Value::size).sum(),
-            Entry::Session(_) => 0,
+            RecordContent::Call { call, .. } => call.params.iter().map(Value::size).sum(),
+            RecordContent::Session(_) => 0,
         },
         // There is one.
         Change::State { .. } => 0,
@@ -190,12 +204,12 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cluster::journal::Manifest, master::Master, xmlrpc::Call};
+    use crate::{cluster::journal::Manifest, xmlrpc::Call};
 
     fn call(seq: u64, bytes: usize) -> Change {
         let value = "x".repeat(bytes).as_str().into();
         let call = Call::new("setParam", vec!["/n".into(), "/p".into(), value]);
-        let entry = Entry::call(call);
+        let entry = RecordContent::call(call);
         Change::Call(Record { seq, entry }, Source::Here)
     }
 
@@ -235,7 +249,7 @@ mod tests {
         assert_eq!(seqs(&outgoing.committed(6)), [5, 6]);
         assert_eq!(added(&outgoing, &keys, 7), [7]);
         assert_eq!(seqs(&outgoing.take_all()), [7]);
-        assert_eq!(outgoing.len(), 0);
+        assert_eq!(outgoing.count(), 0);
     }
 
     #[test]
@@ -243,11 +257,11 @@ mod tests {
         let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
         let parts = outgoing.prepare(&keys).unwrap().unwrap();
         assert_eq!((outgoing.ready(), parts.len()), (5, 1));
-        outgoing.preparing = Some(Box::pin(std::future::pending()));
+        outgoing.preparing = true;
         // Once at a time.
         assert!(outgoing.prepare(&keys).unwrap().is_none());
         assert_eq!(outgoing.ready(), 5);
-        outgoing.preparing = None;
+        outgoing.preparing = false;
         // They were not written, and are given again.
         assert_eq!(outgoing.prepare(&keys).unwrap(), Some(parts));
         outgoing.prepared();
@@ -264,9 +278,9 @@ mod tests {
     #[test]
     fn what_became_ready_alone_has_its_parts_written_with_the_beat() {
         let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
-        outgoing.preparing = Some(Box::pin(std::future::pending()));
+        outgoing.preparing = true;
         outgoing.all_ready();
-        assert!(outgoing.preparing.is_none());
+        assert!(!outgoing.preparing);
         assert_eq!(outgoing.ready(), 7);
         assert_eq!(outgoing.missing_parts(&keys), []);
         outgoing.committed(5);
@@ -305,7 +319,7 @@ mod tests {
         assert!(outgoing.has_outgrown());
         outgoing.replace_rest(Some(state(6 + count)));
         outgoing.all_ready();
-        assert_eq!((outgoing.len(), outgoing.ready()), (FIRST + 1, 6 + count));
+        assert_eq!((outgoing.count(), outgoing.ready()), (FIRST + 1, 6 + count));
         // A beat that is sent again has what it had.
         assert_eq!(added(&outgoing, &keys, 4 + count), before);
         outgoing.committed(4 + FIRST as u64);
@@ -334,7 +348,7 @@ mod tests {
         let [Change::Call(Record { seq: 6, entry }, _)] = instead.as_slice() else {
             panic!("{instead:?}");
         };
-        assert_eq!(*entry, Entry::call(master::get_pid()));
+        assert_eq!(*entry, RecordContent::call(master::get_pid()));
         assert_eq!(added(&outgoing, &keys, 7), [5, 6, 7]);
     }
 }

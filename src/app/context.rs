@@ -141,13 +141,13 @@ impl Context {
         process: MasterProcess,
         rosout: Option<bool>,
         cause: &'static str,
-    ) -> Duty {
+    ) -> MasterDuties {
         let stop = CancellationToken::new();
         let roscore_stop = stop.child_token();
         let roscore = rosout.map(|rosout| self.roscore(rosout, true, roscore_stop.clone()));
         let mut driver = self.driver(Some(process));
         let first = driver.take_over(cause);
-        Duty {
+        MasterDuties {
             driver: tokio::spawn(driver.run(first, stop.clone())),
             roscore,
             roscore_stop,
@@ -157,14 +157,14 @@ impl Context {
 }
 
 /// Recovery and roscore's other duties while this computer of several has the master.
-pub(super) struct Duty {
+pub(super) struct MasterDuties {
     driver: JoinHandle<Result<Option<MasterProcess>, ProcessError>>,
     roscore: Option<JoinHandle<()>>,
     roscore_stop: CancellationToken,
     stop: CancellationToken,
 }
 
-impl Duty {
+impl MasterDuties {
     /// Waits until recovery fails by itself, and returns the error. Cancel safe.
     pub(super) async fn failed(&mut self) -> ProcessError {
         match (&mut self.driver).await {

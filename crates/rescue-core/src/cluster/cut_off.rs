@@ -1,0 +1,323 @@
+//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; the shell also
+//! stores them beside the checkpoint.
+
+use std::collections::VecDeque;
+
+use crate::{
+    checkpoint::format::{Record, RecordContent},
+    cluster::{
+        merge::{self, Changes, WritesToSend},
+        mutant::Mutant,
+        sharing::Change,
+    },
+    master::{Master, Request},
+};
+
+/// How many periods of being cut off are kept apart.
+const TIMES_MOST: usize = 8;
+/// How many writes of a period can be recognised when they appear in the journal.
+const EXPECTED_MOST: usize = 4_000;
+
+/// One period of being cut off.
+#[derive(Clone, Debug)]
+pub struct Time {
+    /// The state when this computer was cut off.
+    pub base: Master,
+    /// The writes answered since.
+    pub pending: WritesToSend,
+    /// The others' changes since.
+    pub changes: Changes,
+    /// How many of the writes may also be in the journal.
+    expected: usize,
+}
+
+impl Time {
+    fn new(base: Master) -> Self {
+        Self {
+            base,
+            pending: WritesToSend::default(),
+            changes: Changes::default(),
+            expected: 0,
+        }
+    }
+}
+
+/// The periods whose writes have not all reached a leader, oldest first.
+#[derive(Clone, Debug, Default)]
+pub struct CutOff {
+    times: VecDeque<Time>,
+}
+
+impl CutOff {
+    /// Restores what an earlier process left: the state when it was cut off, and the writes answered since.
+    pub fn left(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
+        let mut time = Time::new(base);
+        for call in calls {
+            if Mutant::GuessesByValues.lives() {
+                time.changes.expect([call.clone()]);
+            }
+            time.pending.add(&call);
+        }
+        Self {
+            times: VecDeque::from([time]),
+        }
+    }
+
+    /// Whether a leader has all writes.
+    pub fn is_empty(&self) -> bool {
+        self.times.is_empty()
+    }
+
+    /// Begins a period of being cut off, in the state `base`.
+    pub fn begin(&mut self, base: Master) {
+        // The writes of earlier periods may still be on their way.
+        let earlier: Vec<_> = self.calls().cloned().collect();
+        let is_empty = self
+            .times
+            .back()
+            .is_some_and(|last| last.pending.is_empty());
+        if is_empty && self.times.len() > 1 {
+            self.times.pop_back();
+        }
+        // The oldest period may be on its way.
+        if self.times.len() >= TIMES_MOST
+            && let Some(second) = self.times.remove(2)
+            && let Some(first) = self.times.get_mut(1)
+        {
+            // The others' changes since the first of the two count for both.
+            second
+                .pending
+                .calls()
+                .for_each(|call| first.pending.add(call));
+        }
+        let mut time = Time::new(base);
+        time.changes.expect(earlier);
+        self.times.push_back(time);
+    }
+
+    /// Notes that others may run these calls of this computer. They do not count as others' changes.
+    pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
+        if let Some(time) = self.times.back_mut() {
+            time.changes.expect(calls);
+        }
+    }
+
+    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period.
+    pub fn expect_in_all(&mut self, calls: &[Request]) {
+        for time in &mut self.times {
+            time.changes.expect(calls.iter().cloned());
+        }
+    }
+
+    /// Notes new records of the journal.
+    pub fn note(&mut self, records: &[Record]) {
+        for time in &mut self.times {
+            for record in records {
+                if let RecordContent::Call { call, .. } = &record.entry {
+                    time.changes.note(record.seq, &Request::from(call.clone()));
+                }
+            }
+        }
+    }
+
+    /// Notes that the journal's state changed from `was` to `is`, without the records in between. `None` stands for
+    /// the state when this computer was cut off.
+    pub fn note_difference(&mut self, was: Option<&Master>, is: &Master) {
+        for time in &mut self.times {
+            let was = was.unwrap_or(&time.base);
+            time.changes.note_difference(was, is);
+        }
+    }
+
+    /// Returns the others' `state` plus the kept writes.
+    pub fn on(&self, state: &Master) -> Master {
+        let mut state = state.clone();
+        for time in &self.times {
+            for call in merge::merge(&time.changes, &state, time.pending.calls()).send {
+                state.apply_telling(&call, &mut ());
+            }
+        }
+        state
+    }
+
+    /// Keeps answered writes. `given` says whether they may also get into the journal. Returns the new ones.
+    pub fn add<'a>(
+        &mut self,
+        changes: impl IntoIterator<Item = &'a Change>,
+        given: bool,
+    ) -> Vec<Request> {
+        let Some(time) = self.times.back_mut() else {
+            return Vec::new();
+        };
+        let mut calls = Vec::new();
+        for change in changes {
+            // A whole state comes from a master, not from a node.
+            let Change::Call(record, _) = change else {
+                continue;
+            };
+            let RecordContent::Call { call, .. } = &record.entry else {
+                continue;
+            };
+            let call = Request::from(call.clone());
+            // Only so many can be on their way at once.
+            if given && time.expected < EXPECTED_MOST {
+                time.expected += 1;
+                time.changes.expect_record(record.seq, call.clone());
+            }
+            time.pending.add(&call);
+            calls.push(call);
+        }
+        calls
+    }
+
+    /// The state at the beginning of the oldest period.
+    pub fn base(&self) -> Option<&Master> {
+        self.times.front().map(|time| &time.base)
+    }
+
+    /// All writes, in order.
+    pub fn calls(&self) -> impl Iterator<Item = &Request> {
+        self.times.iter().flat_map(|time| time.pending.calls())
+    }
+
+    /// How many writes are kept.
+    pub fn len(&self) -> usize {
+        self.times.iter().map(|time| time.pending.len()).sum()
+    }
+
+    /// The oldest period.
+    pub fn first_mut(&mut self) -> Option<&mut Time> {
+        self.times.front_mut()
+    }
+
+    /// Drops the oldest period: its writes have reached the leader, or are lost and reported.
+    pub fn sent(&mut self) {
+        self.times.pop_front();
+    }
+
+    /// Drops the present period: its writes are in the journal after all.
+    pub fn resumed(&mut self) {
+        self.times.pop_back();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{cluster::sharing::Source, master::Method, xmlrpc::Value};
+
+    fn set(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    fn record(seq: u64, call: Request) -> Record {
+        let entry = RecordContent::call(call.into());
+        Record { seq, entry }
+    }
+
+    fn change(seq: u64, call: Request) -> Change {
+        Change::Call(record(seq, call), Source::Here)
+    }
+
+    fn calls_of(time: &Time) -> Vec<Request> {
+        time.pending.calls().cloned().collect()
+    }
+
+    fn first(cut_off: &CutOff) -> Vec<Request> {
+        cut_off.times.front().map(calls_of).unwrap_or_default()
+    }
+
+    fn base() -> Master {
+        let mut base = Master::default();
+        base.apply(&set("/before", 1));
+        base
+    }
+
+    fn begun() -> CutOff {
+        let mut cut_off = CutOff::default();
+        cut_off.begin(base());
+        cut_off
+    }
+
+    #[test]
+    fn a_period_that_ends_without_loss_keeps_the_writes_of_the_one_before() {
+        let mut cut_off = begun();
+        cut_off.add(&[change(5, set("/a", 1))], false);
+        cut_off.begin(base());
+        cut_off.add(&[change(6, set("/b", 2))], false);
+        // etcd has the second after all.
+        cut_off.resumed();
+        assert_eq!(first(&cut_off), [set("/a", 1)]);
+        cut_off.resumed();
+        assert!(cut_off.is_empty());
+    }
+
+    /// The leader made the first period's write twice, because its first answer was lost.
+    #[test]
+    fn a_write_that_is_sent_again_is_no_change_of_others_in_later_periods() {
+        let mut cut_off = begun();
+        cut_off.add(&[change(5, set("/count", 1))], false);
+        cut_off.begin(base());
+        cut_off.add(&[change(6, set("/count", 2))], false);
+        cut_off.expect_in_all(&[set("/count", 1)]);
+        cut_off.note(&[record(7, set("/count", 1))]);
+        cut_off.note(&[record(8, set("/count", 1))]);
+        for time in &cut_off.times {
+            let merged = merge::merge(&time.changes, &base(), time.pending.calls());
+            assert!(merged.lost.is_empty(), "{:?}", merged.lost);
+        }
+        // The same by another node is a change.
+        let of_another = Request::new(
+            Method::SetParam,
+            [Value::from("/m"), "/count".into(), 1.into()],
+        );
+        cut_off.note(&[record(9, of_another)]);
+        let last = cut_off.times.back().unwrap();
+        let merged = merge::merge(&last.changes, &base(), last.pending.calls());
+        assert_eq!(merged.lost.len(), 1);
+    }
+
+    /// The first one's writes are on their way when the second begins.
+    #[test]
+    fn the_second_of_two_periods_continues_from_the_first() {
+        let others = base();
+        let mut cut_off = begun();
+        cut_off.add(&[change(5, set("/count", 1))], false);
+        let second = cut_off.on(&others);
+        assert_eq!(second.params().get("count"), Some(&1.into()));
+        cut_off.begin(second);
+        cut_off.add(&[change(6, set("/count", 2))], false);
+        // The others get the first.
+        let merged = |cut_off: &CutOff, others: &Master| {
+            let first = cut_off.times.front().unwrap();
+            merge::merge(&first.changes, others, first.pending.calls())
+        };
+        assert_eq!(merged(&cut_off, &others).send, [set("/count", 1)]);
+        let mut others = others;
+        others.apply(&set("/count", 1));
+        cut_off.note(&[record(7, set("/count", 1))]);
+        cut_off.sent();
+        let second = merged(&cut_off, &others);
+        assert_eq!((second.send, second.lost), (vec![set("/count", 2)], vec![]));
+        cut_off.sent();
+        assert!(cut_off.is_empty());
+    }
+
+    #[test]
+    fn a_network_that_comes_and_goes_piles_up_no_times() {
+        let mut cut_off = begun();
+        for value in 0..50 {
+            cut_off.begin(base());
+            cut_off.begin(base());
+            cut_off.add(&[change(5, set("/a", value))], false);
+        }
+        assert!(cut_off.times.len() <= TIMES_MOST);
+        let last = cut_off.times.back().unwrap();
+        assert_eq!(calls_of(last), [set("/a", 49)]);
+        // What was written this time only is in the journal.
+        cut_off.resumed();
+        assert_eq!(first(&cut_off), []);
+        assert_eq!(calls_of(cut_off.times.back().unwrap()), [set("/a", 48)]);
+    }
+}

@@ -1,0 +1,371 @@
+//! Decides what one computer of several does: whom it follows, what its mirror holds, which calls it answers, what it
+//! writes to the journal and merges, and when it may run a master. Pure.
+//!
+//! [`Machine`], a part of it, decides who leads. The shell passes in what happened and when, and carries out the
+//! returned actions in order. The shell decides nothing, so the simulation in `cluster/tests` tests what production
+//! decides.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+use crate::{
+    checkpoint::format::{Record, RecordContent as JournalEntry},
+    cluster::{
+        cut_off::CutOff,
+        displaced::DisplacedLately,
+        journal::{Keys, Progress},
+        machine::{self, Machine, Role, Settings, View, WhenAlone},
+        namesake::{self, Sign},
+        outgoing::Outgoing,
+        standing::{Place, Standing},
+    },
+    master::{Master, Request},
+};
+
+mod chores;
+mod following;
+mod giving;
+mod leaving;
+mod lost;
+mod merging;
+mod roles;
+#[cfg(test)]
+mod tests;
+mod types;
+
+use self::{chores::Chores, following::Reading, leaving::Release, lost::Lost, merging::Merging};
+pub use self::{
+    chores::SAYS_EVERY,
+    roles::PROBES,
+    types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
+};
+
+/// Pause before a failed read of etcd is retried.
+const AGAIN: Duration = Duration::from_millis(200);
+/// How long a start waits for etcd's journal before this computer may claim leadership without it.
+const START_BY: Duration = Duration::from_secs(2);
+
+/// The journal, as far as this computer has read it.
+#[derive(Debug, Default)]
+struct Journal {
+    state: Master,
+    progress: Progress,
+    displaced: DisplacedLately,
+}
+
+impl Journal {
+    /// Applies `records`, which follow the last known one.
+    fn apply(&mut self, now: Instant, records: &[Record]) {
+        for record in records {
+            if let JournalEntry::Call { call, .. } = &record.entry {
+                let request = Request::from(call.clone());
+                self.displaced.note(now, &self.state, &request);
+                self.state.apply_telling(&request, &mut ());
+            }
+        }
+    }
+}
+
+/// The probes of the leader's rosrescue.
+#[derive(Debug, Default)]
+struct Probing {
+    number: u64,
+    under_way: bool,
+    at: Option<Instant>,
+}
+
+/// The previous leader, and how its leadership ended.
+#[derive(Debug, Default)]
+struct Before {
+    leader: Option<(String, Instant)>,
+    released: bool,
+}
+
+/// Evidence of another computer with this one's name.
+#[derive(Debug, Default)]
+struct Namesake {
+    /// Set if the member entry of this name belongs to another computer.
+    sign: Option<Sign>,
+    /// Looks for such a computer. Set once etcd has been read.
+    watch: Option<namesake::NamesakeWatch>,
+    /// Whether this process has led.
+    led: bool,
+}
+
+/// The state machine of one computer; see the [module](self).
+#[derive(Debug)]
+pub struct Member {
+    keys: Keys,
+    machine: Machine,
+    /// The role that the shell was told last.
+    role: Role,
+    standing: Standing,
+    has_master: bool,
+    own: Own,
+    /// Whether this computer, if it leads next, keeps its ledger's state instead of the journal's.
+    own_wins: bool,
+    lost: Lost,
+    journal: Journal,
+    reading: Reading,
+    place: Place,
+    outgoing: Outgoing,
+    /// The last record whose call was answered, since calls began to be recorded here.
+    acknowledged: u64,
+    cut_off: CutOff,
+    merging: Merging,
+    before: Before,
+    namesake: Namesake,
+    deciding: bool,
+    probing: Probing,
+    release: Release,
+    chores: Chores,
+    queue: Queue,
+}
+
+/// Inputs for the machine and actions for the shell, in order.
+#[derive(Debug, Default)]
+struct Queue {
+    inputs: VecDeque<machine::Input>,
+    actions: Vec<Action>,
+    /// When the machine starts even if etcd has not been read. `None` once it has started.
+    start_by: Option<Instant>,
+}
+
+impl Member {
+    /// Creates a member that waits for [`Input::Begin`]. `left` holds the writes that an earlier process answered while
+    /// it was cut off. `id` is the unique name under which such writes are sent to a leader.
+    pub fn new(settings: Settings, keys: Keys, own: Own, left: CutOff, id: String) -> Self {
+        let known = own.restored;
+        Self {
+            keys,
+            machine: Machine::new(settings),
+            role: Role::Joining,
+            standing: Standing::Nobody { known },
+            has_master: false,
+            own,
+            own_wins: false,
+            lost: Lost::default(),
+            journal: Journal::default(),
+            reading: Reading::default(),
+            place: Place::default(),
+            outgoing: Outgoing::default(),
+            acknowledged: 0,
+            cut_off: left,
+            merging: Merging::new(id),
+            before: Before::default(),
+            namesake: Namesake::default(),
+            deciding: false,
+            probing: Probing::default(),
+            release: Release::default(),
+            chores: Chores::default(),
+            queue: Queue::default(),
+        }
+    }
+
+    /// Handles `input` at `now`, and returns the actions to carry out, in order.
+    pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
+        self.hear(input.heard());
+        match input {
+            Input::Begin => {
+                self.queue.start_by = Some(now + START_BY);
+                self.reading.load_by(now);
+            }
+            Input::Answer { number, answer } => {
+                self.doubt_etcd(now, &answer);
+                self.tell_machine(machine::Input::Answer { number, answer });
+            }
+            Input::Watched { view, entries, .. } => self.watched(now, view, entries),
+            Input::WatchEnded => self.reading.ended(now),
+            Input::Loaded(read) => self.loaded(now, read),
+            Input::Recorded(changes) => self.recorded(changes),
+            Input::AsState(state) => self.recorded_as_state(state),
+            Input::Forwarded(calls) => self.cut_off.expect(calls),
+            Input::Prepared(leads) => self.prepared(leads),
+            Input::Decided { seq, goes_on } => {
+                self.deciding = false;
+                self.tell_machine(machine::Input::Decided { seq, goes_on });
+            }
+            Input::Probed { number, leads } => self.probed(number, leads),
+            Input::Merged { number, answer } => self.portion_answered(now, number, answer),
+            Input::SnapshotWritten(written) => self.snapshot_written(now, written),
+            Input::HandOver { to, refused } => self.hand_over(now, to, refused),
+            Input::Stop => self.stop(now),
+            Input::RosoutEnded => self.rosout_ended(),
+            Input::Wake => self.woken(now),
+        }
+        loop {
+            while let Some(input) = self.queue.inputs.pop_front() {
+                self.drive(now, input);
+            }
+            self.catch_up(now);
+            self.update(now);
+            if self.queue.inputs.is_empty() {
+                break;
+            }
+        }
+        self.end_if_stopped();
+        std::mem::take(&mut self.queue.actions)
+    }
+
+    /// When to pass in [`Input::Wake`]. Changes with every input.
+    pub fn deadline(&self) -> Option<Instant> {
+        [
+            self.machine.deadline(),
+            self.reading.due(),
+            self.probing.at.filter(|_| !self.probing.under_way),
+            self.release.by,
+            self.queue.start_by,
+            self.merging.due(),
+            self.chores.due(),
+        ]
+        .into_iter()
+        .flatten()
+        .min()
+    }
+
+    /// The part that decides who leads.
+    pub fn machine(&self) -> &Machine {
+        &self.machine
+    }
+
+    /// The role that was carried out last.
+    pub fn role(&self) -> Role {
+        self.role
+    }
+
+    pub fn settings(&self) -> &Settings {
+        self.machine.settings()
+    }
+
+    /// The leader's keys as etcd showed them last.
+    pub fn view(&self) -> &View {
+        let (seen, known) = (self.reading.view(), self.machine.view());
+        match seen.revision > known.revision {
+            true => seen,
+            false => known,
+        }
+    }
+
+    /// Who has the master, and where calls go.
+    pub fn standing(&self) -> &Standing {
+        &self.standing
+    }
+
+    /// The place in the journal up to which the mirror is current.
+    pub fn place(&self) -> Place {
+        self.place
+    }
+
+    /// The number of the last record that was read from the journal.
+    pub fn seq(&self) -> u64 {
+        self.journal.progress.seq
+    }
+
+    /// When this computer noticed that etcd has lost its data. `None` once a computer leads again.
+    pub fn etcd_lost(&self) -> Option<Instant> {
+        self.lost.since()
+    }
+
+    /// Whether the previous leader gave up leadership by itself.
+    pub fn was_released(&self) -> bool {
+        self.before.released
+    }
+
+    /// The number of writes that are not in etcd yet.
+    pub fn uncommitted(&self) -> usize {
+        match self.keeps() {
+            true => self.cut_off.len(),
+            false => self.outgoing.count(),
+        }
+    }
+
+    /// The writes answered while cut off that have not reached a leader, with the state before them.
+    pub fn kept(&self) -> Option<(&Master, Vec<Request>)> {
+        let base = self.cut_off.base()?;
+        Some((base, self.cut_off.calls().cloned().collect()))
+    }
+
+    /// This computer's entry among the members.
+    pub fn says(&self) -> Said {
+        let settings = self.settings();
+        Said {
+            uri: settings.uri.clone(),
+            version: settings.version.clone(),
+            role: self.machine.role().as_str().to_owned(),
+            seq: self.seq(),
+            boot: settings.boot.clone(),
+            holds: self.lost.holds(),
+        }
+    }
+
+    fn act(&mut self, action: Action) {
+        self.queue.actions.push(action);
+    }
+
+    fn tell(&mut self, news: News) {
+        self.act(Action::Tell(news));
+    }
+
+    fn tell_machine(&mut self, input: machine::Input) {
+        self.queue.inputs.push_back(input);
+    }
+
+    /// Passes an input to the machine, and does what it decides.
+    fn drive(&mut self, now: Instant, input: machine::Input) {
+        let actions = self.machine.on(now, input);
+        // First, so that the next request does not send them again.
+        for change in self.outgoing.committed(self.machine.committed()) {
+            self.hold(now, change);
+        }
+        for action in actions {
+            match action {
+                machine::Action::Send { number, op } => self.send(number, op),
+                machine::Action::CatchUp(seq) => self.reading.wanted = Some(seq),
+                machine::Action::Become(role) => self.become_role(now, role),
+                machine::Action::Acknowledge(seq) => {
+                    self.acknowledged = seq;
+                    self.act(Action::Acknowledge(seq));
+                }
+                machine::Action::Yield {
+                    committed,
+                    acknowledged,
+                } => self.give_back(committed, acknowledged),
+                machine::Action::Released => self.released(),
+            }
+        }
+    }
+
+    /// Whether calls are recorded on this computer: it leads, or it is cut off and serves.
+    fn records(&self) -> bool {
+        self.standing.records()
+    }
+
+    /// Whether the ledger's state is the journal's.
+    fn follows(&self) -> bool {
+        self.reading.loaded && !self.own_wins && !self.records()
+    }
+
+    /// Whether the mirror may answer: its state is that of the session which continues.
+    fn knows(&self) -> bool {
+        self.own.restored
+            || self.reading.loaded && self.machine.session() == machine::JournalSession::GoesOn
+    }
+
+    /// Whether writes answered now are kept for a later leader.
+    fn keeps(&self) -> bool {
+        self.role == Role::Alone && self.settings().alone == WhenAlone::Serve
+    }
+
+    /// Updates everything that depends on several parts.
+    fn update(&mut self, now: Instant) {
+        self.update_lost(now);
+        self.update_master();
+        self.check_for_namesake(now);
+        self.update_standing();
+        self.update_probes(now);
+        self.update_merge(now);
+        self.update_chores(now);
+    }
+}

@@ -1,0 +1,86 @@
+//! Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
+
+use std::time::{Duration, Instant};
+
+use super::{Action, Member};
+use crate::cluster::{journal::Progress, machine::Role};
+
+/// How often a computer updates its entry among the members.
+pub const SAYS_EVERY: Duration = Duration::from_secs(5);
+/// How often the leader compacts etcd, and the age from which revisions are dropped.
+const FORGET: Duration = Duration::from_secs(300);
+/// Pause after a snapshot that could not be written.
+const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
+
+#[derive(Debug, Default)]
+pub(super) struct Chores {
+    /// When to write this computer's entry among the members.
+    say_at: Option<Instant>,
+    /// Whether a snapshot is being written.
+    snapshot: bool,
+    /// After a failed snapshot, when the next one may begin.
+    snapshot_at: Option<Instant>,
+    /// The revision up to which to compact etcd, and when.
+    forget: Option<(Instant, u64)>,
+}
+
+impl Chores {
+    pub(super) fn due(&self) -> Option<Instant> {
+        let forget = self.forget.map(|(at, _)| at);
+        [self.say_at, forget].into_iter().flatten().min()
+    }
+
+    /// Has this computer's entry among the members updated at `now`.
+    pub(super) fn say_at(&mut self, now: Instant) {
+        self.say_at = Some(now);
+    }
+}
+
+impl Member {
+    /// Starts the work that is due.
+    pub(super) fn update_chores(&mut self, now: Instant) {
+        // Earlier, it would overwrite the entry of another computer with this name.
+        let watch = self.namesake.watch.as_ref();
+        let may_say = watch.is_some_and(|of| of.is_over(now));
+        if self.chores.say_at.is_none_or(|at| at <= now) {
+            self.chores.say_at = Some(now + SAYS_EVERY);
+            if may_say {
+                self.act(Action::Say);
+            }
+        }
+        let term = self.machine.term();
+        let Some(term) = term.filter(|_| self.machine.role() == Role::Leading) else {
+            self.chores.forget = None;
+            return;
+        };
+        let is_early = self.chores.snapshot_at.is_some_and(|at| now < at);
+        let progress = self.journal.progress;
+        if !self.chores.snapshot && !is_early && progress.wants_snapshot() {
+            self.chores.snapshot = true;
+            self.act(Action::WriteSnapshot {
+                term,
+                progress,
+                state: self.journal.state.clone(),
+                displaced: self.journal.displaced.at(now),
+            });
+        }
+        let revision = self.view().revision;
+        match self.chores.forget {
+            Some((at, before)) if at <= now => {
+                self.chores.forget = Some((now + FORGET, revision));
+                self.act(Action::Forget(before));
+            }
+            None => self.chores.forget = Some((now + FORGET, revision)),
+            Some(_) => {}
+        }
+    }
+
+    pub(super) fn snapshot_written(&mut self, now: Instant, written: Option<(Progress, usize)>) {
+        self.chores.snapshot = false;
+        match written {
+            Some((then, bytes)) => self.journal.progress.snapshot_written(then, bytes),
+            // An etcd that is full refuses at once.
+            None => self.chores.snapshot_at = Some(now + SNAPSHOT_PAUSE),
+        }
+    }
+}

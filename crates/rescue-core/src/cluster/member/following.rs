@@ -1,0 +1,354 @@
+//! Reads the journal, and keeps the ledger current while another computer leads.
+
+use std::time::Instant;
+
+use super::{AGAIN, Action, Entry, Heard, Member, News, Read};
+use crate::{
+    checkpoint::format::Record,
+    cluster::{
+        machine::{self, JournalSession, Leader, Role, View},
+        mutant::Mutant,
+        namesake::{self, Sign},
+        standing::Place,
+    },
+};
+
+/// How far etcd has been read, and what must be read next.
+#[derive(Debug, Default)]
+pub(super) struct Reading {
+    /// Whether the journal has been read once.
+    pub(super) loaded: bool,
+    /// The record up to which the machine waits for the journal.
+    pub(super) wanted: Option<u64>,
+    /// The last record whose reading was reported to the machine.
+    reported: u64,
+    /// Whether a read is under way.
+    loading: bool,
+    /// The newest revision that was known when that read began.
+    floor: u64,
+    /// When the next read is due.
+    load_at: Option<Instant>,
+    /// How many reads must end before the journal is as fresh as [`Self::refresh`] asked.
+    fresh: Option<u8>,
+    watching: bool,
+    /// The leader's keys as etcd showed them last, also before the machine starts.
+    view: View,
+}
+
+impl Reading {
+    /// Makes the next read due at `at` at the latest.
+    pub(super) fn load_by(&mut self, at: Instant) {
+        self.load_at = Some(self.load_at.map_or(at, |before| before.min(at)));
+    }
+
+    /// Asks for a read that begins after `now`. What the watch delivers may be much older.
+    pub(super) fn refresh(&mut self, now: Instant) {
+        self.fresh = Some(1 + u8::from(self.loading));
+        self.load_by(now);
+    }
+
+    /// Whether the read that [`Self::refresh`] asked for has ended.
+    pub(super) fn is_fresh(&self) -> bool {
+        self.fresh == Some(0)
+    }
+
+    pub(super) fn due(&self) -> Option<Instant> {
+        self.load_at.filter(|_| !self.loading)
+    }
+
+    /// Handles the end of the watch.
+    pub(super) fn ended(&mut self, now: Instant) {
+        self.watching = false;
+        self.load_at = Some(now + AGAIN);
+    }
+
+    /// Starts over with `view`, because etcd has lost its data.
+    pub(super) fn forget(&mut self, view: &View) {
+        (self.wanted, self.reported) = (None, 0);
+        (self.watching, self.view) = (false, view.clone());
+    }
+
+    pub(super) fn view(&self) -> &View {
+        &self.view
+    }
+}
+
+impl Member {
+    /// Reads the journal if it is needed further than it is known.
+    pub(super) fn catch_up(&mut self, now: Instant) {
+        let seq = self.journal.progress.seq;
+        let wanted = self.reading.wanted;
+        let news = wanted.is_some() || self.reading.reported != seq;
+        let there = seq >= wanted.unwrap_or_default();
+        if news && self.reading.loaded && !self.records() && there {
+            (self.reading.wanted, self.reading.reported) = (None, seq);
+            self.tell_machine(machine::Input::Followed(seq));
+        }
+        if self.reading.loaded && seq >= self.view().seq() {
+            self.decide(seq);
+        }
+        if !there && !self.reading.loading && self.reading.load_at.is_none() {
+            self.reading.load_by(now);
+        }
+        if self.reading.due().is_some_and(|at| at <= now) {
+            (self.reading.load_at, self.reading.loading) = (None, true);
+            self.reading.floor = self.view().revision;
+            self.act(Action::Load(self.journal.progress));
+        }
+    }
+
+    /// Finds out whether the session in etcd continues, if the machine waits for that.
+    fn decide(&mut self, seq: u64) {
+        let waits = self.machine.role() == Role::CatchingUp
+            && self.machine.session() == JournalSession::Unknown
+            && !self.deciding;
+        if !waits {
+            return;
+        }
+        if self.own_wins || seq == 0 {
+            let goes_on = true;
+            return self.tell_machine(machine::Input::Decided { seq, goes_on });
+        }
+        self.deciding = true;
+        let (state, closed) = (self.journal.state.clone(), self.before.released);
+        self.act(Action::Decide { seq, state, closed });
+    }
+
+    /// Handles keys and journal entries from the watch.
+    pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
+        // First, because writes that this computer answered and lost came before the others' changes.
+        self.see(now, view);
+        let progress = &mut self.journal.progress;
+        // All records at once, because each new state may take long.
+        let mut records = Vec::new();
+        for entry in entries {
+            let new = match entry {
+                Entry::Records { records, bytes } => progress.take(records, bytes).ok(),
+                Entry::Apart(seq) if seq <= progress.seq => continue,
+                Entry::Apart(_) => None,
+            };
+            match new {
+                Some(new) => records.extend(new),
+                // A gap is filled by a separate read.
+                None => {
+                    self.reading.load_by(now);
+                    break;
+                }
+            }
+        }
+        self.follow(now, &records);
+        self.yield_to_others();
+    }
+
+    /// Shows the leader's keys to the machine.
+    fn see(&mut self, now: Instant, view: View) {
+        if view.revision >= self.reading.view.revision {
+            self.reading.view = view.clone();
+        }
+        self.yield_to_others();
+        self.drive(now, machine::Input::View(view));
+    }
+
+    /// Gives up this computer's own state if another computer leads. After etcd has lost its data, that computer's state
+    /// must be in the journal first.
+    fn yield_to_others(&mut self) {
+        let leader = self.view().leader.as_ref();
+        let other = leader.filter(|leader| leader.id != self.settings().id);
+        let leads = other.is_some_and(|leader| !self.was_self(leader));
+        if self.own_wins && leads && !self.lost.waits_for(self.journal.progress) {
+            self.own_wins = false;
+            self.adopt();
+        }
+    }
+
+    /// Applies new records of the journal.
+    fn follow(&mut self, now: Instant, records: &[Record]) {
+        if records.is_empty() {
+            return;
+        }
+        self.journal.apply(now, records);
+        self.cut_off.note(records);
+        if !self.cut_off.is_empty() || self.outgoing.count() > 0 {
+            self.adopt();
+        } else if self.follows() {
+            self.act(Action::Follow(records.to_vec()));
+        }
+    }
+
+    /// Sets the ledger, if it follows the journal, to the journal's state plus the writes that were answered here and are
+    /// not in the journal yet. Callers must see their own writes.
+    pub(super) fn adopt(&mut self) {
+        if self.follows() {
+            let mut state = self.cut_off.on(&self.journal.state);
+            // The same for writes answered as a leader, as long as it is unknown whether another computer leads.
+            let (held, answered) = (self.journal.progress.seq, self.acknowledged);
+            self.outgoing.apply(held + 1..=answered, &mut state);
+            self.act(Action::FollowState(state));
+        }
+    }
+
+    pub(super) fn loaded(&mut self, now: Instant, read: Option<Read>) {
+        self.reading.loading = false;
+        // A read that began before it was asked for does not count, whether it failed or not.
+        let earlier = self.reading.fresh == Some(2);
+        if earlier {
+            self.reading.fresh = Some(1);
+        }
+        let Some(read) = read else {
+            self.reading.load_at = Some(now + AGAIN);
+            return;
+        };
+        // The term in a checkpoint is a revision of etcd, too.
+        let floor = match self.reading.loaded {
+            true => self.reading.floor,
+            false => self.reading.floor.max(self.own.term),
+        };
+        if self.has_lost(&read.view, floor) {
+            return self.start_over(now, &read.view);
+        }
+        if !earlier {
+            self.reading.fresh = self.reading.fresh.map(|_| 0);
+        }
+        if !self.reading.watching {
+            self.reading.watching = true;
+            self.act(Action::Watch(read.view.clone()));
+        }
+        let first = !std::mem::replace(&mut self.reading.loaded, true);
+        if first {
+            if self.namesake.watch.is_none() {
+                self.begin_watch_for_namesake(now, &read.view);
+            }
+            // etcd's journal is the truth. The checkpoint counts only if it continues that journal in the same term.
+            let leader = read.view.leader.as_ref();
+            let whole = self.own.seq >= read.view.seq() || Mutant::OwnDiskWins.lives();
+            let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
+            self.own_wins = own || self.lost.since().is_some();
+        } else {
+            self.see(now, read.view.clone());
+        }
+        let journal = &mut self.journal;
+        if let Some((state, displaced)) = read.state
+            && read.progress.seq >= journal.progress.seq
+        {
+            let before = std::mem::replace(&mut journal.state, state);
+            // The first state of a new journal comes from the computer that held the most.
+            let before = match self.own_wins {
+                true => &self.own.state,
+                false => &before,
+            };
+            if !first {
+                self.cut_off.note_difference(Some(before), &journal.state);
+                self.cut_off.note(&read.records);
+            }
+            journal.displaced.add(now, displaced);
+            journal.apply(now, &read.records);
+            journal.progress = read.progress;
+            self.adopt();
+        } else if let Ok(new) = journal.progress.take(read.records, 0) {
+            match first {
+                // The ledger's state may differ.
+                true => {
+                    self.journal.apply(now, &new);
+                    self.adopt();
+                }
+                false => self.follow(now, &new),
+            }
+        }
+        if first {
+            if !self.is_starting_over() {
+                self.cut_off.note_difference(None, &self.journal.state);
+            }
+            if self
+                .namesake
+                .watch
+                .as_ref()
+                .is_none_or(|of| of.is_over(now))
+            {
+                self.start(now);
+            }
+            self.see(now, read.view);
+        }
+        self.yield_to_others();
+    }
+
+    /// Starts the machine, once.
+    pub(super) fn start(&mut self, now: Instant) {
+        if self.queue.start_by.take().is_some() {
+            self.drive(now, machine::Input::Start(0));
+        }
+    }
+
+    /// Whether `leader` is an earlier process of this computer, and still in the term of the checkpoint.
+    fn was_self(&self, leader: &Leader) -> bool {
+        let own = self.settings();
+        leader.id != own.id && leader.name == own.name && leader.term == self.own.term
+    }
+
+    /// Updates the place up to which the mirror is current.
+    pub(super) fn look_at_place(&mut self) {
+        let seq = self.journal.progress.seq;
+        // What only the checkpoint holds is lost if another computer leads next, and what is owed is not in it.
+        let differs = self.own.seq > seq || !self.cut_off.is_empty();
+        if self.own_wins && differs && !self.records() {
+            return;
+        }
+        let view = self.view();
+        // At least the whole journal before this leader's first record.
+        let whole = self.reading.loaded && seq >= view.seq();
+        let leader = view.leader.as_ref().filter(|_| whole);
+        let term = leader.map_or(self.place.term, |leader| leader.term);
+        let epoch = self.lost.times;
+        self.place = Place { epoch, term, seq };
+    }
+
+    /// Handles entries of members.
+    pub(super) fn hear(&mut self, heard: &[Heard]) {
+        let own = self.machine.settings();
+        for heard in heard.iter().filter(|heard| heard.name == own.name) {
+            self.namesake.sign = heard.sign_of_namesake(own);
+        }
+        for heard in heard.iter().filter(|heard| heard.name != own.name) {
+            self.lost.hear(heard);
+        }
+    }
+
+    /// Delays the start if another computer may have this one's name.
+    fn begin_watch_for_namesake(&mut self, now: Instant, view: &View) {
+        let signs = self.signs_of_namesake(view);
+        let watch = namesake::NamesakeWatch::new(now, self.settings().ttl, signs);
+        if let (Some(until), Some(uri)) = (watch.hold(), watch.suspect()) {
+            let uri = uri.to_owned();
+            self.queue.start_by = self.queue.start_by.map(|_| until);
+            self.tell(News::Suspect { uri, until });
+        }
+        self.namesake.watch = Some(watch);
+    }
+
+    /// Ends this member if another living computer has its name.
+    pub(super) fn check_for_namesake(&mut self, now: Instant) {
+        let view = self.view();
+        let signs = self.signs_of_namesake(view);
+        let watch = self.namesake.watch.as_ref();
+        let living = watch.and_then(|watch| watch.living(now, &signs));
+        let mut there = living.map(|sign| sign.uri.clone());
+        if let Some(leader) = &view.leader {
+            let own = self.machine.settings();
+            // Only one process runs on a computer at a time, so this leader is another computer.
+            if leader.id == own.id {
+                self.namesake.led = true;
+            } else if self.namesake.led && leader.name == own.name {
+                there = there.or_else(|| Some(leader.uri.clone()));
+            }
+        }
+        if let Some(uri) = there.filter(|_| !Mutant::IgnoresNamesake.lives()) {
+            self.act(Action::EndForNamesake(uri));
+        }
+    }
+
+    /// The evidence in etcd of another computer with this one's name.
+    fn signs_of_namesake(&self, view: &View) -> Vec<Sign> {
+        let leader = namesake::sign_of_leader(self.settings(), view);
+        let member = self.namesake.sign.clone();
+        leader.into_iter().chain(member).collect()
+    }
+}

@@ -1,0 +1,165 @@
+//! Writes recorded changes to the journal, and keeps the writes that were answered while cut off.
+
+use std::time::Instant;
+
+use super::{Action, Member, News, roles::is_ours};
+use crate::{
+    cluster::{
+        machine::{self, EtcdAnswer, Op, Role},
+        sharing::Change,
+    },
+    master::Request,
+};
+
+impl Member {
+    /// Carries out a request of the machine.
+    pub(super) fn send(&mut self, number: u64, op: Op) {
+        let term = self.machine.term().unwrap_or_default();
+        let entry = match &op {
+            Op::Beat { seq, .. } => self.outgoing.entry(&self.keys, *seq),
+            _ => Ok(None),
+        };
+        let entry = match entry {
+            Ok(entry) => entry,
+            Err(error) => {
+                self.tell(News::TooLarge(error.to_string()));
+                let answer = EtcdAnswer::Silence;
+                return self.tell_machine(machine::Input::Answer { number, answer });
+            }
+        };
+        let parts = match &entry {
+            Some(_) => self.outgoing.missing_parts(&self.keys),
+            None => Vec::new(),
+        };
+        self.act(Action::Send {
+            number,
+            op,
+            entry,
+            term,
+            parts,
+        });
+    }
+
+    /// Handles changes that the ledger has recorded.
+    pub(super) fn recorded(&mut self, changes: Vec<Change>) {
+        if !self.records() {
+            return;
+        }
+        let is_alone = self.machine.role() == Role::Alone;
+        let leads_on = self.machine.term().is_some();
+        if self.keeps() {
+            let ours = changes.iter().filter(|of| is_ours(of));
+            let kept = self.cut_off.add(ours, leads_on);
+            self.keep(kept);
+        }
+        self.outgoing.add(changes);
+        if !is_alone {
+            return self.prepare();
+        }
+        self.outgoing.all_ready();
+        // Without a term they never go to the journal. A later leader gets the kept writes instead.
+        match leads_on {
+            false => self.outgoing.forget(),
+            true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),
+            true => {}
+        }
+        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+    }
+
+    /// Replaces the changes that have piled up by one state.
+    pub(super) fn recorded_as_state(&mut self, state: Option<Change>) {
+        if self.records() && self.outgoing.has_outgrown() {
+            self.outgoing.replace_rest(state);
+            self.all_ready();
+        }
+    }
+
+    pub(super) fn all_ready(&mut self) {
+        self.outgoing.all_ready();
+        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+    }
+
+    fn prepare(&mut self) {
+        let Some(term) = self.machine.term().filter(|_| self.records()) else {
+            return;
+        };
+        loop {
+            match self.outgoing.prepare(&self.keys) {
+                Ok(Some(parts)) => {
+                    self.outgoing.preparing = true;
+                    self.act(Action::Prepare { term, parts });
+                    break;
+                }
+                Ok(None) => break,
+                Err(error) => {
+                    self.tell(News::TooLarge(error.to_string()));
+                    self.outgoing.leave_out_next();
+                }
+            }
+        }
+        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+    }
+
+    pub(super) fn prepared(&mut self, leads: Option<bool>) {
+        if !std::mem::take(&mut self.outgoing.preparing) {
+            return;
+        }
+        if leads == Some(true) {
+            self.outgoing.prepared();
+        }
+        // If another computer leads, its keys will show that.
+        self.prepare();
+    }
+
+    /// Notes that a change is in the journal.
+    pub(super) fn hold(&mut self, now: Instant, change: Change) {
+        let journal = &mut self.journal;
+        if change.seq() <= journal.progress.seq {
+            return;
+        }
+        match change {
+            Change::Call(record, _) => {
+                if let Ok(new) = journal.progress.take(vec![record], 0) {
+                    journal.apply(now, &new);
+                    self.cut_off.note(&new);
+                }
+            }
+            Change::State { seq, state } => {
+                self.cut_off.note_difference(Some(&journal.state), &state);
+                journal.state = *state;
+                journal.progress.take_state(seq, 0);
+            }
+        }
+    }
+
+    /// Keeps the writes after record `committed` up to `acknowledged`: they were answered but are not in the journal.
+    pub(super) fn give_back(&mut self, committed: u64, acknowledged: u64) {
+        let changes = self.outgoing.take_all();
+        if self.keeps() {
+            return;
+        }
+        let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
+        let answered: Vec<_> = changes.iter().filter(answered).collect();
+        if !answered.is_empty() {
+            let base = self.journal.state.clone();
+            self.begin_cut_off(base);
+            let kept = self.cut_off.add(answered, true);
+            self.keep(kept);
+        }
+    }
+
+    /// Stores exactly the writes that a leader must still get.
+    pub(super) fn keep_all(&mut self) {
+        let kept = self.kept().map(|(base, calls)| (base.clone(), calls));
+        self.act(match kept {
+            Some((base, calls)) => Action::KeepAll { base, calls },
+            None => Action::KeepNothing,
+        });
+    }
+
+    pub(super) fn keep(&mut self, calls: Vec<Request>) {
+        if !calls.is_empty() {
+            self.act(Action::Keep(calls));
+        }
+    }
+}

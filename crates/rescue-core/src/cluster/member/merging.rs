@@ -1,0 +1,362 @@
+//! Sends the writes that were answered while cut off to the leader, except those that conflict with others' writes.
+
+use std::{
+    collections::BTreeSet,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{Action, Member, News};
+use crate::{
+    cluster::{
+        machine::Role,
+        merge::{
+            self, Changes, Lost, weight,
+            wire::{self, Ask, WriteOutcome},
+        },
+        mutant::Mutant,
+    },
+    master::{Master, Method, Request, names},
+    xmlrpc::Value,
+};
+
+/// Pause before unanswered calls are sent again.
+const AGAIN: Duration = Duration::from_millis(100);
+/// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
+const TELLER: &str = "/rosrescue";
+/// How often parameters are set again that others keep changing. Each of their changes notifies the nodes as well, and
+/// calls wait for the end of the merge.
+const ROUNDS_MAX: u32 = 3;
+/// The largest number of calls in one portion. Other writes pass between portions.
+const CALLS_MOST: usize = 100;
+/// The approximate largest size of one portion, in bytes.
+const BYTES_MOST: usize = 512 << 10;
+
+#[derive(Debug, Default)]
+enum Step {
+    #[default]
+    Idle,
+    /// Waits until the journal has been read as it is now.
+    Reading,
+    /// Waits for the answer to this portion, from the leader at this address and of this term, or from this computer.
+    Asked(Ask, Option<(String, u64)>),
+    /// Waits until this time, then sends the same portion again, or judges everything again.
+    Pause(Instant, Option<Ask>),
+}
+
+/// The state of sending the writes of the oldest period of being cut off.
+#[derive(Debug)]
+pub(super) struct Merging {
+    /// The prefix of the name under which the portions of one period are sent.
+    id: String,
+    /// How many periods were sent before.
+    times: u64,
+    step: Step,
+    /// The number of the last portion. Answers to earlier ones are ignored.
+    asked: u64,
+    /// The writes still to be sent. `None` before they have been judged.
+    left: Option<Vec<Request>>,
+    /// Parameters of which nodes here heard a value that was lost. These nodes must hear the present value.
+    untold: BTreeSet<String>,
+    /// Whether the portion under way sets the parameters in [`Self::untold`] again.
+    telling: bool,
+    /// How often such a portion failed, because others changed a parameter meanwhile.
+    rounds: u32,
+    /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
+    unread: bool,
+    /// The writes in `left` conflict with no change up to this record.
+    judged: u64,
+    sent: u64,
+    lost: u64,
+}
+
+impl Merging {
+    pub(super) fn new(id: String) -> Self {
+        Self {
+            id,
+            times: 0,
+            step: Step::Idle,
+            asked: 0,
+            left: None,
+            untold: BTreeSet::new(),
+            telling: false,
+            rounds: 0,
+            unread: false,
+            judged: 0,
+            sent: 0,
+            lost: 0,
+        }
+    }
+
+    pub(super) fn due(&self) -> Option<Instant> {
+        match self.step {
+            Step::Pause(until, _) => Some(until),
+            _ => None,
+        }
+    }
+
+    fn id(&self) -> Arc<str> {
+        format!("{} {}", self.id, self.times).into()
+    }
+}
+
+impl Member {
+    /// The leader that takes such writes: its address and term, or `Some(None)` for this computer. `None` if no leader is
+    /// known.
+    fn merges_to(&self) -> Option<Option<(String, u64)>> {
+        match self.machine.role() {
+            Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
+                let (uri, term) = self.leader()?;
+                Some(Some((uri.to_owned(), term)))
+            }
+            Role::Leading if self.records() => Some(None),
+            _ => None,
+        }
+    }
+
+    pub(super) fn update_merge(&mut self, now: Instant) {
+        let to = self.merges_to();
+        match &mut self.merging.step {
+            Step::Idle => {
+                if to.is_some() && !self.cut_off.is_empty() {
+                    self.judge_again(now);
+                }
+            }
+            Step::Reading => {
+                if self.reading.is_fresh() {
+                    self.judge(now);
+                }
+            }
+            Step::Asked(ask, asked) => {
+                // A leader that is gone never answers.
+                if to.is_some_and(|to| to != *asked) {
+                    self.merging.step = Step::Pause(now + AGAIN, Some(ask.clone()));
+                }
+            }
+            Step::Pause(until, ask) => {
+                if *until <= now {
+                    match ask.take() {
+                        Some(ask) => self.ask(now, ask),
+                        None => self.judge_again(now),
+                    }
+                }
+            }
+        }
+    }
+
+    fn judge_again(&mut self, now: Instant) {
+        self.merging.step = Step::Reading;
+        self.reading.refresh(now);
+    }
+
+    /// Judges the remaining writes by the others' changes up to the journal's last record.
+    fn judge(&mut self, now: Instant) {
+        let Some(time) = self.cut_off.first_mut() else {
+            self.merging.step = Step::Idle;
+            return;
+        };
+        let left = self.merging.left.take();
+        let left = left.unwrap_or_else(|| time.pending.calls().cloned().collect());
+        if Mutant::MergesByState.lives() {
+            time.changes = Changes::default();
+            time.changes
+                .note_difference(&time.base, &self.journal.state);
+        }
+        let merged = merge::merge(&time.changes, &self.journal.state, &left);
+        self.merging
+            .untold
+            .extend(merged.lost.iter().filter_map(parameter));
+        let lost = merged.lost.iter();
+        let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
+        self.merging.left = Some(merged.send);
+        self.merging.judged = self.journal.progress.seq;
+        self.merging.unread = false;
+        self.report(lost);
+        self.next_portion(now);
+    }
+
+    fn next_portion(&mut self, now: Instant) {
+        let untold = set_again(&self.journal.state, &self.merging.untold);
+        let left = self.merging.left.as_deref().unwrap_or_default();
+        self.merging.telling = left.is_empty();
+        let left = if self.merging.telling { &untold } else { left };
+        let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
+        if calls.is_empty() {
+            match self.merging.unread {
+                true => self.judge_again(now),
+                false => self.merged(),
+            }
+            return;
+        }
+        let ask = Ask {
+            id: self.merging.id(),
+            seq: self.merging.judged,
+            calls,
+        };
+        self.ask(now, ask);
+    }
+
+    fn ask(&mut self, now: Instant, ask: Ask) {
+        let Some(to) = self.merges_to() else {
+            self.merging.step = Step::Pause(now + AGAIN, Some(ask));
+            return;
+        };
+        // Without an answer, the journal may still contain the calls, perhaps several times.
+        self.cut_off.expect_in_all(&ask.calls);
+        self.merging.step = Step::Asked(ask.clone(), to.clone());
+        self.merging.asked += 1;
+        let number = self.merging.asked;
+        self.act(Action::Merge { number, ask, to });
+    }
+
+    /// Handles the answer to a portion. `None` if the leader did not answer.
+    pub(super) fn portion_answered(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: Option<wire::MergeAnswer>,
+    ) {
+        let Step::Asked(ask, _) = &mut self.merging.step else {
+            return;
+        };
+        if number != self.merging.asked {
+            return;
+        }
+        let ask = ask.clone();
+        match answer {
+            None => self.merging.step = Step::Pause(now + AGAIN, Some(ask)),
+            Some(wire::MergeAnswer::Again) => self.merging.step = Step::Pause(now + AGAIN, None),
+            Some(wire::MergeAnswer::Done(outcomes)) => {
+                self.merging.unread = true;
+                if self.merging.telling {
+                    return self.told(now, &ask, &outcomes);
+                }
+                if let Some(left) = &mut self.merging.left {
+                    left.drain(..ask.calls.len().min(left.len()));
+                }
+                let lost_there = ask.calls.iter().zip(&outcomes);
+                let lost_there =
+                    lost_there.filter(|(_, of)| matches!(of, WriteOutcome::Lost { .. }));
+                let lost_there = lost_there.filter_map(|(call, _)| parameter_of(call));
+                self.merging.untold.extend(lost_there);
+                self.report(ask.calls.into_iter().zip(outcomes).collect());
+                self.next_portion(now);
+            }
+        }
+    }
+
+    /// Handles the answer to a portion that set parameters again.
+    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
+        let is_last = self.merging.rounds >= ROUNDS_MAX;
+        let untold = &mut self.merging.untold;
+        let before = untold.len();
+        for (call, outcome) in ask.calls.iter().zip(outcomes) {
+            // If it was changed meanwhile, nodes may have heard the new value before the lost one.
+            if is_last || !matches!(outcome, WriteOutcome::Lost { .. }) {
+                call.text(1).map(|key| untold.remove(key));
+            }
+        }
+        match untold.len() == before - ask.calls.len() {
+            true => self.next_portion(now),
+            false => {
+                self.merging.rounds += 1;
+                self.merging.step = Step::Pause(now + AGAIN, None);
+            }
+        }
+    }
+
+    fn report(&mut self, outcomes: Vec<(Request, WriteOutcome)>) {
+        for (call, outcome) in &outcomes {
+            match outcome {
+                WriteOutcome::Holds => self.merging.sent += 1,
+                // Others have deleted the parameter, too.
+                WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+                WriteOutcome::Refused(_) | WriteOutcome::Lost { .. } => self.merging.lost += 1,
+            }
+        }
+        if !outcomes.is_empty() {
+            self.act(Action::Report(outcomes));
+        }
+    }
+
+    /// Finishes the oldest period: all its writes have been sent.
+    fn merged(&mut self) {
+        let (sent, lost) = (self.merging.sent, self.merging.lost);
+        self.tell(News::Merged { sent, lost });
+        self.merging = Merging {
+            times: self.merging.times + 1,
+            asked: self.merging.asked,
+            ..Merging::new(std::mem::take(&mut self.merging.id))
+        };
+        self.cut_off.sent();
+        self.keep_all();
+        self.adopt();
+        if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {
+            self.stand_leading(term);
+        }
+        self.update_standing();
+    }
+}
+
+/// The resolved name of the parameter of a lost write.
+fn parameter(lost: &Lost) -> Option<String> {
+    parameter_of(&lost.call)
+}
+
+fn parameter_of(call: &Request) -> Option<String> {
+    let sets = matches!(call.method(), Method::SetParam | Method::DeleteParam);
+    sets.then(|| Some(names::resolve(call.text(1)?, call.caller()?)))?
+}
+
+/// Calls that set each of these parameters to its value in `state`, so that its subscribers are notified.
+fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
+    let values = keys.iter().filter_map(|key| {
+        let parts: Vec<_> = names::parts(key).collect();
+        Some((key, merge::value_at(state.params(), &parts)?))
+    });
+    let calls = values.map(|(key, value)| {
+        let arguments = [Value::from(TELLER), key.as_str().into(), value.clone()];
+        Request::new(Method::SetParam, arguments)
+    });
+    calls.collect()
+}
+
+/// How many of the calls fit into the next portion.
+fn portion(calls: &[Request]) -> usize {
+    let (mut count, mut bytes) = (0, 0);
+    for call in calls.iter().take(CALLS_MOST) {
+        // Its answer contains a value that the master may be unable to return.
+        let is_alone = *call.method() == Method::SubscribeParam;
+        bytes += weight(call);
+        if count > 0 && (is_alone || bytes > BYTES_MOST) {
+            break;
+        }
+        count += 1;
+        if is_alone {
+            break;
+        }
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calls_go_in_portions_and_none_is_left_out() {
+        let set = |value: &str| Request::new(Method::SetParam, ["/n", "/k", value]);
+        let subscribe = Request::new(Method::SubscribeParam, ["/n", "http://n:1/", "/k"]);
+        let large = "x".repeat(BYTES_MOST);
+        let mut calls = vec![set("1"); CALLS_MOST + 1];
+        calls.extend([set(&large), set(&large), set("2"), subscribe, set("3")]);
+        let mut lengths = Vec::new();
+        let mut left = calls.as_slice();
+        while !left.is_empty() {
+            let count = portion(left);
+            lengths.push(count);
+            left = &left[count..];
+        }
+        assert_eq!(lengths, [CALLS_MOST, 1, 1, 1, 1, 1, 1]);
+    }
+}

@@ -1,0 +1,261 @@
+//! Changes of this computer's role: it starts a master, or gives it up.
+
+use std::time::Instant;
+
+use super::{Action, Cause, Member, News};
+use crate::{
+    cluster::{
+        machine::{JournalSession, Role, WhenAlone},
+        mutant::Mutant,
+        sharing::{Change, Source},
+        standing::{Pass, Standing},
+    },
+    master::Master,
+};
+
+/// Probes of the leader's rosrescue per time to live.
+pub const PROBES: u32 = 4;
+/// The same while etcd is silent. Then only the leader itself shows whether it still leads.
+const PROBES_IN_SILENCE: u32 = 20;
+
+/// Whether a change is this computer's own. A forwarded call is made elsewhere if it gets no answer here.
+pub(super) fn is_ours(change: &Change) -> bool {
+    !matches!(change, Change::Call(_, Source::Forwarded)) || Mutant::KeepsForwarded.lives()
+}
+
+impl Member {
+    pub(super) fn become_role(&mut self, now: Instant, role: Role) {
+        let before = std::mem::replace(&mut self.role, role);
+        if before == Role::Alone && role != Role::Alone {
+            self.tell(News::NotAlone);
+        }
+        match role {
+            Role::Leading => self.lead(now),
+            Role::Alone => self.be_alone(),
+            Role::Joining | Role::Following | Role::CatchingUp => {
+                if self.records() {
+                    self.tell(News::Deposed);
+                }
+                self.released();
+                self.give_up();
+            }
+        }
+        self.chores.say_at(now);
+    }
+
+    fn lead(&mut self, now: Instant) {
+        let term = self.machine.term().unwrap_or_default();
+        match self.records() {
+            false => self.begin_to_lead(now),
+            true => {
+                self.tell(News::LeadsAgain);
+                self.act(Action::ServeOwnOnly(false));
+                self.begin_master(Cause::WasCutOff);
+                self.cut_off.resumed();
+                if self.cut_off.is_empty() {
+                    self.act(Action::KeepNothing);
+                }
+            }
+        }
+        self.act(Action::Term(term));
+        self.stand_leading(term);
+    }
+
+    fn begin_to_lead(&mut self, now: Instant) {
+        let over = matches!(self.machine.session(), JournalSession::Over(_));
+        let before = self.before.leader.take();
+        let own = &self.settings().name;
+        let cause = match before.as_ref().is_some_and(|(name, _)| name != own) {
+            true => Cause::TakenOver,
+            false => Cause::Started,
+        };
+        let released = self.before.released;
+        self.tell(News::Leads { before, released });
+        let owns = std::mem::take(&mut self.own_wins);
+        let seq = self.machine.committed();
+        self.outgoing.start(seq);
+        self.acknowledged = seq;
+        let held = self.journal.state.clone();
+        let state = match over {
+            true => Some(Master::default()),
+            // Writes answered while cut off are merged later. They are not part of the state that the others get.
+            false => (!self.cut_off.is_empty() && !owns).then(|| held.clone()),
+        };
+        self.act(Action::Lead { seq, held, state });
+        let displaced = self.journal.displaced.at(now);
+        self.act(Action::TellDisplaced(displaced));
+        self.begin_master(cause);
+    }
+
+    fn be_alone(&mut self) {
+        let serves = self.settings().alone == WhenAlone::Serve;
+        self.tell(News::Alone { serves });
+        if !serves {
+            self.give_up();
+            return self.stand(Standing::Nobody { known: true });
+        }
+        let led = self.records();
+        self.end_master();
+        let base = match led || self.follows() {
+            true => &self.journal.state,
+            false => &self.own.state,
+        };
+        // The nodes continue from what they wrote while cut off before.
+        let base = self.cut_off.on(base);
+        self.begin_cut_off(base.clone());
+        self.act(Action::ServeOwnOnly(true));
+        if led {
+            // Recorded calls are answered from now on, except forwarded ones, which are made elsewhere.
+            let answered = self.acknowledged;
+            let changes = self.outgoing.changes();
+            let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
+            let kept = self.cut_off.add(kept, true);
+            self.keep(kept);
+        } else {
+            // First, so that no more calls are forwarded.
+            self.stand(Standing::Nobody { known: true });
+            self.act(Action::AskForwarded);
+            let seq = self.machine.committed();
+            self.outgoing.start(seq);
+            self.acknowledged = seq;
+            let (held, state) = (base.clone(), Some(base));
+            self.act(Action::Lead { seq, held, state });
+        }
+        self.act(Action::StandIn);
+        self.stand(Standing::Alone);
+        self.all_ready();
+    }
+
+    /// From now on, keeps answered writes for the leader. `base` is the present state.
+    pub(super) fn begin_cut_off(&mut self, base: Master) {
+        let first = self.cut_off.is_empty();
+        // Before etcd has been read, the others' state is unknown. It is compared with the first period.
+        if first || self.reading.loaded {
+            self.cut_off.begin(base);
+        }
+        if first {
+            self.keep_all();
+        }
+    }
+
+    pub(super) fn begin_master(&mut self, cause: Cause) {
+        self.has_master = true;
+        self.act(Action::BeginMaster(cause));
+    }
+
+    pub(super) fn end_master(&mut self) {
+        if Mutant::MasterWhileAlone.lives() && self.role == Role::Alone {
+            return;
+        }
+        if std::mem::take(&mut self.has_master) {
+            self.act(Action::EndMaster);
+        }
+    }
+
+    /// Runs a master as long as the machine allows it.
+    pub(super) fn update_master(&mut self) {
+        let may = self.machine.may_have_master();
+        if self.has_master && !may {
+            self.tell(News::Lapsed);
+            self.end_master();
+            self.act(Action::StandIn);
+        } else if !self.has_master && may && self.records() {
+            self.begin_master(Cause::WasCutOff);
+        }
+    }
+
+    /// Stops recording and answering for the other computers.
+    fn give_up(&mut self) {
+        self.act(Action::Leave);
+        let known = self.knows();
+        self.stand(Standing::Nobody { known });
+        self.end_master();
+        self.act(Action::ServeOwnOnly(false));
+        self.act(Action::TurnAway);
+        self.adopt();
+    }
+
+    /// Publishes who has the master and where calls go, if that has changed.
+    pub(super) fn stand(&mut self, standing: Standing) {
+        if self.standing != standing {
+            self.standing = standing.clone();
+            self.act(Action::Stand(standing));
+        }
+    }
+
+    /// Publishes that this computer leads. Calls wait while earlier writes, answered while cut off, are being merged.
+    pub(super) fn stand_leading(&mut self, term: u64) {
+        let pass = match (self.cut_off.is_empty(), self.release.is_begun()) {
+            (false, _) => Pass::Nothing,
+            (true, true) => Pass::Reads,
+            (true, false) => Pass::Calls,
+        };
+        self.stand(Standing::Leads { term, pass });
+    }
+
+    /// The address and term of the leader, if it is another computer that has not given up leadership.
+    pub(super) fn leader(&self) -> Option<(&str, u64)> {
+        let own = self.settings();
+        let view = self.view();
+        let leader = view.leader.as_ref()?;
+        let released = view.alive.as_ref().is_some_and(|of| of.released.is_some());
+        let is_own = leader.id == own.id || leader.name == own.name && leader.uri == own.uri;
+        (!released && !is_own).then_some((&*leader.uri, leader.term))
+    }
+
+    /// Updates the standing when the leader changes.
+    pub(super) fn update_standing(&mut self) {
+        self.look_at_place();
+        let own = &self.settings().id;
+        let view = self.view();
+        let other = view.leader.as_ref().filter(|leader| leader.id != *own);
+        if let Some(leader) = other {
+            let released = view.alive.as_ref().is_some_and(|of| of.released.is_some());
+            let seen = self.machine.observed();
+            self.before.leader = seen.map(|at| (leader.name.clone(), at));
+            self.before.released = released;
+        }
+        if self.machine.role() != Role::Following || self.role != Role::Following {
+            return;
+        }
+        let standing = match self.leader() {
+            // Writes answered while cut off must be merged before new calls.
+            Some((uri, term)) if self.cut_off.is_empty() => {
+                let uri = uri.to_owned();
+                Standing::Follows { uri, term }
+            }
+            _ => Standing::Nobody {
+                known: self.knows(),
+            },
+        };
+        self.stand(standing);
+    }
+
+    /// Probes the leader's rosrescue regularly.
+    pub(super) fn update_probes(&mut self, now: Instant) {
+        let asks = matches!(self.machine.role(), Role::Following | Role::Alone);
+        let leader = self.leader().filter(|_| asks);
+        let leader = leader.map(|(uri, term)| (uri.to_owned(), term));
+        let Some((uri, term)) = leader else {
+            (self.probing.under_way, self.probing.at) = (false, None);
+            return;
+        };
+        let ttl = self.settings().ttl;
+        let silent = self.machine.heard().is_none_or(|heard| heard + ttl <= now);
+        let pause = ttl / if silent { PROBES_IN_SILENCE } else { PROBES };
+        let probing = &mut self.probing;
+        if !probing.under_way && *probing.at.get_or_insert(now) <= now {
+            probing.number += 1;
+            (probing.under_way, probing.at) = (true, Some(now + pause));
+            let number = probing.number;
+            self.act(Action::Probe { number, uri, term });
+        }
+    }
+
+    pub(super) fn probed(&mut self, number: u64, leads: bool) {
+        if self.probing.under_way && self.probing.number == number {
+            self.probing.under_way = false;
+            self.tell_machine(crate::cluster::machine::Input::Peer(leads));
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! One situation each. What happens when many come together is in `crate::cluster::tests`.
+
+use super::*;
+use crate::{
+    checkpoint::format::{Record, RecordContent},
+    cluster::{
+        machine::{Alive, Commit, EtcdAnswer, Leader},
+        merge::wire::{Ask, MergeAnswer, WriteOutcome},
+    },
+    master::Method,
+    xmlrpc::Value,
+};
+
+/// Others set the parameter again in record `seq`.
+fn record(seq: u64) -> Record {
+    let value = i32::try_from(seq).unwrap();
+    let entry = RecordContent::call(set(value).into());
+    Record { seq, entry }
+}
+
+fn set(value: i32) -> Request {
+    let params = [Value::from("/n"), "/k".into(), value.into()];
+    Request::new(Method::SetParam, params)
+}
+
+/// The keys when `b` leads, and its journal ends with record `seq`.
+fn led(seq: u64) -> View {
+    let revision = seq + 1;
+    View {
+        revision,
+        leader: Some(Leader {
+            term: 1,
+            name: "b".to_owned(),
+            id: "b-1".to_owned(),
+            claim: 1,
+            uri: "http://b:1/".to_owned(),
+            boot: String::new(),
+            version: String::new(),
+        }),
+        alive: Some(Alive {
+            revision,
+            beat: seq,
+            seq,
+            released: None,
+            settled: true,
+        }),
+    }
+}
+
+/// A computer that has set the parameter while it was cut off, and etcd.
+struct Merges {
+    member: Member,
+    now: Instant,
+    inputs: VecDeque<Input>,
+    journal: Progress,
+    lost: usize,
+}
+
+impl Merges {
+    fn new() -> Self {
+        let settings = Settings {
+            name: "a".to_owned(),
+            id: "a-1".to_owned(),
+            uri: "http://a:1/".to_owned(),
+            boot: String::new(),
+            version: String::new(),
+            ttl: Duration::from_secs(2),
+            commit: Commit::Always,
+            alone: WhenAlone::Serve,
+        };
+        let left = CutOff::left(Master::default(), [set(-1)]);
+        let (keys, own) = (Keys::new("robot"), Own::default());
+        Self {
+            member: Member::new(settings, keys, own, left, "a-1".to_owned()),
+            now: Instant::now(),
+            inputs: VecDeque::from([Input::Begin]),
+            journal: Progress::default(),
+            lost: 0,
+        }
+    }
+
+    /// Goes on until the leader is asked to merge something. `None` once all is merged.
+    fn next(&mut self) -> Option<(u64, Ask)> {
+        let until = self.now + Duration::from_secs(5);
+        let mut asked = None;
+        while asked.is_none() {
+            let input = self.inputs.pop_front().unwrap_or_else(|| {
+                self.now = self.member.deadline().unwrap();
+                Input::Wake
+            });
+            assert!(self.now < until, "{:?}", self.member);
+            for action in self.member.on(self.now, input) {
+                match action {
+                    Action::Send { number, .. } => {
+                        let answer = EtcdAnswer::Is(led(self.journal.seq));
+                        self.inputs.push_back(Input::Answer { number, answer });
+                    }
+                    Action::Load(known) => {
+                        assert_eq!(known.seq, self.journal.seq);
+                        self.load();
+                    }
+                    Action::Report(outcomes) => self.lost += outcomes.len(),
+                    Action::Merge { number, ask, .. } => asked = Some((number, ask)),
+                    Action::Tell(News::Merged { .. }) => return None,
+                    _ => {}
+                }
+            }
+        }
+        asked
+    }
+
+    /// Each time that this computer reads the journal, others have set the parameter again.
+    fn load(&mut self) {
+        let seq = self.journal.seq + 1;
+        let records = vec![record(seq)];
+        self.journal.take(records.clone(), 1).unwrap();
+        self.inputs.push_back(Input::Loaded(Some(Read {
+            view: led(seq),
+            state: None,
+            records,
+            progress: self.journal,
+            heard: Vec::new(),
+        })));
+    }
+}
+
+/// The calls of this computer's nodes wait for the end of the merge.
+#[test]
+fn a_merge_ends_although_others_keep_changing_a_parameter_whose_value_was_lost() {
+    let (mut merges, mut told) = (Merges::new(), 0);
+    while let Some((number, ask)) = merges.next() {
+        // The write itself is lost; the nodes must hear the others' value.
+        let value = i32::try_from(merges.journal.seq).unwrap();
+        assert_eq!(ask.calls.len(), 1);
+        assert_eq!(ask.calls[0].params().get(2), Some(&value.into()));
+        let outcome = WriteOutcome::Lost {
+            why: "changed".to_owned(),
+            present: None,
+        };
+        let answer = Some(MergeAnswer::Done(vec![outcome]));
+        merges.inputs.push_back(Input::Merged { number, answer });
+        told += 1;
+    }
+    assert_eq!((told, merges.lost), (4, 1));
+}
+
+/// With thousands of writes to merge, each new state costs 10 ms. If every record of others cost as much, this computer
+/// would fall further and further behind.
+#[test]
+fn however_many_records_arrive_at_once_they_make_one_new_state() {
+    let mut merges = Merges::new();
+    assert!(merges.next().is_some());
+    let first = merges.journal.seq + 1;
+    let entries = (first..first + 50).map(|seq| Entry::Records {
+        records: vec![record(seq)],
+        bytes: 1,
+    });
+    let (view, entries, heard) = (led(first + 49), entries.collect(), Vec::new());
+    let watched = Input::Watched {
+        view,
+        entries,
+        heard,
+    };
+    let actions = merges.member.on(merges.now, watched);
+    let mut states = actions.iter().filter_map(|action| match action {
+        Action::FollowState(state) => state.params().get("k"),
+        _ => None,
+    });
+    let last = i32::try_from(first + 49).unwrap();
+    assert_eq!(states.next(), Some(&last.into()));
+    assert_eq!(states.next(), None);
+}

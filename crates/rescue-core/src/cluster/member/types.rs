@@ -1,0 +1,311 @@
+//! Inputs and actions of [`Member`](super::Member).
+
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    checkpoint::format::Record,
+    cluster::{
+        journal::{Progress, Put},
+        machine::{EtcdAnswer, Op, Settings, View},
+        merge::wire::{self, Ask, WriteOutcome},
+        namesake::{Key, Sign},
+        sharing::Change,
+        standing::Standing,
+    },
+    master::{Displaced, Master, Request},
+};
+
+/// What this computer's checkpoint holds at the start.
+#[derive(Clone, Debug, Default)]
+pub struct Own {
+    /// The state in the ledger.
+    pub state: Master,
+    /// Whether the state belongs to a session that continues.
+    pub restored: bool,
+    /// The last term in which this computer led.
+    pub term: u64,
+    /// The last record of the journal that the state contains.
+    pub seq: u64,
+}
+
+/// A computer's entry among the members, as JSON at `ROBOT/members/NAME`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Said {
+    pub uri: String,
+    pub version: String,
+    pub role: String,
+    pub seq: u64,
+    /// See [`Settings::boot`].
+    #[serde(default)]
+    pub boot: String,
+    /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
+    #[serde(default)]
+    pub holds: Option<Holds>,
+}
+
+/// A place in a journal that etcd has lost: its leader's term and a record number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Holds {
+    pub term: u64,
+    pub seq: u64,
+}
+
+/// An entry among the members.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Heard {
+    pub name: String,
+    /// `None` if the entry was deleted.
+    pub said: Option<Said>,
+    /// The revision of the entry's last change.
+    pub revision: u64,
+}
+
+impl Heard {
+    /// Returns evidence of a namesake if this entry, which has the name in `own`, belongs to another computer.
+    pub(super) fn sign_of_namesake(&self, own: &Settings) -> Option<Sign> {
+        let said = self.said.as_ref()?;
+        let is_own = own.is_of_this_computer(&self.name, &said.uri, &said.boot);
+        (!is_own).then(|| Sign {
+            key: Key::Member,
+            uri: said.uri.clone(),
+            revision: self.revision,
+        })
+    }
+}
+
+/// A journal entry as the watch delivers it.
+#[derive(Clone, Debug)]
+pub enum Entry {
+    Records {
+        records: Vec<Record>,
+        bytes: usize,
+    },
+    /// An entry that must be read separately, up to this record.
+    Apart(u64),
+}
+
+/// The part of the journal that was not known yet.
+#[derive(Clone, Debug)]
+pub struct Read {
+    /// The leader's two keys at the same revision.
+    pub view: View,
+    /// The state before the records, and who was displaced until then. `None` if the records follow the known journal.
+    pub state: Option<(Master, Vec<Displaced>)>,
+    pub records: Vec<Record>,
+    pub progress: Progress,
+    pub heard: Vec<Heard>,
+}
+
+/// What happened.
+#[derive(Debug)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "few exist at a time, and none is stored"
+)]
+pub enum Input {
+    /// The member starts.
+    Begin,
+    /// The answer to request `number` of the machine.
+    Answer { number: u64, answer: EtcdAnswer },
+    /// The watch delivers the leader's keys, new journal entries, and changed member entries.
+    Watched {
+        view: View,
+        entries: Vec<Entry>,
+        heard: Vec<Heard>,
+    },
+    /// The watch has ended.
+    WatchEnded,
+    /// The result of [`Action::Load`]. `None` if etcd could not be read.
+    Loaded(Option<Read>),
+    /// The ledger has recorded these changes.
+    Recorded(Vec<Change>),
+    /// The result of [`Action::TakeAsState`].
+    AsState(Option<Change>),
+    /// The result of [`Action::AskForwarded`]: writes of this computer's nodes that a leader has not answered.
+    Forwarded(Vec<Request>),
+    /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
+    Prepared(Option<bool>),
+    /// The result of [`Action::Decide`].
+    Decided { seq: u64, goes_on: bool },
+    /// The result of [`Action::Probe`] `number`: whether the leader's rosrescue answered that it leads.
+    Probed { number: u64, leads: bool },
+    /// The result of [`Action::Merge`] `number`. `None` if the leader did not answer.
+    Merged {
+        number: u64,
+        answer: Option<wire::MergeAnswer>,
+    },
+    /// The result of [`Action::WriteSnapshot`]: its place and its size in bytes. `None` if it was not written.
+    SnapshotWritten(Option<(Progress, usize)>),
+    /// Someone asks for a handover to the computer `to`, or to any if `to` is empty. `refused` says why that computer
+    /// cannot lead.
+    HandOver { to: String, refused: Option<String> },
+    /// rosrescue was asked to stop.
+    Stop,
+    /// The result of [`Action::EndRosout`].
+    RosoutEnded,
+    /// The deadline of [`Member::deadline`](super::Member::deadline) has passed.
+    Wake,
+}
+
+impl Input {
+    /// The member entries in this input.
+    pub fn heard(&self) -> &[Heard] {
+        match self {
+            Self::Watched { heard, .. } => heard,
+            Self::Loaded(Some(read)) => &read.heard,
+            _ => &[],
+        }
+    }
+}
+
+/// Why a master is started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cause {
+    Started,
+    TakenOver,
+    WasCutOff,
+}
+
+/// An event to log for the operator.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum News {
+    /// This computer is cut off.
+    Alone {
+        serves: bool,
+    },
+    NotAlone,
+    /// This computer leads from now on. `before` is the previous leader and when it was last heard of; `released` says
+    /// whether it gave up leadership by itself.
+    Leads {
+        before: Option<(String, Instant)>,
+        released: bool,
+    },
+    LeadsAgain,
+    Deposed,
+    /// etcd has lost its data. The most recent state of a living computer will replace it.
+    EtcdLost,
+    /// The master was killed, because another computer may lead.
+    Lapsed,
+    /// The start waits until `until`, because the computer at `uri` may have this name.
+    Suspect {
+        uri: String,
+        until: Instant,
+    },
+    /// A change is too large for the journal.
+    TooLarge(String),
+    /// The writes made while cut off have been merged: `sent` were accepted, `lost` were not.
+    Merged {
+        sent: u64,
+        lost: u64,
+    },
+}
+
+/// What the shell must do, in order.
+#[derive(Debug)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "few exist at a time, and none is stored"
+)]
+pub enum Action {
+    /// Write `parts`, if any, in `term`; then carry out `op` with the journal's `entry`. Ends with [`Input::Answer`].
+    Send {
+        number: u64,
+        op: Op,
+        entry: Option<Put>,
+        term: u64,
+        parts: Vec<Put>,
+    },
+    /// Read the journal after this place.
+    Load(Progress),
+    /// Watch the leader's keys and the journal from this revision on.
+    Watch(View),
+    /// Write the parts of a large change.
+    Prepare {
+        term: u64,
+        parts: Vec<Put>,
+    },
+    /// Find out whether the session of the journal, which has `state` at record `seq`, continues. `closed` says whether
+    /// the last leader stopped cleanly.
+    Decide {
+        seq: u64,
+        state: Master,
+        closed: bool,
+    },
+    /// Publish who has the master and where calls go.
+    Stand(Standing),
+    /// Stop recording, acknowledging and notifying.
+    Leave,
+    /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
+    /// the ledger's state, if set.
+    Lead {
+        seq: u64,
+        held: Master,
+        state: Option<Master>,
+    },
+    /// Apply these records of another computer.
+    Follow(Vec<Record>),
+    /// Take over this state of another computer.
+    FollowState(Master),
+    /// Answer the calls up to this record.
+    Acknowledge(u64),
+    /// Replace the recorded changes that were not handed out yet by the ledger's state.
+    TakeAsState,
+    AskForwarded,
+    /// Tell these displaced nodes to shut down again, because they may have missed it.
+    TellDisplaced(Vec<Displaced>),
+    /// Note this term in the checkpoint.
+    Term(u64),
+    BeginMaster(Cause),
+    /// Kill the master at once.
+    EndMaster,
+    /// The mirror answers, because there is no master.
+    StandIn,
+    /// Answer no call on this computer.
+    TurnAway,
+    /// Whether to notify this computer's nodes only.
+    ServeOwnOnly(bool),
+    /// Keep exactly these writes, answered while cut off since the state was `base`.
+    KeepAll {
+        base: Master,
+        calls: Vec<Request>,
+    },
+    /// Keep these writes as well.
+    Keep(Vec<Request>),
+    /// Delete the kept writes.
+    KeepNothing,
+    /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
+    Merge {
+        number: u64,
+        ask: Ask,
+        to: Option<(String, u64)>,
+    },
+    /// Report the outcomes of writes that were answered while cut off.
+    Report(Vec<(Request, WriteOutcome)>),
+    /// Ask the rosrescue at `uri` whether it leads in `term`. Wait for a quarter of the time to live at most.
+    Probe {
+        number: u64,
+        uri: String,
+        term: u64,
+    },
+    /// Write this computer's entry among the members.
+    Say,
+    WriteSnapshot {
+        term: u64,
+        progress: Progress,
+        state: Master,
+        displaced: Vec<Displaced>,
+    },
+    /// Compact etcd up to this revision.
+    Forget(u64),
+    /// Answer a handover request: done, or why not.
+    HandedOver(Result<(), String>),
+    /// Stop roscore's other duties while calls still pass.
+    EndRosout,
+    Tell(News),
+    /// Stop.
+    End,
+    /// Stop, because the computer at this address has the same name.
+    EndForNamesake(String),
+}

@@ -1,0 +1,54 @@
+//! Defects found in the field. A test puts each back, and the simulation must find it.
+
+/// A defect that the product had.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mutant {
+    /// A former leader trusts its own disk although etcd's journal holds more.
+    OwnDiskWins,
+    /// A leader that was paused acts before it knows whether it still leads, and a silent one keeps its master.
+    ActsWithoutLease,
+    /// A computer that is cut off runs a master, which notifies nodes on other computers.
+    MasterWhileAlone,
+    /// A follower's mirror answers although it is out of date.
+    StaleReads,
+    /// A merge compares two states, so a value that others changed and changed back counts as unchanged.
+    MergesByState,
+    /// A value that equals this computer's own write never counts as another computer's change.
+    GuessesByValues,
+    /// Writes made while cut off are judged once, and then sent whatever others write meanwhile.
+    JudgesOnce,
+    /// A leader that is cut off keeps calls that other computers forwarded to it.
+    KeepsForwarded,
+    /// Every write made while cut off is kept, instead of the last one of each subject.
+    KeepsEachWrite,
+    /// An etcd that has lost its data is not recognised.
+    TrustsLostEtcd,
+    /// Two computers of one name do not notice each other.
+    IgnoresNamesake,
+    /// A request that never ends blocks the machine forever.
+    WaitsForEver,
+}
+
+#[cfg(test)]
+thread_local! {
+    static PRESENT: std::cell::Cell<Option<Mutant>> = const { std::cell::Cell::new(None) };
+}
+
+impl Mutant {
+    /// Whether this defect is present.
+    #[cfg(test)]
+    pub(crate) fn lives(self) -> bool {
+        PRESENT.get() == Some(self)
+    }
+
+    #[cfg(not(test))]
+    pub(crate) fn lives(self) -> bool {
+        false
+    }
+
+    /// Sets this thread's defect.
+    #[cfg(test)]
+    pub(crate) fn put(mutant: Option<Self>) {
+        PRESENT.set(mutant);
+    }
+}

@@ -1,0 +1,210 @@
+//! Records the changes that other computers must get, and who changed what recently. Pure.
+
+use std::{collections::VecDeque, sync::Arc};
+
+use crate::{
+    checkpoint::format::{self, Record, RecordContent},
+    cluster::{
+        merge::{self, ChangeSubject, Changes, Verdict},
+        mutant::Mutant,
+    },
+    master::{Master, Request},
+};
+
+/// How many changes are remembered for computers that were cut off.
+const RECENT_MOST: usize = 4096;
+/// The approximate limit of their size, in bytes.
+const RECENT_BYTES_MOST: usize = 4 << 20;
+
+/// The source of a recorded call.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Source {
+    /// A node of this computer, or rosrescue itself.
+    #[default]
+    Here,
+    /// Another computer, which repeats the call elsewhere if it gets no answer.
+    Forwarded,
+    /// A computer that was cut off and now sends its writes under this name.
+    Merge(Arc<str>),
+}
+
+/// The latest changes, oldest first.
+#[derive(Debug, Default)]
+struct Recent {
+    /// The list is complete after this record.
+    after: u64,
+    changes: VecDeque<(u64, Source, Vec<ChangeSubject>)>,
+    bytes: usize,
+}
+
+impl Recent {
+    /// Creates a list that is complete after record `seq`.
+    fn from(seq: u64) -> Self {
+        Self {
+            after: seq,
+            ..Self::default()
+        }
+    }
+
+    fn add(&mut self, seq: u64, source: &Source, call: &Request) {
+        let subjects: Vec<_> = call
+            .calls()
+            .into_iter()
+            .flat_map(ChangeSubject::of)
+            .collect();
+        self.bytes += bytes_of(&subjects);
+        self.changes.push_back((seq, source.clone(), subjects));
+        while (self.changes.len() > RECENT_MOST || self.bytes > RECENT_BYTES_MOST)
+            && let Some((seq, _, subjects)) = self.changes.pop_front()
+        {
+            self.after = seq;
+            self.bytes -= bytes_of(&subjects);
+        }
+    }
+
+    /// The changes after record `seq` that `merge` did not make. `None` if the list does not reach back so far.
+    fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
+        if seq < self.after {
+            return None;
+        }
+        let later = self.changes.iter().filter(|(of, ..)| *of > seq);
+        let theirs = later
+            .filter(|(_, source, _)| !matches!(source, Source::Merge(name) if **name == *merge));
+        let mut changes = Changes::default();
+        for subject in theirs.flat_map(|(.., subjects)| subjects) {
+            changes.add(subject.clone());
+        }
+        Some(changes)
+    }
+}
+
+fn bytes_of(subjects: &[ChangeSubject]) -> usize {
+    subjects.iter().map(ChangeSubject::size).sum()
+}
+
+/// A change that the other computers must get.
+#[derive(Clone, Debug)]
+pub enum Change {
+    Call(Record, Source),
+    /// The state was replaced as a whole by record `seq`.
+    State {
+        seq: u64,
+        state: Box<Master>,
+    },
+}
+
+impl Change {
+    /// Its number in the journal.
+    pub fn seq(&self) -> u64 {
+        match self {
+            Self::Call(record, _) => record.seq,
+            Self::State { seq, .. } => *seq,
+        }
+    }
+}
+
+/// The changes that a computer records while it leads or is cut off, numbered as in the journal.
+#[derive(Debug)]
+pub struct Sharing {
+    /// The number of the last record.
+    last: u64,
+    changes: Vec<Change>,
+    recent: Recent,
+}
+
+impl Sharing {
+    /// Creates one whose first record comes after `seq`.
+    pub fn after(seq: u64) -> Self {
+        Self {
+            last: seq,
+            changes: Vec::new(),
+            recent: Recent::from(seq),
+        }
+    }
+
+    /// The number of the last record.
+    pub fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// Records a call from `source`. A call that cannot be encoded is left out, as in the checkpoint.
+    pub fn record(&mut self, call: &Request, source: &Source) {
+        let record = Record {
+            seq: self.last + 1,
+            entry: RecordContent::call(call.clone().into()),
+        };
+        if format::push_record(&mut Vec::new(), &record).is_ok() {
+            self.last += 1;
+            self.recent.add(self.last, source, call);
+            self.changes.push(Change::Call(record, source.clone()));
+        }
+    }
+
+    /// Records that the state was replaced by `mirror`.
+    pub fn record_state(&mut self, mirror: &Master) {
+        self.last += 1;
+        // Anything may have changed.
+        self.recent = Recent::from(self.last);
+        let (seq, state) = (self.last, Box::new(mirror.clone()));
+        self.changes.push(Change::State { seq, state });
+    }
+
+    /// Returns the recorded changes, each once.
+    pub fn take(&mut self) -> Vec<Change> {
+        std::mem::take(&mut self.changes)
+    }
+
+    /// Returns the recorded changes as one: their result, which is `mirror`.
+    pub fn take_as_state(&mut self, mirror: &Master) -> Change {
+        self.changes.clear();
+        let (seq, state) = (self.last, Box::new(mirror.clone()));
+        Change::State { seq, state }
+    }
+
+    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. It sends them under the
+    /// name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the changes after that
+    /// record are no longer known.
+    pub fn judge(
+        &self,
+        mirror: &Master,
+        seq: u64,
+        merge: &str,
+        calls: &[&Request],
+    ) -> Option<Vec<Verdict>> {
+        let changes = match Mutant::JudgesOnce.lives() {
+            true => Changes::default(),
+            false => self.recent.since(seq, merge)?,
+        };
+        let calls = calls.iter();
+        Some(
+            calls
+                .map(|call| merge::judge(&changes, mirror, call))
+                .collect(),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{master::Method, xmlrpc::Value};
+
+    fn set_of(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    #[test]
+    fn old_changes_are_forgotten() {
+        let mut recent = Recent::from(3);
+        for seq in 4..=u64::try_from(RECENT_MOST).unwrap() + 13 {
+            recent.add(seq, &Source::Here, &set_of("/a", 1));
+        }
+        assert!(recent.since(12, "mine").is_none());
+        assert!(recent.since(13, "mine").is_some());
+        let key = "k".repeat(RECENT_BYTES_MOST);
+        recent.add(9_000, &Source::Here, &set_of(&key, 1));
+        assert!(recent.since(8_999, "mine").is_none() && recent.changes.is_empty());
+        assert_eq!(recent.bytes, 0);
+    }
+}

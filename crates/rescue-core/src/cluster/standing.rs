@@ -1,0 +1,65 @@
+//! One value that says who has the master and where calls go. Pure.
+
+use crate::cluster::mutant::Mutant;
+
+/// The calls that a leader answers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pass {
+    Calls,
+    /// The mirror answers reads. Writes wait for the next leader.
+    Reads,
+    /// Nothing. Writes answered while cut off are not merged yet, so their callers would not see them.
+    Nothing,
+}
+
+/// This computer's standing. Only [`Member`](crate::cluster::member::Member) sets it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// This computer leads in `term`, and has the master.
+    Leads { term: u64, pass: Pass },
+    /// This computer is cut off. Its mirror answers its own nodes, and other computers' calls are refused.
+    Alone,
+    /// The computer at `uri` leads in `term`. All calls are forwarded to it.
+    Follows { uri: String, term: u64 },
+    /// No computer leads. Writes wait. If `known`, the mirror has the robot's state and answers reads.
+    Nobody { known: bool },
+}
+
+impl Standing {
+    /// Whether calls are recorded on this computer.
+    pub fn records(&self) -> bool {
+        matches!(self, Self::Leads { .. } | Self::Alone)
+    }
+
+    /// Whether this computer answers its own nodes' calls.
+    pub fn answers(&self) -> bool {
+        let pass = Pass::Calls;
+        matches!(self, Self::Leads { pass: of, .. } if *of == pass) || *self == Self::Alone
+    }
+
+    /// Whether this computer answers calls that other computers forward to the leader of `term`.
+    pub fn answers_others(&self, term: u64) -> bool {
+        let pass = Pass::Calls;
+        *self == Self::Leads { term, pass }
+    }
+}
+
+/// A place in the journal of all computers. A place in a later term is further: that term's leader has everything
+/// committed before, and nothing more of earlier terms can be added.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Place {
+    /// How often etcd has lost its data since this process started.
+    pub epoch: u64,
+    /// The leader's term.
+    pub term: u64,
+    /// The record number.
+    pub seq: u64,
+}
+
+impl Place {
+    /// Whether a mirror at this place may answer reads after earlier answers have shown the place `told`. On one
+    /// computer, no read goes back in time.
+    pub fn shows(self, told: Self) -> bool {
+        self >= told || Mutant::StaleReads.lives()
+    }
+}

@@ -1,0 +1,512 @@
+//! What nodes have done and heard, and what must be true of it.
+
+use std::collections::HashMap;
+
+use super::{
+    etcd::{Etcd, Held},
+    world::COMPUTERS,
+};
+use crate::{
+    checkpoint::format::RecordContent as JournalEntry,
+    cluster::machine::Commit,
+    master::{Master, Method, Request},
+    xmlrpc::Value,
+};
+
+/// Parameters that are written.
+pub(super) const KEYS: usize = 4;
+
+pub(super) fn key(number: usize) -> String {
+    format!("/k{number}")
+}
+
+pub(super) fn node(computer: usize) -> String {
+    format!("http://node{computer}:1/")
+}
+
+/// The state in which all begins: a node of each computer subscribes to each parameter.
+pub(super) fn subscriptions() -> Master {
+    let mut state = Master::default();
+    for computer in 0..COMPUTERS {
+        for number in 0..KEYS {
+            let (caller, api, key) = (format!("/s{computer}"), node(computer), key(number));
+            let params = [caller.as_str(), api.as_str(), key.as_str()];
+            state.apply(&Request::new(Method::SubscribeParam, params));
+        }
+    }
+    state
+}
+
+pub(super) fn value_of(state: &Master, number: usize) -> Option<i32> {
+    state
+        .params()
+        .get(&key(number)[1..])
+        .and_then(Value::as_int)
+}
+
+/// A write of a node, and what becomes of it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Call {
+    pub(super) computer: usize,
+    pub(super) key: usize,
+    pub(super) value: i32,
+    pub(super) made: u64,
+    /// When it was answered, and by which computer,
+    ran: Option<u64>,
+    by: Option<usize>,
+    /// and when its node had the answer.
+    heard: Option<u64>,
+    /// It was answered alone, by a computer that held so much of the log.
+    alone: Option<usize>,
+    /// Others have been told that it does not hold.
+    reported: bool,
+    /// It was answered alone, and the power failed before the disk had it.
+    unsynced: bool,
+    /// It is what others have set, too.
+    held: bool,
+    /// It was run where it changed nothing, and is in no journal.
+    unchanged: bool,
+    /// A leader has made it for a computer that was alone, when the log had this length.
+    merged: Option<(u64, usize)>,
+}
+
+/// A read of a node.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Read {
+    pub(super) computer: usize,
+    pub(super) key: usize,
+    pub(super) began: u64,
+    pub(super) done: Option<u64>,
+    pub(super) value: Option<i32>,
+    /// A computer that was alone has answered, or a leader whose journal lacked some of what it showed. Neither counts.
+    pub(super) alone: bool,
+}
+
+impl Read {
+    pub(super) fn new(computer: usize, key: usize, began: u64) -> Self {
+        Self {
+            computer,
+            key,
+            began,
+            done: None,
+            value: None,
+            alone: false,
+        }
+    }
+}
+
+#[derive(Debug, Default)]
+pub(super) struct History {
+    pub(super) calls: Vec<Call>,
+    by_value: HashMap<(usize, usize, i32), usize>,
+    pub(super) reads: Vec<Read>,
+    /// What the node of each computer was told last of each parameter.
+    pub(super) told: [[Option<i32>; KEYS]; COMPUTERS],
+    /// Nodes of a computer have died at these moments.
+    died: Vec<(usize, u64)>,
+    /// A computer did not read each change of others at these moments: it has started, or was given a whole state.
+    skipped: Vec<(usize, u64)>,
+    pub(super) broken: Option<String>,
+}
+
+impl History {
+    pub(super) fn breaks(&mut self, what: &str) {
+        self.broken.get_or_insert_with(|| what.to_owned());
+    }
+
+    /// A node writes. `again`: by which of the values that others have written, counted from the last one.
+    pub(super) fn write(
+        &mut self,
+        computer: usize,
+        key: usize,
+        now: u64,
+        again: Option<u64>,
+    ) -> usize {
+        let number = self.calls.len();
+        let before = again.and_then(|back| {
+            let of_key = self.calls.iter().rev().filter(|call| call.key == key);
+            let value = of_key.skip(back as usize).map(|call| call.value).next()?;
+            let fresh = !self.by_value.contains_key(&(computer, key, value));
+            fresh.then_some(value)
+        });
+        let value = before.unwrap_or(number as i32 + 1);
+        self.by_value.insert((computer, key, value), number);
+        self.calls.push(Call {
+            computer,
+            key,
+            value,
+            made: now,
+            ran: None,
+            by: None,
+            heard: None,
+            alone: None,
+            reported: false,
+            unsynced: false,
+            held: false,
+            unchanged: false,
+            merged: None,
+        });
+        number
+    }
+
+    pub(super) fn request(&self, call: usize) -> Request {
+        let Call {
+            computer,
+            key: number,
+            value,
+            ..
+        } = self.calls[call];
+        let caller = format!("/w{computer}");
+        let params = [
+            caller.as_str().into(),
+            key(number).as_str().into(),
+            value.into(),
+        ];
+        Request::new(Method::SetParam, params as [Value; 3])
+    }
+
+    fn find(&self, params: &[Value]) -> Option<usize> {
+        let computer = params.first()?.as_str()?.strip_prefix("/w")?.parse().ok()?;
+        let key = params.get(1)?.as_str()?.strip_prefix("/k")?.parse().ok()?;
+        self.by_value
+            .get(&(computer, key, params.get(2)?.as_int()?))
+            .copied()
+    }
+
+    fn of(&mut self, request: &Request) -> &mut Call {
+        let call = self.find(request.params()).unwrap();
+        &mut self.calls[call]
+    }
+
+    pub(super) fn reported(&mut self, call: &Request) {
+        self.of(call).reported = true;
+    }
+
+    pub(super) fn held(&mut self, call: &Request) {
+        self.of(call).held = true;
+    }
+
+    /// A leader has made `call` for the computer `from`.
+    pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
+        // A value that is set again, so that nodes are told of it, is no call of a node.
+        let call = self.find(call.params());
+        // Another computer that has led has judged by what it had answered itself.
+        if let Some(call) = call.filter(|call| self.calls[*call].computer == from) {
+            self.calls[call].merged.get_or_insert((now, log));
+        }
+    }
+
+    pub(super) fn answered(
+        &mut self,
+        by: usize,
+        call: usize,
+        now: u64,
+        alone: Option<(u64, usize)>,
+        changed: bool,
+    ) {
+        let call = &mut self.calls[call];
+        call.unchanged |= !changed;
+        call.by.get_or_insert(by);
+        call.ran.get_or_insert(now);
+        if call.heard.is_none() {
+            call.alone = alone.map(|(_, log)| log);
+        }
+    }
+
+    /// The answer does not reach its node.
+    pub(super) fn unheard(&mut self, call: usize) {
+        let call = &mut self.calls[call];
+        if call.heard.is_none() {
+            call.alone = None;
+        }
+    }
+
+    pub(super) fn is_heard(&self, call: usize) -> bool {
+        self.calls[call].heard.is_some()
+    }
+
+    pub(super) fn heard(&mut self, call: usize, now: u64) {
+        self.calls[call].heard.get_or_insert(now);
+    }
+
+    pub(super) fn gives_up(&mut self, _call: usize) {}
+
+    /// The power of a computer has failed. Its disk holds what it had answered when it was `synced`.
+    pub(super) fn loses_power(&mut self, computer: usize, synced: u64, now: u64) {
+        let unsynced = |call: &Call| call.alone.is_some() && call.heard >= Some(synced);
+        for call in &mut self.calls {
+            call.unsynced |= call.computer == computer && unsynced(call);
+        }
+        self.forgets(computer, now);
+    }
+
+    /// The nodes of a computer have died. What they were told counts no more.
+    pub(super) fn forgets(&mut self, computer: usize, now: u64) {
+        self.died.push((computer, now));
+    }
+
+    /// A computer has not read each change of the others.
+    pub(super) fn skips(&mut self, computer: usize, now: u64) {
+        self.skipped.push((computer, now));
+    }
+
+    /// Checks all, against the journal.
+    pub(super) fn check(&self, etcd: &Etcd, commit: Commit) -> Result<(), String> {
+        let places = Places::of(self, etcd);
+        for key in 0..KEYS {
+            self.check_last(key, &places, etcd, commit)?;
+            let last = value_of(&etcd.state, key);
+            for (computer, told) in self.told.iter().enumerate() {
+                // A write that was answered alone and changed nothing there is kept nowhere, and cannot be corrected.
+                let mut calls = self.calls.iter();
+                let in_vain = calls.any(|call| {
+                    (call.computer, call.key, Some(call.value)) == (computer, key, told[key])
+                        && call.unchanged
+                        && call.alone.is_some()
+                });
+                if told[key] != last && !in_vain {
+                    let told = told[key];
+                    return Err(format!(
+                        "the node of {computer} was told last that {key} is {told:?}, and it is {last:?}"
+                    ));
+                }
+            }
+        }
+        self.check_merged(&places, etcd)?;
+        self.check_reads(&places, etcd, commit)
+    }
+
+    /// The last value of a parameter is not older than a write that was answered.
+    fn check_last(
+        &self,
+        key: usize,
+        places: &Places,
+        etcd: &Etcd,
+        commit: Commit,
+    ) -> Result<(), String> {
+        let last = value_of(&etcd.state, key);
+        let of_key = self.calls.iter().enumerate();
+        let of_key = of_key.filter(|(_, call)| call.key == key);
+        let same = of_key.clone().filter(|(_, call)| Some(call.value) == last);
+        let last_made = same.clone().map(|(_, call)| call.made).max();
+        let last_heard = same
+            .clone()
+            .map(|(_, call)| call.heard.unwrap_or(u64::MAX))
+            .max();
+        for (number, call) in of_key {
+            let Some(heard) = call.heard.filter(|_| Some(call.value) != last) else {
+                continue;
+            };
+            let superseded = self.calls.iter().enumerate().any(|(of, later)| {
+                let own = (later.computer, later.key) == (call.computer, call.key);
+                own && of > number && later.heard.is_some()
+            });
+            // Or what others have set is the same.
+            let in_log = !places.of[number].is_empty()
+                || places.of_value(self, key, Some(call.value)).is_some();
+            let may_be_lost = commit == Commit::Interval && !in_log;
+            let alone = call.alone.is_some();
+            let excused = call.reported || call.unsynced || superseded || call.unchanged;
+            if may_be_lost && !alone || alone && excused {
+                continue;
+            }
+            let older = last_heard.is_none_or(|of| of < call.made);
+            if older {
+                return Err(format!(
+                    "{call:?}, heard at {heard}, is gone: {key} is {last:?}, written at {last_made:?} and answered at {last_heard:?}"
+                ));
+            }
+            if alone && !in_log && !call.held && !etcd.lost {
+                return Err(format!(
+                    "{call:?} was answered alone, is in no journal and was not reported"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// What was answered alone has replaced nothing that others have written meanwhile.
+    fn check_merged(&self, places: &Places, etcd: &Etcd) -> Result<(), String> {
+        for (number, call) in self.calls.iter().enumerate() {
+            let (Some(cut), Some((moment, log))) = (call.alone, call.merged) else {
+                continue;
+            };
+            // Where states are compared, it does not show that others have set a value and set it back, or what this
+            // computer's nodes have set as well.
+            let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
+            let mut skipped = self.skipped.iter();
+            let compared =
+                skipped.any(|(of, at)| *of == call.computer && (since..=moment).contains(at));
+            let merged = places.changed[number].iter().find(|at| **at >= log * 1000);
+            let Some(merged) = merged else { continue };
+            let before = etcd.value_at(call.key, *merged);
+            let first = places.of_value(self, call.key, before);
+            let back = first.is_some_and(|(first, _)| first < cut * 1000);
+            let mut own = self.calls.iter();
+            let own = own.any(|of| {
+                (of.computer, of.key) == (call.computer, call.key) && Some(of.value) == before
+            });
+            if compared && (back || own) {
+                continue;
+            }
+            for (of, other) in self.calls.iter().enumerate() {
+                let theirs = other.computer != call.computer && other.key == call.key;
+                // What this computer itself has answered was before.
+                let counts = other.heard.is_some()
+                    && other.alone.is_none()
+                    && other.by != Some(call.computer);
+                if !theirs || !counts || other.value == call.value {
+                    continue;
+                }
+                let first = places.changed[of].first();
+                if first.is_some_and(|at| *at >= cut * 1000 && at < merged) {
+                    return Err(format!("{call:?} has replaced {other:?} of others"));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// On one computer no read goes back, and a node sees what it has written.
+    fn check_reads(&self, places: &Places, etcd: &Etcd, commit: Commit) -> Result<(), String> {
+        for computer in 0..COMPUTERS {
+            for key in 0..KEYS {
+                self.check_reads_of(computer, key, places, etcd, commit)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn check_reads_of(
+        &self,
+        computer: usize,
+        key: usize,
+        places: &Places,
+        etcd: &Etcd,
+        commit: Commit,
+    ) -> Result<(), String> {
+        // From these moments on no read is older than that.
+        let mut floors: Vec<(u64, usize, String)> = Vec::new();
+        for (number, call) in self.calls.iter().enumerate() {
+            // One that changed nothing may have been run again later.
+            let counts = !call.reported && !call.unchanged;
+            if (call.computer, call.key) != (computer, key) || !counts {
+                continue;
+            }
+            let Some(heard) = call.heard else { continue };
+            // A later write may stand for it, and be lost.
+            if call.alone.is_some() && !call.held {
+                continue;
+            }
+            // In a state the value may be another call's.
+            let same = self.calls.iter();
+            let same = same.filter(|of| (of.key, of.value) == (key, call.value));
+            let in_state = places.of[number].first().filter(|_| same.count() == 1);
+            if let Some(first) = places.changed[number].first().or(in_state) {
+                floors.push((heard, *first, format!("{call:?}")));
+            }
+        }
+        let of = |read: &&Read| (read.computer, read.key) == (computer, key) && !read.alone;
+        let reads = self
+            .reads
+            .iter()
+            .filter(of)
+            .filter(|read| read.done.is_some());
+        let reads: Vec<_> = reads.collect();
+        // A value that was lost and reported may come back when its node calls again.
+        let lost = |value: Option<i32>| {
+            let mut calls = self.calls.iter();
+            calls.any(|call| call.key == key && Some(call.value) == value && call.reported)
+        };
+        for read in reads.iter().filter(|read| !lost(read.value)) {
+            if let Some((first, _)) = places.of_value(self, key, read.value) {
+                floors.push((read.done.unwrap(), first, format!("{read:?}")));
+            }
+        }
+        // The same value may have been written in vain, or alone: it is not known which write a read shows.
+        let in_vain = |read: &&Read| {
+            let mut calls = self.calls.iter().zip(&places.of);
+            calls.any(|(call, places)| {
+                let same = call.key == key && Some(call.value) == read.value;
+                let in_vain = places.is_empty() || call.alone.is_some();
+                same && in_vain && Some(call.made) <= read.done
+            })
+        };
+        for read in reads.into_iter().filter(|read| !in_vain(read)) {
+            let Some((_, last)) = places.of_value(self, key, read.value) else {
+                continue;
+            };
+            for (moment, floor, why) in &floors {
+                // It was answered before the journal had it, or is back with a leader that has started again.
+                let (added, held) = &etcd.log[floor / 1000];
+                let early = *added >= read.began || matches!(held, Held::State(_));
+                let mut restarts = self.skipped.iter();
+                let restarted = restarts
+                    .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
+                if commit == Commit::Interval && (early || restarted) {
+                    continue;
+                }
+                let died = self
+                    .died
+                    .iter()
+                    .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
+                if *moment < read.began && last < *floor && !died {
+                    return Err(format!("{read:?} is older than {why}: {last} < {floor}"));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where each write is in the log.
+struct Places {
+    of: Vec<Vec<usize>>,
+    /// The same without states, which hold what was written before.
+    changed: Vec<Vec<usize>>,
+}
+
+impl Places {
+    fn of(history: &History, etcd: &Etcd) -> Self {
+        let mut of = vec![Vec::new(); history.calls.len()];
+        let mut changed = of.clone();
+        for (index, (moment, held)) in etcd.log.iter().enumerate() {
+            let records = match held {
+                Held::Records(records) => records,
+                Held::State(state) => {
+                    let made = history.calls.iter().enumerate();
+                    let made = made.filter(|(_, call)| call.made < *moment);
+                    for (number, call) in made {
+                        if value_of(state, call.key) == Some(call.value) {
+                            of[number].push(index * 1000);
+                        }
+                    }
+                    continue;
+                }
+            };
+            for (part, record) in records.iter().enumerate() {
+                if let JournalEntry::Call { call, .. } = &record.entry
+                    && let Some(call) = history.find(&call.params)
+                {
+                    of[call].push(index * 1000 + part);
+                    changed[call].push(index * 1000 + part);
+                }
+            }
+        }
+        Self { of, changed }
+    }
+
+    /// The first and the last place of any write of this value; none if it is nowhere.
+    fn of_value(
+        &self,
+        history: &History,
+        key: usize,
+        value: Option<i32>,
+    ) -> Option<(usize, usize)> {
+        let calls = history.calls.iter().enumerate();
+        let calls = calls.filter(|(_, call)| call.key == key && Some(call.value) == value);
+        let mut places: Vec<_> = calls.flat_map(|(call, _)| self.of[call].clone()).collect();
+        places.sort_unstable();
+        Some((*places.first()?, *places.last()?))
+    }
+}

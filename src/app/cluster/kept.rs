@@ -1,0 +1,287 @@
+//! Stores the writes that were answered while this computer was cut off beside the checkpoint, until the leader has
+//! them.
+
+use std::path::{Path, PathBuf};
+
+use crate::{
+    checkpoint::{
+        format::{Checkpoint, RecordContent},
+        session,
+        store::{self, Store, StoreError},
+    },
+    cluster::cut_off::CutOff,
+    ledger::journal::{DISK_PATIENCE, SILENT},
+    limit::rarely,
+    master::{Master, Request},
+    wait,
+};
+
+/// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
+const FILE_BYTES: u64 = 64 << 10;
+
+/// The file `CHECKPOINT.alone`.
+#[derive(Default)]
+pub(super) struct Kept {
+    /// `None` while there is nothing to keep, or while the disk hangs.
+    store: Option<Store>,
+    /// The size of the file's journal when it was last rewritten, in bytes.
+    written: u64,
+}
+
+fn path_of(checkpoint: &Path) -> PathBuf {
+    let mut name = checkpoint.as_os_str().to_owned();
+    name.push(".alone");
+    name.into()
+}
+
+impl Kept {
+    /// Opens the file, and returns the writes that an earlier process left. If its session does not continue
+    /// (`goes_on`), the file is kept under another name.
+    pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
+        let path = path_of(checkpoint);
+        let opened = wait::within(DISK_PATIENCE, move || {
+            if !path.exists() {
+                return None;
+            }
+            let mut opened = Store::open(&path);
+            if let (Ok((store, Some(_))), false) = (&mut opened, goes_on) {
+                keep_of_session(store);
+                return None;
+            }
+            Some(opened)
+        });
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent");
+        let (store, loaded) = match opened.await {
+            Some(Some(Ok((store, Some(loaded))))) => (store, loaded),
+            Some(None | Some(Ok((_, None)))) => return Default::default(),
+            Some(Some(Err(error))) => {
+                unread(&error);
+                return Default::default();
+            }
+            None => {
+                unread(&SILENT);
+                return Default::default();
+            }
+        };
+        let base = session::rebuild(loaded.checkpoint, Vec::new()).mirror;
+        let calls = loaded.records.into_iter().filter_map(|record| {
+            let RecordContent::Call { call, .. } = record.entry else {
+                return None;
+            };
+            Some(Request::from(call))
+        });
+        let left = CutOff::left(base.clone(), calls);
+        tracing::info!(
+            calls = left.len(),
+            "an earlier process was cut off; its writes are sent to the next leader"
+        );
+        let mut this = Self::default();
+        let calls = left.calls().cloned().collect();
+        this.write(store, base, calls).await;
+        (this, left)
+    }
+
+    /// Stores exactly `calls`, answered since the state was `base`.
+    pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
+        let path = path_of(checkpoint);
+        let store = match self.store.take() {
+            Some(store) => Some(Ok(store)),
+            None => wait::within(DISK_PATIENCE, move || Store::open_over(&path)).await,
+        };
+        match store {
+            Some(Ok(store)) => self.write(store, base, calls).await,
+            Some(Err(error)) => say_unkept(&error),
+            None => say_unkept(&SILENT),
+        }
+    }
+
+    async fn write(&mut self, mut store: Store, base: Master, calls: Vec<Request>) {
+        let checkpoint = Checkpoint {
+            seq: store.seq(),
+            snapshot: base.snapshot(),
+            ..Checkpoint::default()
+        };
+        let entries = entries(calls);
+        let write = move || {
+            let written = store.begin(&checkpoint);
+            let written = written.and_then(|()| store.append(&entries).map(|_| ()));
+            (written, store)
+        };
+        self.have(write).await;
+        self.written = self.store.as_ref().map_or(0, Store::journal_bytes);
+    }
+
+    /// Stores these calls as well.
+    pub(super) async fn add(&mut self, calls: Vec<Request>) {
+        if let Some(mut store) = self.store.take() {
+            let entries = entries(calls);
+            let append = move || (store.append(&entries).map(|_| ()), store);
+            self.have(append).await;
+        }
+    }
+
+    /// Whether the file is twice as large as necessary.
+    pub(super) fn has_outgrown(&self) -> bool {
+        let Some(store) = &self.store else {
+            return false;
+        };
+        let needed = self.written.max(store.snapshot_bytes()).max(FILE_BYTES);
+        store.journal_bytes() > self.written.saturating_add(needed)
+    }
+
+    /// Runs `work` with the store on another thread.
+    async fn have(
+        &mut self,
+        work: impl FnOnce() -> (Result<(), StoreError>, Store) + Send + 'static,
+    ) {
+        let Some((done, store)) = wait::within(DISK_PATIENCE, work).await else {
+            return say_unkept(&SILENT);
+        };
+        if let Err(error) = done {
+            say_unkept(&error);
+        }
+        self.store = Some(store);
+    }
+
+    /// Removes the file, because all writes have been sent.
+    pub(super) async fn remove(&mut self, checkpoint: &Path) {
+        self.store = None;
+        let path = path_of(checkpoint);
+        // It only has to be done before the next start.
+        wait::within(DISK_PATIENCE, move || remove_files(path)).await;
+    }
+}
+
+fn entries(calls: Vec<Request>) -> Vec<RecordContent> {
+    let calls = calls.into_iter();
+    calls.map(|call| RecordContent::call(call.into())).collect()
+}
+
+fn remove_files(path: PathBuf) {
+    let previous = store::previous_of(&path);
+    for path in [path, previous] {
+        if let Err(error) = std::fs::remove_file(&path)
+            && error.kind() != std::io::ErrorKind::NotFound
+        {
+            tracing::warn!(
+                path = %path.display(),
+                %error,
+                "cannot delete the file of writes that have been sent; delete it, or they will be sent again"
+            );
+        }
+    }
+}
+
+/// Keeps the writes of an ended session under another name.
+fn keep_of_session(store: &mut Store) {
+    match store.set_aside("session") {
+        Ok(Some(kept)) => tracing::warn!(
+            kept = %kept.display(),
+            "writes made while cut off belong to an ended session; they are kept in a file, not sent"
+        ),
+        Ok(None) => {}
+        Err(error) => {
+            tracing::error!(%error, "cannot store the writes of an ended session under another name")
+        }
+    }
+}
+
+fn say_unkept(error: &dyn std::fmt::Display) {
+    rarely!(
+        error,
+        %error,
+        "cannot store the writes made while cut off; a crash of rosrescue itself would lose them. Free space on \
+         the disk or repair it"
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{master::Method, xmlrpc::Value};
+
+    fn set(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    fn base() -> Master {
+        let mut base = Master::default();
+        base.apply(&set("/before", 1));
+        base
+    }
+
+    fn calls(of: &CutOff) -> Vec<Request> {
+        of.calls().cloned().collect()
+    }
+
+    async fn begun(checkpoint: &Path) -> Kept {
+        let mut kept = Kept::default();
+        kept.replace(checkpoint, base(), Vec::new()).await;
+        kept
+    }
+
+    /// The files in the folder of `checkpoint`.
+    fn files(checkpoint: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(checkpoint.parent().unwrap()).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.filter(|name| !name.ends_with(".lock")).collect();
+        names.sort();
+        names
+    }
+
+    #[tokio::test]
+    async fn what_was_answered_alone_is_read_back_by_the_next_process_and_by_the_one_after_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut kept = begun(&checkpoint).await;
+        kept.add(vec![set("/a", 1)]).await;
+        kept.add(vec![set("/b", 2)]).await;
+        drop(kept);
+        for _ in 0..2 {
+            let (_kept, left) = Kept::left(&checkpoint, true).await;
+            assert!(left.base() == Some(&base()));
+            assert_eq!(calls(&left), [set("/a", 1), set("/b", 2)]);
+        }
+        Kept::default().remove(&checkpoint).await;
+        assert_eq!(files(&checkpoint), [""; 0]);
+        assert!(Kept::left(&checkpoint, true).await.1.is_empty());
+    }
+
+    #[tokio::test]
+    async fn of_a_session_that_is_over_the_writes_are_kept_under_another_name_and_not_sent() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut kept = begun(&checkpoint).await;
+        kept.add(vec![set("/a", 1)]).await;
+        drop(kept);
+        assert!(Kept::left(&checkpoint, false).await.1.is_empty());
+        let names = files(&checkpoint);
+        assert!(!names.is_empty() && !names.contains(&"chkpt.yaml.alone".to_owned()));
+        let text = std::fs::read_to_string(folder.path().join(&names[0])).unwrap();
+        assert!(text.contains("before"), "{text}");
+        assert!(Kept::left(&checkpoint, true).await.1.is_empty());
+    }
+
+    #[tokio::test]
+    async fn parameters_that_are_set_again_and_again_take_no_larger_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut kept = begun(&checkpoint).await;
+        let mut largest = 0;
+        let values = |round| (0..10).map(move |key| set(&format!("/k{key}"), round));
+        for round in 0..300 {
+            kept.add(values(round).collect()).await;
+            if kept.has_outgrown() {
+                kept.replace(&checkpoint, base(), values(round).collect())
+                    .await;
+            }
+            let bytes = std::fs::metadata(path_of(&checkpoint)).unwrap().len();
+            largest = largest.max(bytes);
+        }
+        assert!(largest < 3 * FILE_BYTES, "{largest}");
+        drop(kept);
+        let (_kept, left) = Kept::left(&checkpoint, true).await;
+        assert_eq!(calls(&left), values(299).collect::<Vec<_>>());
+    }
+}

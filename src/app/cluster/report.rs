@@ -1,0 +1,169 @@
+//! Logs what the member reports.
+
+use std::{collections::BTreeMap, time::Instant};
+
+use super::ClusterDriver;
+use crate::{
+    checkpoint::format::shown,
+    cluster::{
+        member::{Cause, News},
+        merge::wire::WriteOutcome,
+    },
+    hide::Hide,
+    limit::{Pair, alarm, all_clear, rarely},
+    master::{Method, Request, names},
+    status::report::{CUT_OFF, STARTED, TAKEN_OVER},
+    xmlrpc::Value,
+};
+
+/// The alarm that this computer is cut off, and its all-clear.
+static ALONE: Pair = Pair::new();
+
+impl ClusterDriver {
+    /// Logs an event.
+    pub(super) fn tell(&mut self, news: News) {
+        match news {
+            News::Alone { serves } => self.tell_alone(serves),
+            News::NotAlone => {
+                let role = self.member.role().as_str();
+                all_clear!(info, ALONE, role, "no longer cut off");
+            }
+            News::Leads { before, released } => self.known.taken_over(before, released),
+            News::LeadsAgain => {
+                tracing::warn!("this computer leads again, because etcd has answered");
+            }
+            News::Deposed => {
+                tracing::warn!("this computer no longer leads; another computer does, or may");
+            }
+            News::EtcdLost => tracing::error!(
+                "etcd has lost its data; the most recent state of a living computer will replace it"
+            ),
+            News::Lapsed => tracing::warn!(
+                "etcd does not answer, and another computer may lead by now; killed the master, and the mirror answers"
+            ),
+            News::Suspect { uri, until } => {
+                let name = &self.member.settings().name;
+                let wait = until.saturating_duration_since(Instant::now());
+                tracing::info!(
+                    name,
+                    uri,
+                    "the cluster knows this computer's name at another address; the start waits up to {wait:.0?} to \
+                     see whether another computer has it"
+                );
+            }
+            News::TooLarge(error) => rarely!(
+                error,
+                error,
+                "cannot write a change to etcd; the other computers do not get it"
+            ),
+            News::Merged { sent, lost } => {
+                self.known.lost_writes += lost;
+                tracing::info!(
+                    sent,
+                    lost,
+                    "sent the writes made while cut off to the leader"
+                );
+            }
+        }
+    }
+
+    fn tell_alone(&self, serves: bool) {
+        let silent = self.trouble.is_silent(self.member.settings().ttl / 2);
+        let own = &self.member.settings().id;
+        let leader = self.member.view().leader.as_ref();
+        let why = match (
+            leader.filter(|of| !silent && of.id != *own),
+            self.trouble.get(),
+        ) {
+            (Some(leader), _) => {
+                let (name, uri) = (&leader.name, &leader.uri);
+                format!("{name} leads but cannot be reached at {uri}")
+            }
+            (None, Some((_, why))) => format!("etcd: {why}"),
+            (None, None) => "etcd answered too late".to_owned(),
+        };
+        alarm!(
+            error,
+            ALONE,
+            why,
+            serves,
+            "ALONE: this computer is cut off from the others or from etcd's majority; with --alone serve its own \
+             nodes are served and what they write is sent to the leader later, else writes wait. Repair the \
+             network, or etcd"
+        );
+    }
+}
+
+/// The reason for a master's start, for reports.
+pub(super) fn cause(of: Cause) -> &'static str {
+    match of {
+        Cause::Started => STARTED,
+        Cause::TakenOver => TAKEN_OVER,
+        Cause::WasCutOff => CUT_OFF,
+    }
+}
+
+/// Logs the lost ones among the writes that were answered while cut off. One line per subject, because a node may
+/// have written to it a thousand times.
+pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
+    let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
+    for (call, outcome) in &outcomes {
+        let node = call.caller().unwrap_or_default();
+        let method = call.method().name();
+        match outcome {
+            WriteOutcome::Holds => {}
+            // Others have deleted the parameter, too.
+            WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
+            WriteOutcome::Refused(text) => {
+                tracing::warn!(
+                    method,
+                    node,
+                    text,
+                    "the leader refused a write made while this computer was cut off"
+                );
+            }
+            WriteOutcome::Lost { why, present } => match parameter(call) {
+                Some((key, value)) => {
+                    let alone = shown_value(hide, &key, value);
+                    let others = shown_value(hide, &key, present.as_ref());
+                    tracing::warn!(
+                        method,
+                        node,
+                        %alone,
+                        %others,
+                        "a write made while this computer was cut off was lost: {why}"
+                    );
+                }
+                None => {
+                    *subjects
+                        .entry((why, method.to_owned(), node.to_owned()))
+                        .or_default() += 1;
+                }
+            },
+        }
+    }
+    for ((why, method, node), count) in subjects {
+        tracing::warn!(
+            method,
+            node,
+            count,
+            "a write made while this computer was cut off was lost: {why}"
+        );
+    }
+}
+
+/// A parameter's value for the log, hidden if necessary.
+fn shown_value(hide: &Hide, key: &str, value: Option<&Value>) -> String {
+    let text = |value| shown(&hide.mask(key, value));
+    value.map_or_else(|| "(none)".to_owned(), text)
+}
+
+/// The parameter that `call` sets, and its value. `None` for a deletion.
+fn parameter(call: &Request) -> Option<(String, Option<&Value>)> {
+    let key = || Some(names::resolve(call.text(1)?, call.caller()?));
+    match call.method() {
+        Method::SetParam => Some((key()?, call.params().get(2))),
+        Method::DeleteParam => Some((key()?, None)),
+        _ => None,
+    }
+}
