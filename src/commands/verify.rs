@@ -36,10 +36,10 @@ struct Verified {
     exact: bool,
     /// Number of the usable snapshot's last record. `None` if no snapshot is usable.
     snapshot: Option<u64>,
-    /// Number of usable records after it.
+    /// Number of usable records after the snapshot.
     records: usize,
     usable: Counts,
-    /// The reason, if the last append is incomplete.
+    /// Why the last record is incomplete. `None` if it is complete.
     torn: Option<String>,
     damage: Vec<String>,
 }

@@ -76,7 +76,7 @@ pub(super) fn read(path: &Path) -> String {
     }
 }
 
-/// Classifies a unit by the command that it starts, or by the script that it starts, as those of robot_upstart.
+/// Classifies a unit by the command that it starts. If the command is a script, as with robot_upstart, its text counts.
 fn kind_of(unit: &str) -> Option<UnitKind> {
     let mut found = None;
     for line in unit.lines() {

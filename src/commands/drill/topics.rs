@@ -57,7 +57,7 @@ impl Seen {
         }
     }
 
-    /// Starts the part with kills.
+    /// Keeps the longest pause so far as the normal one. From now on pauses are compared with it.
     fn begin(&mut self) {
         self.normal = (self.messages >= FEWEST).then_some(self.longest);
         self.longest = Duration::ZERO;
@@ -172,7 +172,7 @@ impl Topic {
             .sum()
     }
 
-    /// Starts the part with kills.
+    /// Notes that the kills begin: pauses from now on are compared with those before.
     pub(super) fn begin(&self) {
         for link in &self.links {
             lock(&link.seen).begin();

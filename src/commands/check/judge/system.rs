@@ -206,7 +206,7 @@ impl Findings {
         let proxied = facts.proxied.as_ref().map(|(uri, _)| uri.port);
         let others = facts.masters.iter().filter(|process| {
             let at = |port: Option<u16>| port.is_some_and(|port| process.ports.contains(&port));
-            // The finding about the port covers the first one, and the second one is intended.
+            // The finding about the port reports a master at `port`. A master at `proxied` is intended.
             !at(port) && !at(proxied)
         });
         let others: Vec<_> = others.map(named).collect();
