@@ -32,13 +32,13 @@ use crate::{
 /// Size in bytes from which a reply takes more than a millisecond to decode.
 const LONG: usize = 256 << 10;
 
-/// The hyper object that sends and receives.
+/// The hyper object that sends and receives on the connection.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A connection to the master, for one call at a time.
 ///
-/// The caller's task drives it: another task would have to be woken twice for each call. So its end is not noticed
-/// between two calls; [`Self::is_closed`] checks for it.
+/// The caller's task drives the connection, because another task would have to be woken twice for each call. So nobody
+/// notices if the connection ends between two calls; [`Self::is_closed`] checks that.
 ///
 /// If the server closes the connection after one answer, as HTTP/1.0 servers do, the next call gets a new connection.
 /// Another process may listen there by then.
@@ -56,8 +56,8 @@ pub struct Connection {
     server: Option<HeaderValue>,
 }
 
-/// The connection that the caller drives. `None` if it has ended. Dropping it also ends the count of connections for
-/// writes.
+/// The connection that the caller drives, with the [`Writer`] that counts it if it is for writes. `None` if the
+/// connection has ended.
 #[derive(Debug)]
 struct Drive(Option<(Box<Driver>, Option<Writer>)>);
 
