@@ -97,8 +97,8 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well. `None` disables them. Then nodes also stay registered when
-    /// another node takes their port.
+    /// Pause between two regular health checks. `None` disables regular checks: then a dead node may stay registered,
+    /// even if another node takes its port.
     pub reap_interval: Option<Duration>,
     /// Networks that may call. `None` allows all.
     pub allow: Vec<IpNet>,
@@ -130,8 +130,9 @@ pub enum MasterConfig {
 }
 
 impl MasterConfig {
-    /// How long a connection to the master may stay idle, if known. The watched connection is
-    /// renewed with each probe.
+    /// How long a connection to the master may stay idle before the master closes it, if known.
+    /// Each probe renews the [`Sentinel`](crate::upstream::sentinel::Sentinel), so the pause
+    /// between probes must be shorter.
     fn idle_limit(&self) -> Option<Duration> {
         let Self::Supervised(supervised) = self else {
             return None;
@@ -197,7 +198,7 @@ impl Config {
         Ok(Self { cluster, ..config })
     }
 
-    /// Like [`Self::core`], for `rosrescue proxy`.
+    /// The configuration of `rosrescue proxy` with `args` in the environment `env` on the computer `hostname`.
     pub fn proxy(
         args: &ProxyArgs,
         env: Lookup<'_>,
@@ -235,7 +236,7 @@ impl Config {
         }
     }
 
-    /// Serves `addresses` instead of the configured ones. Another process has bound them.
+    /// Serves `addresses`, which another process has bound, instead of the configured ones.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
         let before = self.advertised.clone();
         let single = addresses.first().filter(|address| {
@@ -268,7 +269,7 @@ impl Config {
             interval.min((limit / 2).max(SHORTEST_INTERVAL))
         });
         let reads = args.reads.unwrap_or(match master {
-            // Only rosrescue knows the port of its own master, so nobody can change it directly.
+            // Only rosrescue knows the port of its own master, so no client changes that master directly.
             MasterConfig::Supervised(_) => Reads::Mirror,
             MasterConfig::External(_) => Reads::Master,
         });

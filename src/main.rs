@@ -100,7 +100,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Serves `sockets`, or runs the guardian of a worker that does.
+/// Serves `sockets`, or runs the guardian of a worker that serves them.
 fn start(
     mut config: Config,
     sockets: Option<Sockets>,

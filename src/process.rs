@@ -160,7 +160,7 @@ impl Rosmaster {
         })
     }
 
-    /// The last output of the last rosmaster, for the message that it died early.
+    /// The last output of the last rosmaster, for the message that rosmaster died early.
     pub(crate) async fn last_words(&self) -> String {
         self.output.tail().await
     }
@@ -213,8 +213,8 @@ pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop does not interrupt
-/// it: the new process would then be unknown.
+/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop of rosrescue does not
+/// interrupt the start, because nobody would know the new process.
 fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }

@@ -43,7 +43,7 @@ pub(super) struct LivenessEvidence {
 #[derive(Debug, Default)]
 struct Known {
     liveness: health::Liveness,
-    /// For each port on this computer, its addresses.
+    /// For each port of a node on this computer, the addresses at which the node may listen.
     here: BTreeMap<String, Vec<SocketAddr>>,
 }
 
@@ -51,7 +51,7 @@ struct Known {
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub(crate) health: Health,
-    /// When there was evidence last. `None` if there never was.
+    /// Time of the latest evidence. `None` if there has been no evidence.
     pub(crate) checked: Option<Instant>,
 }
 

@@ -30,8 +30,8 @@ const PROMPT: Duration = Duration::from_millis(10);
 /// How long to wait for the answer of a node that never answers `paramUpdate` but answers other calls, like rosnodejs.
 /// The node only has to read the notification.
 const MUTE: Duration = Duration::from_millis(500);
-/// Maximum number of slow nodes whose answers are awaited in addition. There may be many on a computer that has
-/// vanished.
+/// Maximum number of slow nodes whose answers are awaited in addition to [`AT_ONCE`]. There may be many on a computer
+/// that has vanished.
 const SLOW: usize = 128;
 /// Pauses in seconds before each attempt to shut down a node that does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];

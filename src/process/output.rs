@@ -31,7 +31,7 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// Whether the disk has not finished the last request. Until then it gets no other.
+    /// Whether the disk is still busy with the last request. Until the disk has finished, it gets no other request.
     asked: AtomicBool,
 }
 

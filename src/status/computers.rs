@@ -13,11 +13,11 @@ pub(crate) struct Computers {
     /// This computer's name.
     pub(crate) name: String,
     pub(crate) role: Role,
-    /// Since when it has this role.
+    /// Since when this computer has this role.
     pub(crate) since: f64,
     /// The present leader. If there is none, the last one.
     pub(crate) leader: Option<LeaderStatus>,
-    /// Since when there is no leader. `None` if there is one.
+    /// Since when there is no leader. `None` if there is a leader.
     pub(crate) leaderless_since: Option<f64>,
     /// The last journal record that this computer knows of.
     pub(crate) seq: u64,
@@ -62,12 +62,12 @@ pub(crate) struct Computer {
     pub(crate) uri: String,
     pub(crate) version: String,
     pub(crate) role: Role,
-    /// Number of journal records that its mirror lacks.
+    /// Number of journal records that the mirror of that computer lacks.
     pub(crate) behind: u64,
-    /// When this computer last heard from it. `None` for this computer itself, and if it has not, since this rosrescue
-    /// started.
+    /// When this computer last heard from that one. `None` if it has heard nothing since this rosrescue started, and
+    /// for this computer itself.
     pub(crate) heard: Option<f64>,
-    /// Whether it has been silent for 15 s.
+    /// Whether that computer has been silent for 15 s.
     pub(crate) away: bool,
 }
 
