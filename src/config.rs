@@ -80,7 +80,7 @@ pub struct Config {
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
-    /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
+    /// Whether the user chose the checkpoint. Otherwise the checkpoint's name depends on the served port.
     pub checkpoint_is_given: bool,
     pub restore: RestorePolicy,
     /// Maximum space for kept checkpoints, in bytes.
@@ -228,7 +228,7 @@ impl Config {
         }
     }
 
-    /// Adapts the configuration to the served `port`. The system chooses it if port 0 was configured.
+    /// Adapts the configuration to the served `port`, which the system chooses if port 0 was configured.
     pub fn serve_on(&mut self, port: u16) {
         self.advertised.port = port;
         if !self.checkpoint_is_given {

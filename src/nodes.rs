@@ -155,7 +155,7 @@ impl Nodes {
 
     /// The names of the unreachable nodes.
     pub fn unreachable(&self) -> Vec<String> {
-        // The two locks must never be held together here.
+        // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes();
@@ -170,14 +170,14 @@ impl Nodes {
     pub(super) fn mark_unreachable(&self, port: &str) {
         let now = Instant::now();
         let new = self.lock().add(port, now);
-        // This node may be due before all others.
+        // This node may have to be asked again before all other unreachable nodes.
         self.changed.notify_one();
         if !new {
             return;
         }
         tracing::debug!(port, "a node does not answer");
         if self.update_notifying() {
-            // The master may be about to notify this node of recent changes before all others.
+            // The master may call this node before it notifies other nodes of recent changes, and wait for its answer.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
             self.ledger.outbox_changed.notify_one();
@@ -196,7 +196,7 @@ impl Nodes {
     /// Decides whether rosrescue notifies nodes in addition to the master: while a node is unreachable or a check is
     /// running. Returns whether that begins now.
     fn update_notifying(&self) -> bool {
-        // The locks are nested only here. Otherwise an older result could be stored last.
+        // Only here is the ledger's lock taken while this lock is held. Otherwise an older result could be stored last.
         let unreachable = self.lock();
         let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger

@@ -385,7 +385,7 @@ fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf
             .flatten()
             .map(|entry| entry.path())
             .collect();
-        // The last name wins, so newer distributions come first: kinetic, melodic, noetic.
+        // Newer distributions have later names (kinetic, melodic, noetic), so the last name is tried first.
         distributions.sort();
         let candidates = distributions.iter().rev();
         let mut programs =
@@ -400,7 +400,7 @@ fn is_program(path: &Path) -> bool {
         .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
 }
 
-/// Whether rosmaster could listen on this port. It sets SO_REUSEADDR.
+/// Whether rosmaster could listen on this port. rosmaster sets SO_REUSEADDR, and so does this check.
 fn is_free(port: u16) -> bool {
     bind_loopback(port).is_ok()
 }

@@ -32,7 +32,7 @@ pub(super) struct Opened {
     pub(super) bytes: u64,
     /// Wall time of the last change.
     pub(super) written: i64,
-    /// Number of the snapshot's last record. `None` if there is no complete snapshot.
+    /// Number of the last record that the snapshot includes. `None` if there is no complete snapshot.
     pub(super) snapshot_seq: Option<u64>,
     /// Methods of the calls in the journal; `session` for a change of the session.
     pub(super) journal: Vec<String>,

@@ -88,7 +88,7 @@ struct Topic {
 
 #[derive(Serialize)]
 struct Journal {
-    /// Number of the snapshot's last record.
+    /// Number of the last record that the snapshot includes.
     snapshot: Option<u64>,
     /// Number of records after the snapshot.
     records: usize,

@@ -391,7 +391,7 @@ impl Plan {
             self.run(place.systemctl(&["stop", UNITS[1]]));
             self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
         } else {
-            // The next rosrescue adopts the running master. Calls wait for some 0.2 s.
+            // This kills rosrescue, and the next rosrescue adopts the running master. Calls wait for some 0.2 s.
             self.run(place.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }

@@ -32,9 +32,9 @@ struct Verified {
     file: String,
     /// Whether the file is undamaged.
     whole: bool,
-    /// Whether everything recorded can be used, if necessary from the previous generation.
+    /// Whether everything recorded can be used, if necessary from the previous generation of the file.
     exact: bool,
-    /// Number of the usable snapshot's last record. `None` if no snapshot is usable.
+    /// Number of the last record that the usable snapshot includes. `None` if no snapshot is usable.
     snapshot: Option<u64>,
     /// Number of usable records after the snapshot.
     records: usize,

@@ -427,7 +427,8 @@ async fn reconcile(
     call: Request,
     outcome: &mut CheckResult,
 ) {
-    // A multicall is never batched: an earlier call of its batch could make it displace a node.
+    // A multicall is never put into a batch. In a batch, the node could register at a new address just before this
+    // call, which would then take its name away.
     let kind = call.kind();
     let alone = Request::multicall([call]);
     let reply = nodes.write_queue.call_if(alone, condition.clone()).await;

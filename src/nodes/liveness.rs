@@ -74,7 +74,7 @@ impl Nodes {
     /// Whether each registered node is alive, by name.
     pub(crate) fn lives(&self) -> BTreeMap<String, Life> {
         let now = Instant::now();
-        // The two locks must never be held together.
+        // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
         let nodes: Vec<_> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));

@@ -99,7 +99,7 @@ impl Output {
         String::from_utf8_lossy(&tail).trim().to_owned()
     }
 
-    /// Runs `work` on the disk in another thread. `None` if that takes too long, or if earlier work has not ended.
+    /// Runs `work` on the disk in another thread. `None` if `work` takes too long, or if earlier work has not ended.
     async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         if self.shared.asked.swap(true, Ordering::AcqRel) {
             return None;

@@ -108,7 +108,8 @@ pub(crate) struct Manner {
 /// An injection that was prepared in advance.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// The mirror's version and the next token when it was prepared. `None` if it was not prepared in advance.
+    /// The mirror's version and the next token when this injection was prepared. `None` if it was not prepared in
+    /// advance.
     basis: Option<(u64, Token)>,
     plan: Plan,
     /// Whether it restores the mirror's complete state.

@@ -1,4 +1,4 @@
-//! Limits the memory of large answers that are being sent, and closes slow readers when it is used up.
+//! Limits the memory of large answers that are being sent, and closes slow readers when the memory is used up.
 
 use std::{
     collections::HashMap,

@@ -145,8 +145,8 @@ impl Calls {
         }
     }
 
-    /// Answers a call on the computer that has the master. The error says that it no longer has the master, or that
-    /// there is no answer.
+    /// Answers a call on the computer that has the master. An error means that another computer has the master now, or
+    /// that there is no answer.
     pub(super) async fn answer_here(
         &self,
         head: Head,
@@ -284,7 +284,7 @@ impl Calls {
     }
 
     /// Begins the answer to a read. Waits until the master has answered the calls that may notify the caller. Does not
-    /// wait for a late master, whose notifications are repeated later.
+    /// wait for a late master, because its notifications are repeated later.
     async fn begin_read(&self, read: Option<&Request>) -> Option<Delivery> {
         let mut changed = self.ledger.order_changed();
         let patience = self.patience();
@@ -321,8 +321,8 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // The mirror does not answer for a late master while it may be outdated, or if the method is
-                    // unknown, because the master may not be a rosmaster and may know that method.
+                    // The mirror does not answer for a late master while the mirror may be outdated. It never answers a
+                    // call of an unknown method, because the master may know that method.
                     let is_late =
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);
@@ -453,7 +453,7 @@ impl Calls {
     }
 
     /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection, or while
-    /// the master takes too long, the mirror answers it only if it changes nothing.
+    /// the master takes too long, the mirror answers only a write that changes nothing.
     async fn queue(
         &self,
         head: Head,

@@ -37,8 +37,8 @@ type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A connection to the master, for one call at a time.
 ///
-/// The caller's task drives the connection, because another task would have to be woken twice for each call. So nobody
-/// notices if the connection ends between two calls; [`Self::is_closed`] checks that.
+/// The caller's task drives the connection, because another task would have to be woken twice for each call. So an end
+/// of the connection between two calls goes unnoticed; [`Self::is_closed`] checks for it.
 ///
 /// If the server closes the connection after one answer, as HTTP/1.0 servers do, the next call gets a new connection.
 /// Another process may listen there by then.

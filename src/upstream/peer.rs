@@ -140,7 +140,7 @@ impl Peers {
         }
     }
 
-    /// The rosrescue at `uri`. Drops the connections to any other one.
+    /// The rosrescue at `uri`. Drops the connections to any other rosrescue.
     pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {

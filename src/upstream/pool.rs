@@ -33,7 +33,7 @@ pub enum ReadError {
     Shut,
 }
 
-/// The pool. It is small, because a Python master is slow with many connections.
+/// The pool of connections for reads. It is small, because a Python master is slow with many connections.
 pub struct Pool {
     upstream: Arc<Upstream>,
     ledger: Arc<Ledger>,

@@ -76,7 +76,7 @@ impl Verified {
         Ok(reply)
     }
 
-    /// Whether answers since the verification come from the right incarnation.
+    /// Checks that answers since the verification come from the incarnation with `token`.
     pub(crate) async fn confirm(
         &self,
         upstream: &Upstream,

@@ -269,7 +269,7 @@ pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
     Ok(topics)
 }
 
-/// Whether another subscriber to this type would load the robot.
+/// Whether messages of this type are usually so large that another subscriber would load the robot.
 fn is_heavy(message_type: &str) -> bool {
     [
         "Image",
