@@ -219,9 +219,9 @@ fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }
 
-/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. Its programs need them to find modules
-/// and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders between the
-/// installation and the program.
+/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these paths to
+/// find modules and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders
+/// between the installation and the program.
 fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     let Some(prefix) = program
         .ancestors()

@@ -34,7 +34,7 @@ struct Outcome {
     handed_over: bool,
     /// The leader before the handover.
     from: String,
-    /// The leader now. `None` if there is none.
+    /// The leader now. `None` if no computer leads.
     to: Option<String>,
     /// The computer that `--to` asks for. `None` without `--to`.
     wanted: Option<String>,

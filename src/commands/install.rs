@@ -72,7 +72,7 @@ pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
 
 /// Where the unit files go, and which systemd runs the service.
 struct Place {
-    /// Whether it is a user's own service.
+    /// Whether the service is a user's own, and not the system's.
     user: bool,
     units: PathBuf,
 }

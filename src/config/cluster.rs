@@ -206,7 +206,7 @@ fn is_on_loopback(endpoint: &str) -> bool {
     uri.is_ok_and(|uri| uri.host().is_some_and(is_loopback))
 }
 
-/// Parses `HOST`, which gets `port`, or `HOST:PORT`.
+/// Parses `HOST:PORT`, or `HOST`, to which it adds `port`.
 fn advertised(given: &str, port: u16) -> Result<MasterUri, ClusterError> {
     let given_host = match given.parse::<Ipv6Addr>() {
         Ok(address) => format!("[{address}]"),

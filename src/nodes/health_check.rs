@@ -465,7 +465,7 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
 /// Unregisters a node as the node itself would. Does nothing if the node has come back since it was asked: its address
 /// has changed, or `same` rejects its last calls.
 async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
-    // The node's queued calls run before this.
+    // Lets the node's queued calls run first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(node);

@@ -112,7 +112,7 @@ pub(crate) struct Prepared {
     /// advance.
     basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether it restores the mirror's complete state.
+    /// Whether this injection restores the mirror's complete state.
     complete: bool,
 }
 
@@ -389,7 +389,8 @@ impl Examiner {
             say_difference(&self.ledger.adopt(state.clone()));
         }
         if bears == Bears::Nothing {
-            // A master that was only late finishes its notifications.
+            // This master has no token of ours, so the previous master is gone and sends no more notifications. A
+            // master that was only late finishes its own.
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
         let token = self.ledger.succeed();

@@ -101,7 +101,7 @@ impl MasterProcess {
         upstream: &Upstream,
     ) -> Result<(), ProcessError> {
         let pid = match self.starting.take() {
-            // The upstream has its address from the checkpoint.
+            // `upstream` already has this master's address, from the checkpoint.
             Some(pid) => pid,
             None => self.start(ledger, upstream).await?,
         };

@@ -88,7 +88,7 @@ fn write(checkpoint: &Path, kept: &ReportRecord) -> io::Result<()> {
     others.iter().take(surplus).try_for_each(fs::remove_file)
 }
 
-/// The prefix of the names of these files.
+/// The prefix of the names of report files.
 fn prefix(checkpoint: &Path) -> Option<String> {
     Some(format!(
         "{}.report-",
@@ -96,7 +96,7 @@ fn prefix(checkpoint: &Path) -> Option<String> {
     ))
 }
 
-/// The files of reports, by their dates.
+/// The report files, sorted by the dates in their names.
 fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(Vec::new());

@@ -103,7 +103,7 @@ impl Outage {
 pub(super) struct LastMessage {
     text: String,
     pause: Duration,
-    /// When it may be logged again.
+    /// When the message may be logged again.
     next: Instant,
 }
 

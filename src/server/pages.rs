@@ -205,7 +205,7 @@ impl Asked {
 #[derive(Debug, Serialize)]
 struct WholeState {
     schema: u32,
-    /// The same version number as in the events.
+    /// Version of the state, as in the events of `/events`.
     version: u64,
     registrations: u64,
     /// Numbers of registered items. The lists may be shorter.

@@ -250,7 +250,7 @@ impl Computers {
         if self.lost_writes > 0 {
             writeln!(
                 f,
-                "lost        {} of the changes made while cut off: others had changed the same. The log lists them",
+                "lost        {} of the changes made while cut off: others had changed the same data. The log lists them",
                 self.lost_writes
             )?;
         }
@@ -347,7 +347,7 @@ mod tests {
                 "etcd        NO ANSWER since THEN: no majority",
                 "not in etcd 3 changes made here",
                 "takeover    THEN from pc-3, took 2.04 s; 2 by this computer so far",
-                "lost        1 of the changes made while cut off: others had changed the same. The log lists them",
+                "lost        1 of the changes made while cut off: others had changed the same data. The log lists them",
             ]
         );
     }

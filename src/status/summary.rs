@@ -98,7 +98,7 @@ pub(crate) struct Status {
     #[serde(default)]
     pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
-    /// Why the state is not recorded. `None` if it is.
+    /// Why the state is not recorded. `None` if it is recorded.
     pub(crate) unprotected: Option<String>,
     pub(crate) journal: JournalStatus,
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.

@@ -70,7 +70,7 @@ impl Drive {
                 return Poll::Ready(done);
             }
             self.poll(context);
-            // So data that has arrived is seen at once.
+            // `work` is polled again after the connection, so that it sees arrived data at once.
             work.as_mut().poll(context)
         })
         .await
@@ -80,7 +80,7 @@ impl Drive {
         if let Some((driver, _)) = &mut self.0
             && Pin::new(driver).poll(context).is_ready()
         {
-            // The running call gets the error, if there is one.
+            // If the connection ended with an error, the running call gets that error.
             self.0 = None;
         }
     }
@@ -179,7 +179,7 @@ impl Connection {
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
-            // An empty body needs it too: without it rosmaster answers with status 500 and no body.
+            // An empty body needs this header too. Without it rosmaster answers with status 500 and no body.
             .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {

@@ -73,7 +73,7 @@ pub(super) struct SetupFacts {
     /// Hosts of registered nodes, each with some of its nodes, if rosrescue runs.
     pub(super) node_hosts: Vec<(Host, Vec<String>)>,
     pub(super) disk: CheckpointDisk,
-    /// The limit of open files that this process may ask for.
+    /// The hard limit of open files: the highest limit that this process may set.
     pub(super) files: u64,
     pub(super) clock: Clock,
     /// How to run rosmaster. `None` for `proxy`.

@@ -47,7 +47,7 @@ pub(super) enum Responder {
     Master(Option<i32>),
     /// A program that does not speak XML-RPC.
     Other,
-    /// No program listens there.
+    /// No program listens at the address.
     Nobody,
     /// A program does not answer in time, or the address cannot be reached.
     Silent,

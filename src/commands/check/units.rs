@@ -5,7 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Folders of the system's units. Earlier ones override later ones.
+/// Folders of the system's units. A unit in an earlier folder overrides one in a later folder.
 const FOLDERS: [&str; 4] = [
     "/etc/systemd/system",
     "/run/systemd/system",

@@ -15,7 +15,7 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// A call that takes longer has failed. rosrescue answers all calls sooner.
+/// Longest time for a call. A call that takes longer has failed, because rosrescue answers all calls sooner.
 const LIMIT: Duration = Duration::from_secs(10);
 /// Pause between two calls of a loop.
 const PAUSE: Duration = Duration::from_millis(5);

@@ -25,7 +25,7 @@ const PARAMETER: &str = "the parameter ";
 pub(super) struct RobotState {
     /// Registrations, types and parameters, each under a name for people.
     facts: BTreeMap<String, Value>,
-    /// Each node's process id. `None` if it did not answer.
+    /// Each node's process id. `None` if the node did not answer.
     nodes: BTreeMap<String, Option<i32>>,
 }
 

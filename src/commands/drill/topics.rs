@@ -115,7 +115,7 @@ pub(super) struct TopicReport {
     pub(super) topic: String,
     pub(super) publishers: usize,
     pub(super) messages: u64,
-    /// `None` if the messages have no sequence number.
+    /// Number of lost messages. `None` if the messages have no sequence number.
     pub(super) lost: Option<u64>,
     pub(super) longest_gap_ms: f64,
     /// The longest pause before the first kill. `None` if too few messages came.

@@ -98,7 +98,7 @@ fn alone(gate: State, of: &ClusterFacts) -> ClusterCondition {
         }
         _ => format!(
             "The nodes of this computer keep working. Their changes ({kept}) go to the leader later, except \
-             where others change the same"
+             where others change the same data"
         ),
     };
     ClusterCondition {
