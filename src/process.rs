@@ -214,7 +214,7 @@ pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
 }
 
 /// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop of rosrescue does not
-/// interrupt the start, because nobody would know the new process.
+/// interrupt the start, because the process id of the new process would be lost.
 fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }

@@ -281,8 +281,7 @@ impl Driver {
         match action {
             Action::Connect => {
                 self.disconnect();
-                // Each connection needs its own prepared injection, because the previous one may have gone to a master
-                // that died.
+                // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));

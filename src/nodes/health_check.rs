@@ -428,7 +428,7 @@ async fn reconcile(
     outcome: &mut CheckResult,
 ) {
     // A multicall is never put into a batch. In a batch, the node could register at a new address just before this
-    // call, which would then take its name away.
+    // call. This call would then take the node's name away.
     let kind = call.kind();
     let alone = Request::multicall([call]);
     let reply = nodes.write_queue.call_if(alone, condition.clone()).await;

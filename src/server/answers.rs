@@ -23,7 +23,7 @@ const RATE: u32 = 256 << 10;
 /// slow.
 const AHEAD: Duration = Duration::from_millis(250);
 /// Maximum number of answers that may wait for memory although they are already encoded. They get memory before answers
-/// that are not encoded yet. So few answers must be dropped and encoded again.
+/// that are not encoded yet. Therefore only a few answers must be dropped and encoded again.
 const WAITING: usize = 4;
 
 /// Tracks how fast one connection reads its large answers.

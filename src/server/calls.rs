@@ -321,8 +321,8 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // The mirror does not answer for a late master while the mirror may be outdated. It never answers a
-                    // call of an unknown method, because the master may know that method.
+                    // While the mirror may be outdated, it does not answer for a late master. Nor does it answer a call
+                    // of an unknown method, which that master may know.
                     let is_late =
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);

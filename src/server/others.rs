@@ -73,8 +73,8 @@ pub(crate) struct Others {
 /// rosrescue's own method by which a follower tells the leader that it has passed an answer on to its caller.
 const PASSED_ON: &str = "rosrescue/passedOn";
 
-/// Answers on their way through followers to callers. With each answer, the leader keeps a value that is dropped when
-/// the caller has the answer.
+/// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
+/// the answer, because some notifications must wait for that.
 #[derive(Default)]
 pub(crate) struct Passing(Mutex<Passed>);
 

@@ -219,7 +219,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// Refuses a call, and logs each address at most once a minute, because a refused node calls again and again.
+/// Refuses a request, and logs each address at most once a minute, because a refused node calls again and again.
 fn keep_out(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     let mut said = server
         .refused

@@ -55,9 +55,10 @@ pub struct MemberFacts {
     pub uri: String,
     pub version: String,
     pub role: Role,
-    /// The last journal record in that computer's mirror.
+    /// The last journal record in the described computer's mirror.
     pub seq: u64,
-    /// When this computer last heard from that one. `None` if it has heard nothing since this rosrescue started.
+    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
+    /// started.
     pub heard: Option<Instant>,
 }
 

@@ -62,12 +62,12 @@ pub(crate) struct Computer {
     pub(crate) uri: String,
     pub(crate) version: String,
     pub(crate) role: Role,
-    /// Number of journal records that the mirror of that computer lacks.
+    /// Number of journal records that the described computer's mirror lacks.
     pub(crate) behind: u64,
-    /// When this computer last heard from that one. `None` if it has heard nothing since this rosrescue started, and
-    /// for this computer itself.
+    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
+    /// started, and for this computer itself.
     pub(crate) heard: Option<f64>,
-    /// Whether that computer has been silent for 15 s.
+    /// Whether the described computer has been silent for 15 s.
     pub(crate) away: bool,
 }
 

@@ -61,7 +61,7 @@ impl Peer {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the last answer of that computer was late.
+    /// Whether the last answer of the other computer was late.
     pub(crate) fn is_late(&self) -> bool {
         self.late.load(Ordering::Relaxed)
     }
@@ -70,7 +70,7 @@ impl Peer {
         self.late.store(late, Ordering::Relaxed);
     }
 
-    /// Sends a call to that computer as the leader of `term`. Even without an answer, the call may have been run.
+    /// Sends a call to the other computer as the leader of `term`. Even without an answer, the call may have been run.
     pub(crate) async fn forward(
         &self,
         term: u64,
@@ -114,7 +114,7 @@ impl Peer {
         Ok(reply)
     }
 
-    /// Whether that computer confirms that it leads in `term`.
+    /// Whether the other computer confirms that it leads in `term`.
     pub(crate) async fn leads(&self, term: u64) -> bool {
         let call = master::get_pid();
         let body = Bytes::from(xmlrpc::encode_call(&call));

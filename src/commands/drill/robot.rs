@@ -68,7 +68,7 @@ impl RobotState {
         (answering, self.facts.len())
     }
 
-    /// What has changed since this state in `later`. Facts that already differed in `meanwhile`, just before the first
+    /// How the state `later` differs from this state. Facts that already differed in `meanwhile`, just before the first
     /// kill, do not count as lost. `changed` are the parameters and namespaces that other programs were seen to change.
     pub(super) fn compare(
         &self,
