@@ -1,5 +1,6 @@
-//! The command line. Each option of `core` and `proxy` has an environment variable. Options of the other commands have
-//! none: a variable left over from an earlier command must not confirm a change.
+//! The command line. Each option of `core` and `proxy` has an environment variable. Options of the other commands that
+//! confirm a change, such as `--yes`, have none: a variable left over from an earlier command must not confirm
+//! anything.
 
 pub(crate) mod cluster;
 mod files;
@@ -34,7 +35,7 @@ pub struct Cli {
     /// What to run; `core` if it is left out.
     #[command(subcommand)]
     pub command: Option<Command>,
-    /// The options of `core`, for the bare `rosrescue`.
+    /// The options of `core`, for `rosrescue` without a command.
     #[command(flatten)]
     pub core: CoreArgs,
 }
@@ -52,7 +53,7 @@ impl Cli {
             .get(1)
             .is_some_and(|first| command.find_subcommand(first).is_some())
         {
-            // The variables of the bare `rosrescue` do not apply to another command.
+            // The variables of the options of `core` must not count as options given before another command.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
         let matches = command.get_matches_from(words);
@@ -67,7 +68,7 @@ pub enum Command {
     Core(Box<CoreArgs>),
     /// Protect a master that something else starts
     Proxy(ProxyArgs),
-    /// Another command.
+    /// A command that does not serve nodes.
     #[command(flatten)]
     Tool(Tool),
 }

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// Wall time in seconds since 1970, with microseconds; 0 for earlier times.
+/// The present wall time in seconds since 1970, to the microsecond; 0 if the clock shows an earlier time.
 #[allow(
     clippy::disallowed_methods,
     reason = "the one place that reads the wall clock"

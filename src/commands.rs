@@ -36,7 +36,7 @@ use crate::{
     log::{plain, plain_json},
 };
 
-/// Exit status of a command. A wrong command line has status 2 as well.
+/// Exit status of a command that has a result. [`CommandFailure`] has the other statuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Exit {
     /// The command worked, and its answer is yes: protected, equal, in time.
@@ -52,7 +52,7 @@ pub(crate) enum CommandFailure {
     /// The arguments make no sense. Exit status 2.
     #[error("{0}")]
     Usage(String),
-    /// No rosrescue answers. Exit status 3.
+    /// No program answers at the address. Exit status 3.
     #[error("no rosrescue at {uri}: {why}. Start `rosrescue core`, or give its address with --uri")]
     Nobody { uri: String, why: String },
     /// A process listens at the port but does not answer as rosrescue does. Exit status 3.

@@ -80,7 +80,7 @@ pub struct Config {
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
-    /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
+    /// Whether the user chose the checkpoint. Otherwise the checkpoint's name depends on the served port.
     pub checkpoint_is_given: bool,
     pub restore: RestorePolicy,
     /// Maximum space for kept checkpoints, in bytes.
@@ -97,8 +97,8 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well. `None` disables them. Then nodes also stay registered when
-    /// another node takes their port.
+    /// Pause between two regular health checks. `None` disables regular checks: then a dead node may stay registered,
+    /// even if another node takes its port.
     pub reap_interval: Option<Duration>,
     /// Networks that may call. `None` allows all.
     pub allow: Vec<IpNet>,
@@ -130,8 +130,9 @@ pub enum MasterConfig {
 }
 
 impl MasterConfig {
-    /// How long a connection to the master may stay idle, if known. The watched connection is
-    /// renewed with each probe.
+    /// How long a connection to the master may stay idle before the master closes it, if known.
+    /// Each probe renews the [`Sentinel`](crate::upstream::sentinel::Sentinel), so the pause
+    /// between probes must be shorter.
     fn idle_limit(&self) -> Option<Duration> {
         let Self::Supervised(supervised) = self else {
             return None;
@@ -197,7 +198,7 @@ impl Config {
         Ok(Self { cluster, ..config })
     }
 
-    /// Like [`Self::core`], for `rosrescue proxy`.
+    /// The configuration of `rosrescue proxy` with `args` in the environment `env` on the computer `hostname`.
     pub fn proxy(
         args: &ProxyArgs,
         env: Lookup<'_>,
@@ -227,7 +228,7 @@ impl Config {
         }
     }
 
-    /// Adapts the configuration to the served `port`. The system chooses it if port 0 was configured.
+    /// Adapts the configuration to the served `port`, which the system chooses if port 0 was configured.
     pub fn serve_on(&mut self, port: u16) {
         self.advertised.port = port;
         if !self.checkpoint_is_given {
@@ -235,7 +236,7 @@ impl Config {
         }
     }
 
-    /// Serves `addresses` instead of the configured ones. Another process has bound them.
+    /// Serves `addresses`, which another process has bound, instead of the configured ones.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
         let before = self.advertised.clone();
         let single = addresses.first().filter(|address| {
@@ -268,7 +269,7 @@ impl Config {
             interval.min((limit / 2).max(SHORTEST_INTERVAL))
         });
         let reads = args.reads.unwrap_or(match master {
-            // Only rosrescue knows the port of its own master, so nobody can change it directly.
+            // Only rosrescue knows the port of its own master, so no client changes that master directly.
             MasterConfig::Supervised(_) => Reads::Mirror,
             MasterConfig::External(_) => Reads::Master,
         });

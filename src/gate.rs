@@ -1,5 +1,5 @@
-//! The gate: whether calls pass to the master. Any task may read it and wait for it; only the recovery holds the
-//! [`Tx`].
+//! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. Only the recovery and,
+//! with several computers, `app::cluster` change the gate, through the [`Tx`].
 //!
 //! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], the driver [`State::Late`],
 //! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets
@@ -12,18 +12,18 @@ use tokio::{sync::watch, time::Instant};
 /// The state of the gate: it says which side answers calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// Calls pass to the master of this incarnation.
+    /// Calls pass to the master with this incarnation number.
     Open {
-        /// Number of the incarnation; see [`Token`](crate::replay::Token).
+        /// Number of the incarnation, which is one life of a master process; see [`Token`](crate::replay::Token).
         incarnation: u64,
     },
     /// The mirror answers reads and writes, because the master is away.
     StandingIn,
-    /// The mirror answers reads and writes, because the master is late. The master still has to answer a batch or a
-    /// read. Then it gets the writes that it has missed.
+    /// The mirror answers reads and writes, because the master has not answered a call for too long. When the master
+    /// answers, it gets the writes that it has missed.
     Late,
-    /// An injection is under way: the mirror answers reads, and writes that change nothing. Other
-    /// writes wait.
+    /// rosrescue is giving the master its state (an injection). The mirror answers reads, and
+    /// writes that change nothing. Other writes wait.
     Injecting,
     /// Another computer has the master or will have it soon. Calls go there.
     Elsewhere,
@@ -106,8 +106,7 @@ impl Rx {
         }
     }
 
-    /// Like [`Self::look`]. Also returns whether the state has changed since the last look, or since [`Self::changed`]
-    /// returned.
+    /// The present state, and whether it has changed since the last look or since [`Self::changed`] returned.
     pub fn look_changed(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
@@ -129,7 +128,7 @@ impl Rx {
         }
     }
 
-    /// Waits until no call has passed for an uninterrupted `time`, counted from now at the earliest. Never returns
+    /// Waits until the gate has been shut for an uninterrupted `time`, counted from now at the earliest. Never returns
     /// while the gate is open. Cancel safe, but cancelling restarts the count.
     pub async fn shut_for(&mut self, time: Duration) {
         loop {

@@ -95,8 +95,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     }
 }
 
-/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is returned with the worker.
-/// That worker only has to end the processes that the dead one left running.
+/// Starts a worker after `pause`, retrying until it succeeds. A stop signal ends the pause and is returned with the
+/// worker. After a signal the new worker only ends the processes that the dead worker left running.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
@@ -222,8 +222,8 @@ impl Worker {
         }
     }
 
-    /// Whether the worker writes `word` before it ends, or within [`START_TIME`]. Skips earlier
-    /// words.
+    /// Waits until the worker has written `word` to the link. Returns false if the worker ends
+    /// first, or is silent for [`START_TIME`]. Skips other words.
     fn has_said(&self, word: u8) -> bool {
         let mut said = [0];
         while (&self.link).read(&mut said).is_ok_and(|length| length > 0) {

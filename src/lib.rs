@@ -8,11 +8,11 @@
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; independent of ROS.
 //! * [`master`]: the Master API as a state machine.
-//! * [`hide`]: which values of parameters are not shown.
-//! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
+//! * [`hide`]: which parameter values are hidden.
+//! * [`replay`]: recognising a master, reading its state, and the one call that gives a master its state.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
 //! * `health`: judging what a node reports; which nodes are unreachable.
-//! * `order`: the order in which a node hears of a topic, a parameter or its own name.
+//! * `order`: the order of the notifications and answers that a node gets about a topic, a parameter or its own name.
 //! * [`checkpoint::session`]: whether a checkpoint's session continues, and the state that it holds.
 //! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
 //! * [`checkpoint::compare`], [`checkpoint::putback`]: how two states differ, and what brings a running master
@@ -32,14 +32,14 @@
 //! * `write_queue`: writes on their way to the master, in order.
 //! * `process`: the processes of rosmaster and rosout, and orphans of an earlier rosrescue.
 //! * `nodes`: calls to nodes: health check and notifications.
-//! * `recovery`: watching the master, examining and injecting.
+//! * `recovery`: watching the master, reading its state, and restoring it.
 //! * `roscore`: roscore's other duties.
 //! * `server`: the side that clients talk to.
 //! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
 //! * [`app`]: assembles the program.
 //! * [`commands`]: the commands that do not serve nodes.
 //!
-//! `docs/architecture.md` follows a call, and a record, through these modules by function names.
+//! `docs/architecture.md` names the functions that a call and a record pass on their way through these modules.
 
 pub mod app;
 pub mod checkpoint;

@@ -1,5 +1,5 @@
-//! Rate limits for events that could come by the thousand, such as log lines and files in a crash loop. At first some
-//! pass at once, later one from time to time.
+//! Rate limits for events that could come by the thousand, such as log lines and files in a crash loop. The first ten
+//! events pass at once, later events one from time to time.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -71,7 +71,7 @@ impl Bucket {
     }
 }
 
-/// A rate limit for an alarm and its all-clear. Either both are logged or neither.
+/// A rate limit for an alarm and its all-clear. Both are logged, or neither is.
 #[derive(Debug)]
 pub(crate) struct Pair(Mutex<Episode>);
 
@@ -94,7 +94,7 @@ impl Pair {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Like [`Limit::pass`], for an alarm.
+    /// Permission to log an alarm at `now`. `None` if the alarm must be left out.
     pub(crate) fn alarm(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         let passed = episode.bucket.pass(now);
@@ -102,8 +102,9 @@ impl Pair {
         passed
     }
 
-    /// Like [`Limit::pass`], for the all-clear. It passes if an alarm passed since the last all-clear. Without an alarm
-    /// it is limited like any other line.
+    /// Permission to log the all-clear at `now`. The all-clear is logged if an alarm was logged since the last
+    /// all-clear, and left out if all alarms since then were left out. Without an alarm the all-clear is limited like
+    /// any other line.
     pub(crate) fn all_clear(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         match episode.told.take() {
@@ -131,7 +132,7 @@ macro_rules! rarely {
 }
 pub(crate) use rarely;
 
-/// Like [`rarely!`], for the alarm of a [`Pair`].
+/// Logs the alarm of a [`Pair`] like [`rarely!`], if [`Pair::alarm`] permits.
 macro_rules! alarm {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.alarm(std::time::Instant::now()) {
@@ -142,7 +143,7 @@ macro_rules! alarm {
 }
 pub(crate) use alarm;
 
-/// Like [`rarely!`], for the all-clear of a [`Pair`].
+/// Logs the all-clear of a [`Pair`] like [`rarely!`], if [`Pair::all_clear`] permits.
 macro_rules! all_clear {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.all_clear(std::time::Instant::now()) {

@@ -1,4 +1,4 @@
-//! The command line of rosrescue: arguments, logging, signals, exit codes.
+//! The program `rosrescue`: arguments, logging, signals and exit statuses.
 
 use std::{
     error::Error,
@@ -33,7 +33,7 @@ const LAST_JOBS: Duration = Duration::from_millis(500);
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
 
 fn main() -> ExitCode {
-    // This must come first: it removes the sockets from the environment, which is only safe with a
+    // This must come first: it removes variables from the environment, which is only safe with a
     // single thread.
     let sockets = match Sockets::inherited() {
         Ok(sockets) => sockets,
@@ -100,7 +100,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Serves `sockets`, or runs the guardian of a worker that does.
+/// Serves `sockets`, or runs the guardian of a worker that serves them.
 fn start(
     mut config: Config,
     sockets: Option<Sockets>,
@@ -131,7 +131,7 @@ fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));
     // The closing checkpoint is on the disk and newer than any write that still runs. A thread may be waiting for a
-    // dead name server. Dropping the runtime would wait for it; ending the process does not.
+    // dead name server. Dropping the runtime would wait for that thread; ending the process does not.
     runtime.shutdown_timeout(LAST_JOBS);
     ended
 }

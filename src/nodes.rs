@@ -43,12 +43,12 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most masters
-/// that only closed an idle connection are back by then.
+/// How long the master must be away before rosrescue sends the notifications that the master may not have sent. Most
+/// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
-/// Delay before a new worker sends nodes the notifications that its predecessor may not have sent. By then an adopted
-/// master has sent its own, unless it has a long backlog.
+/// Delay before a restarted rosrescue sends the notifications that the dead one may not have sent. By then a master
+/// that still runs has sent its own notifications, unless it has a long backlog.
 const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
 /// Maximum number of nodes that are remembered because they do not answer `paramUpdate`.
@@ -75,7 +75,7 @@ pub struct Nodes {
     served: Served,
     /// Number of recoveries whose health check is still running.
     checks: AtomicUsize,
-    /// Number of nodes that have not answered yet.
+    /// Number of questions of health checks that nodes have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
@@ -118,7 +118,7 @@ impl Nodes {
     }
 
     /// Whether the node at `port` may be notified. A computer that is cut off does not notify nodes of other computers,
-    /// because they get the leader's state.
+    /// because the leader notifies those nodes.
     pub(super) async fn may_tell(&self, port: &str) -> bool {
         !self.alone.load(Ordering::Relaxed)
             || self.served.has(port)
@@ -155,7 +155,7 @@ impl Nodes {
 
     /// The names of the unreachable nodes.
     pub fn unreachable(&self) -> Vec<String> {
-        // The two locks must never be held together here.
+        // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes();
@@ -170,14 +170,14 @@ impl Nodes {
     pub(super) fn mark_unreachable(&self, port: &str) {
         let now = Instant::now();
         let new = self.lock().add(port, now);
-        // This node may be due before all others.
+        // This node may have to be asked again before all other unreachable nodes.
         self.changed.notify_one();
         if !new {
             return;
         }
         tracing::debug!(port, "a node does not answer");
         if self.update_notifying() {
-            // The master may be about to notify this node of recent changes before all others.
+            // The master may call this node before it notifies other nodes of recent changes, and wait for its answer.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
             self.ledger.outbox_changed.notify_one();
@@ -196,7 +196,7 @@ impl Nodes {
     /// Decides whether rosrescue notifies nodes in addition to the master: while a node is unreachable or a check is
     /// running. Returns whether that begins now.
     fn update_notifying(&self) -> bool {
-        // The locks are nested only here. Otherwise an older result could be stored last.
+        // Only here is the ledger's lock taken while this lock is held. Otherwise an older result could be stored last.
         let unreachable = self.lock();
         let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger
@@ -204,8 +204,8 @@ impl Nodes {
             && notifying
     }
 
-    /// Makes rosrescue notify nodes in addition to the master until the result is dropped. Until then it is unknown
-    /// which nodes are unreachable.
+    /// Makes rosrescue notify nodes in addition to the master until the result is dropped. Until the end of the check
+    /// it is unknown which nodes are unreachable and hold up the master's notifications.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
         nodes.update_notifying();
@@ -230,7 +230,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
     let mut repeats = Repeats::<NotifyingChange>::default();
     let mut gate = nodes.gate.clone();
-    // When to send what the absent master may not have sent, and whether that is done.
+    // When to send the notifications that the absent master may not have sent, and whether they were sent.
     let (mut owed_at, mut owed_told) = (None, false);
     loop {
         let next = nodes.lock().next().map(Into::into);
@@ -290,8 +290,8 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<NotifyingChange>) {
     }
 }
 
-/// Takes the notifications that a master lost at `outage` may not have sent, as topics and parameters. Also begins to
-/// shut down displaced nodes that it may not have told.
+/// Takes the topics and parameters whose notifications may not have been sent by the master that was lost at `outage`.
+/// Also begins to shut down nodes whose names were taken, if that master may not have told them.
 fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
     let owed = nodes
         .ledger
@@ -302,7 +302,7 @@ fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, 
     (owed.topics, owed.params)
 }
 
-/// Sends the notifications that a master lost at `outage` may not have sent. Returns their topics.
+/// Sends the notifications that may not have been sent by the master that was lost at `outage`. Returns their topics.
 pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let (mut topics, params) = take_owed(nodes, outage);
     topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
@@ -312,9 +312,10 @@ pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     topics
 }
 
-/// Sends the notifications that a rosrescue that died may not have sent, after a second. Returns their topics.
+/// Sends, after [`ADOPTED_AFTER`], the notifications that an earlier rosrescue may not have sent before it died.
+/// Returns their topics.
 ///
-/// The master lives and may still be sending notifications, so the present state goes last.
+/// Nodes get the present state last, because the master lives and may still be sending older notifications.
 pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let (mut topics, params) = take_owed(nodes, outage);
     let at = Instant::now() + ADOPTED_AFTER;

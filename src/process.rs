@@ -160,7 +160,7 @@ impl Rosmaster {
         })
     }
 
-    /// The last output of the last rosmaster, for the message that it died early.
+    /// The last output of the last rosmaster, for the message that rosmaster died early.
     pub(crate) async fn last_words(&self) -> String {
         self.output.tail().await
     }
@@ -213,15 +213,15 @@ pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop does not interrupt
-/// it: the new process would then be unknown.
+/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop of rosrescue does not
+/// interrupt the start, because the process id of the new process would be lost.
 fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }
 
-/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. Its programs need them to find modules
-/// and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders between the
-/// installation and the program.
+/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these paths to
+/// find modules and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders
+/// between the installation and the program.
 fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     let Some(prefix) = program
         .ancestors()
@@ -385,7 +385,7 @@ fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf
             .flatten()
             .map(|entry| entry.path())
             .collect();
-        // The last name wins, so newer distributions come first: kinetic, melodic, noetic.
+        // Newer distributions have later names (kinetic, melodic, noetic), so the last name is tried first.
         distributions.sort();
         let candidates = distributions.iter().rev();
         let mut programs =
@@ -400,7 +400,7 @@ fn is_program(path: &Path) -> bool {
         .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
 }
 
-/// Whether rosmaster could listen on this port. It sets SO_REUSEADDR.
+/// Whether rosmaster could listen on this port. rosmaster sets SO_REUSEADDR, and so does this check.
 fn is_free(port: u16) -> bool {
     bind_loopback(port).is_ok()
 }

@@ -1,4 +1,4 @@
-//! Watches the master and restores it after a failure. This is the shell around [`crate::lifecycle`].
+//! Watches the master and restores it after a failure. Carries out what [`crate::lifecycle`] decides.
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
@@ -69,12 +69,12 @@ pub(crate) struct Driver {
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     rescues: Rescues,
-    /// The rescue in which the present master was restored, until the gate opens.
+    /// Number of the rescue in which the present master was restored. Set until the gate opens.
     restored: Option<u64>,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
-    /// Completes when the sentinel's connection ends.
+    /// Completes when the [`Sentinel`]'s connection ends, which shows that the master has ended.
     ended: Option<Ended>,
     /// Completes when a thread of the master ends. Used once for each master.
     thread_ended: Option<Ended>,
@@ -126,8 +126,7 @@ impl Driver {
         }
     }
 
-    /// Like [`Self::start`], after another computer has had the master. `cause` is the reason why this computer has it
-    /// now.
+    /// Does what [`Self::start`] does, on a computer that gets the master from another computer. `cause` is the reason.
     pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
         self.outage.cause = cause;
         self.start(true)
@@ -229,7 +228,7 @@ impl Driver {
             alarm!(
                 warn,
                 AWAY,
-                "the new master died while its state was being restored; the next master gets it"
+                "the new master died while its state was being restored; the next master gets the state"
             );
             self.lifecycle.on(Instant::now(), Input::Answered);
         }
@@ -282,7 +281,7 @@ impl Driver {
         match action {
             Action::Connect => {
                 self.disconnect();
-                // The injection is always prepared again: a master that died meanwhile may have got the previous one.
+                // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));
@@ -293,7 +292,8 @@ impl Driver {
                         Ok(sentinel) => Arc::new(sentinel),
                         Err(error) => return Done::NotConnected(error),
                     };
-                    // This comes before the first call, because another program at the port must not get the state.
+                    // This check comes before the first call, because another program at the port must not get the
+                    // state.
                     match holder(new).await {
                         Holder::Stranger(pid) => Done::PortTaken(pid),
                         Holder::Master | Holder::Unknown => Done::Connected(sentinel),

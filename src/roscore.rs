@@ -25,8 +25,8 @@ use crate::{
 
 /// Time limit for `rosversion`, which is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
-/// Pause before rosout is restarted, as with roslaunch's `respawn`. It doubles each time rosout ended before it had run
-/// for [`LONGEST_RESPAWN`].
+/// Pause before rosout is restarted, as with roslaunch's `respawn`. The pause doubles each time rosout ends before it
+/// has run for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 const ROSOUT: &str = "/rosout";
@@ -190,7 +190,7 @@ const STARTED: Duration = Duration::from_millis(500);
 /// Stops rosout cleanly.
 async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
-        // An orphan may not have been found yet.
+        // A rosout that an earlier rosrescue left running may not have been found yet.
         0 => Rosout::find(&roscore.checkpoint)
             .and_then(|rosout| block_in_place(|| rosout.find_orphan())),
         pid => Some(pid),

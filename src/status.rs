@@ -41,7 +41,7 @@ pub struct DiskStatus {
     /// Whether changes are recorded, and when this last changed.
     pub protected: bool,
     pub since: Instant,
-    /// When the checkpoint was last rewritten as a whole, and the last record then.
+    /// When the checkpoint was last rewritten as a whole, and the number of the last record in it.
     pub compacted: Option<(Instant, u64)>,
     /// Free bytes on the checkpoint's disk.
     pub free: Option<u64>,
@@ -97,7 +97,7 @@ pub struct Earlier {
     pub(crate) deaths: u64,
     /// Number of times rosrescue died and was restarted, this process included.
     pub(crate) worker_restarts: u64,
-    /// Whether the previous process died.
+    /// Whether the previous process of rosrescue died.
     pub(crate) died: bool,
     /// The highest rescue number used in any session.
     pub(crate) last_number: u64,
@@ -178,7 +178,7 @@ impl Facts {
         }
     }
 
-    /// Since when everything has been in order. Call this only if it is in order now and calls pass.
+    /// Since when everything has been in order. Must be called only while calls pass and everything is in order.
     fn settled_since(&self) -> Instant {
         self.disk.since.max(self.calm_since.unwrap_or(self.started))
     }

@@ -1,4 +1,4 @@
-//! Connections to the master.
+//! Connections to the master. An *incarnation* is one life of a master process; a call must reach the present one.
 
 mod connection;
 pub(crate) mod inspect;
@@ -56,7 +56,7 @@ pub enum ConnectError {
     Unreachable { master: String, source: io::Error },
 }
 
-/// Why a call got no reply. The kinds differ in whether the master may have run the call.
+/// Why a call got no reply. Each kind says whether the master may have run the call.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CallError {
@@ -170,7 +170,7 @@ impl Drop for Writer {
     }
 }
 
-/// A call to the master that is under way until this is dropped; see [`Upstream::silent_since`].
+/// A call to the master. It counts as under way until this value is dropped; see [`Upstream::silent_since`].
 #[derive(Debug)]
 pub(crate) struct OpenCall<'a>(&'a Upstream);
 
@@ -247,7 +247,7 @@ impl Upstream {
         self.lock_verification().clone()
     }
 
-    /// Sets how calls are verified. The previous sentinel closes once no call needs it any more.
+    /// Sets how calls are verified. The previous [`Sentinel`] closes once no call needs it any more.
     pub(crate) fn set_verification(&self, verification: Option<Verification>) {
         *self.lock_verification() = verification;
     }

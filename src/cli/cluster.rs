@@ -63,7 +63,7 @@ pub struct ClusterArgs {
     pub cluster_password_file: Option<PathBuf>,
 }
 
-/// When a write is answered.
+/// When the leader answers a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ClusterSync {
     /// After a majority of etcd has stored it: the death of a computer loses no answered write

@@ -62,8 +62,8 @@ pub struct DiffArgs {
     /// Checkpoint to compare with
     #[arg(value_name = "B", required_unless_present = "live")]
     pub b: Option<PathBuf>,
-    /// Compare with the running master, on any computer. Subscriptions to parameters are left out: a master does
-    /// not tell them
+    /// Compare with the running master, on any computer. Subscriptions to parameters are left out, because
+    /// a master does not list them
     #[arg(long, conflicts_with = "b")]
     pub live: bool,
     #[command(flatten)]

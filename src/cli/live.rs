@@ -51,8 +51,8 @@ pub struct WaitArgs {
     #[command(flatten)]
     pub target: TargetArgs,
     /// What to wait for: `answered`, `master`, `protected`, or the /NAME of a node. `answered`: rosrescue answers
-    /// calls. `master`: a master does. `protected`: rosrescue also records every change. With several, for all
-    /// of them
+    /// calls. `master`: a master answers calls. `protected`: rosrescue also records every change. Several
+    /// conditions must all be met
     #[arg(long = "for", env = "ROSRESCUE_WAIT_FOR", value_name = "WHAT")]
     #[arg(value_delimiter = ',', num_args = 1.., default_value = "answered")]
     pub wanted: Vec<For>,

@@ -10,7 +10,7 @@ use super::{cluster::ClusterArgs, tools::HideArgs};
 /// Heading of the options that few robots need.
 const ADVANCED: &str = "Advanced options";
 
-/// Options of `rosrescue core`. Those with a short form are roscore's.
+/// Options of `rosrescue core`. The options with a short form are roscore's.
 #[derive(Args, Clone, Debug)]
 pub struct CoreArgs {
     /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
@@ -30,7 +30,7 @@ pub struct CoreArgs {
     #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS", help_heading = ADVANCED)]
     #[arg(default_value_t = 5.0)]
     pub timeout: f64,
-    /// Longest time for a started rosmaster to listen, in seconds. One that is still busy gets more
+    /// Longest time until a started rosmaster listens, in seconds. A rosmaster that is still busy gets more
     #[arg(
         long,
         env = "ROSRESCUE_START_LIMIT",
@@ -56,7 +56,7 @@ pub struct CoreArgs {
     /// The options for several computers.
     #[command(flatten)]
     pub cluster: ClusterArgs,
-    /// The options of both commands.
+    /// The options that `core` and `proxy` share.
     #[command(flatten)]
     pub common: CommonArgs,
 }
@@ -75,12 +75,12 @@ pub struct ProxyArgs {
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// The options of both commands.
+    /// The options that `core` and `proxy` share.
     #[command(flatten)]
     pub common: CommonArgs,
 }
 
-/// Options of both commands.
+/// Options that `core` and `proxy` share.
 #[derive(Args, Clone, Debug)]
 pub struct CommonArgs {
     /// File that records the state of the master [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or
@@ -230,7 +230,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
     pub master_connections: u32,
-    /// Maximum number of connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
+    /// Maximum number of client connections; further clients wait. Half of the connections, 2000 at most, may be idle
     #[arg(
         long,
         env = "ROSRESCUE_MAX_CONNECTIONS",
@@ -250,7 +250,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub max_body: u64,
-    /// The values that the page does not show.
+    /// The parameters whose values the status page hides.
     #[command(flatten)]
     pub hide: HideArgs,
     /// Run without the guardian process, which keeps the port open and restarts rosrescue. With a systemd socket
@@ -287,7 +287,7 @@ fn network(text: &str) -> Result<IpNet, &'static str> {
 /// When a checkpoint is restored at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum RestoreChoice {
-    /// If rosrescue has not stopped cleanly since boot, or a registered node still answers
+    /// After a crash or kill without a reboot, or if a registered node still answers
     Auto,
     /// Always
     Always,
@@ -315,7 +315,7 @@ pub enum Reads {
     Master,
 }
 
-/// Form of the log.
+/// Format of the log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
     /// One line per message

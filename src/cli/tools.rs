@@ -50,7 +50,7 @@ pub enum Tool {
     Wait(WaitArgs),
 }
 
-/// Which running rosrescue is meant.
+/// The running rosrescue that a command talks to.
 #[derive(Args, Clone, Debug)]
 pub struct TargetArgs {
     /// Address of the running rosrescue, http://HOST:PORT [default: ROS_MASTER_URI, else http://localhost:11311]
@@ -66,7 +66,7 @@ pub struct OutputArgs {
     pub json: bool,
 }
 
-/// Which values of parameters are not shown.
+/// The parameters whose values are hidden.
 #[derive(Args, Clone, Debug)]
 pub struct HideArgs {
     /// Hide the values of parameters whose full name matches this regular expression. Case does not matter, and

@@ -32,7 +32,7 @@ pub(super) struct Opened {
     pub(super) bytes: u64,
     /// Wall time of the last change.
     pub(super) written: i64,
-    /// Number of the snapshot's last record. `None` if there is no complete snapshot.
+    /// Number of the last record that the snapshot includes. `None` if there is no complete snapshot.
     pub(super) snapshot_seq: Option<u64>,
     /// Methods of the calls in the journal; `session` for a change of the session.
     pub(super) journal: Vec<String>,
@@ -60,15 +60,15 @@ pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     fs::canonicalize(&path).unwrap_or(path)
 }
 
-/// The rosrescue that the environment leads to.
+/// The rosrescue that `ROSRESCUE_URI` names, or else the default one.
 fn target() -> TargetArgs {
     TargetArgs {
         uri: std::env::var("ROSRESCUE_URI").ok(),
     }
 }
 
-/// The checkpoint of the rosrescue that runs on this computer. A service runs as another user, with another home
-/// folder.
+/// The checkpoint of the rosrescue that runs on this computer. Asks rosrescue, because a service may run as another
+/// user, whose home folder is another one.
 async fn of_running() -> Option<PathBuf> {
     let running = Running::find(&target()).ok()?;
     if !is_here(&running.address).await {
@@ -105,7 +105,7 @@ pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf,
 
 /// An entry of the history.
 pub(super) struct Listed {
-    /// Such as `present`, `session-3` or `rescue-7`.
+    /// The entry's name, such as `present`, `session-3` or `rescue-7`.
     pub(super) name: String,
     pub(super) path: PathBuf,
     pub(super) written: i64,

@@ -19,7 +19,7 @@ use crate::{
 /// rosrescue's own method that starts a handover. Its parameters are the caller's id and the computer that should lead;
 /// an empty text means any.
 const METHOD: &str = "rosrescue/handover";
-/// The caller's id in that call.
+/// The caller id with which this command makes its call.
 const CALLER: &str = "/rosrescue_handover";
 /// Pause between two checks for the new leader.
 const PAUSE: Duration = Duration::from_millis(20);
@@ -30,13 +30,13 @@ const SAY_EVERY: Duration = Duration::from_secs(1);
 #[derive(Debug, Serialize)]
 struct Outcome {
     uri: String,
-    /// Whether another computer leads now; if one was asked for, whether that one does.
+    /// Whether another computer leads now. With `--to`, whether that computer leads now.
     handed_over: bool,
     /// The leader before the handover.
     from: String,
-    /// The leader now. `None` if there is none.
+    /// The leader now. `None` if no computer leads.
     to: Option<String>,
-    /// The computer that was asked for.
+    /// The computer that `--to` asks for. `None` without `--to`.
     wanted: Option<String>,
     /// Seconds from the request until the result was seen.
     seconds: f64,

@@ -94,12 +94,12 @@ struct Row {
     number: usize,
     name: String,
     what: &'static str,
-    /// `None` if there is no report.
+    /// The report of the rescue. `None` if there is no report.
     rescue: Option<Rescue>,
     /// Wall time of the last change.
     written: String,
     bytes: u64,
-    /// `None` if the checkpoint cannot be read.
+    /// Number of nodes. `None` if the checkpoint cannot be read.
     nodes: Option<usize>,
     parameters: Option<usize>,
     problem: Option<String>,

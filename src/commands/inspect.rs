@@ -40,10 +40,10 @@ pub(super) async fn run(args: &InspectArgs) -> Result<Exit, CommandFailure> {
 struct Inspected {
     file: String,
     bytes: u64,
-    /// Whether this is everything that was recorded.
+    /// Whether the contents are everything that was recorded.
     exact: bool,
     damage: Vec<String>,
-    /// The reason, if the last append is incomplete.
+    /// Why the last record is incomplete. `None` if it is complete.
     torn: Option<String>,
     /// Wall time of the last change.
     written: String,
@@ -88,11 +88,11 @@ struct Topic {
 
 #[derive(Serialize)]
 struct Journal {
-    /// Number of the snapshot's last record.
+    /// Number of the last record that the snapshot includes.
     snapshot: Option<u64>,
     /// Number of records after the snapshot.
     records: usize,
-    /// Number of those records for each method.
+    /// Number of records after the snapshot, for each method.
     calls: BTreeMap<String, usize>,
 }
 

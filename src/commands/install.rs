@@ -1,7 +1,7 @@
 //! `rosrescue install` runs rosrescue as a systemd service, and `rosrescue uninstall` undoes that.
 //!
 //! The units are static: the Debian package has them, and `install` writes them where the package is missing. What
-//! differs from robot to robot is in a drop-in beside each.
+//! differs from robot to robot is in a drop-in for each unit.
 
 mod units;
 
@@ -72,7 +72,7 @@ pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
 
 /// Where the unit files go, and which systemd runs the service.
 struct Place {
-    /// Whether it is a user's own service.
+    /// Whether the service is a user's own, and not the system's.
     user: bool,
     units: PathBuf,
 }
@@ -98,7 +98,8 @@ impl Place {
         Ok(Self { user, units })
     }
 
-    /// Whether the Debian package provides the units. It does so for the system's systemd and the package's program.
+    /// Whether the Debian package provides the units: only for the system's systemd, and only if `program` is the
+    /// package's.
     fn is_packaged(&self, program: &Path) -> bool {
         let unit = Path::new("/usr/lib/systemd/system").join(UNITS[0]);
         !self.user && program == Path::new("/usr/bin/rosrescue") && unit.exists()
@@ -243,7 +244,7 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
     let is_running = place.systemd_runs() && UNITS.iter().all(|unit| place.is("is-active", unit));
     let is_enabled = UNITS.iter().all(|unit| place.is("is-enabled", unit));
     if is_changed && is_running {
-        // The lines that say what runs, and as which user.
+        // The settings that say what runs, and as which user.
         let key = |text: &str| {
             let keys = ["User=", "ExecStart=/"];
             let lines = text.lines();
@@ -390,7 +391,7 @@ impl Plan {
             self.run(place.systemctl(&["stop", UNITS[1]]));
             self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
         } else {
-            // The next rosrescue adopts the running master. Calls wait for some 0.2 s.
+            // This kills rosrescue, and the next rosrescue adopts the running master. Calls wait for some 0.2 s.
             self.run(place.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }
@@ -560,7 +561,7 @@ struct Service {
     listen: Vec<SocketAddr>,
     /// Whether the command is `core`, which starts the master itself.
     runs_rosmaster: bool,
-    /// Whether it must find rosmaster on the PATH.
+    /// Whether the service must find rosmaster on the PATH.
     searches_rosmaster: bool,
 }
 

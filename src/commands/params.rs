@@ -46,7 +46,7 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {
     Ok(Exit::Good)
 }
 
-/// The tree without hidden parameters. A masked value would be loaded as it is.
+/// The tree without hidden parameters, because `rosparam load` would load a masked value as the real one.
 fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -> Struct {
     let mut kept = Struct::new();
     for (key, value) in tree {

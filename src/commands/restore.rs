@@ -48,7 +48,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
             return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
         restored.failed = set(&params, &mut live).await?;
-        // If the master refused calls, its messages explain the rest.
+        // If the master refused calls, its messages explain what differs.
         if restored.failed.is_empty() {
             let now = live.state(&file.state).await?;
             let left = ParamChanges::between(file.state.params(), now.params(), args.exact);
@@ -178,7 +178,7 @@ struct Left {
     why: String,
 }
 
-/// The plan.
+/// Shows the plan.
 impl fmt::Display for Restored {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let plan = &self.plan;

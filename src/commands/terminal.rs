@@ -20,7 +20,8 @@ const USUAL: (usize, usize) = (80, 24);
 /// The terminal's original settings, until they are restored.
 static BEFORE: Mutex<Option<Termios>> = Mutex::new(None);
 
-/// A terminal in raw mode. Dropping this restores it, and so does a panic, before its message.
+/// A terminal in raw mode. Dropping this value restores the terminal. A panic also restores it, before the panic's
+/// message is printed.
 pub(super) struct Terminal(());
 
 impl Terminal {

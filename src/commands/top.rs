@@ -265,7 +265,7 @@ impl Ends {
 
 pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
-    // Before the terminal is taken over, so that an error is printed normally.
+    // The first status is read before the terminal is taken over, so that an error is printed normally.
     let mut status = running.status().await;
     if let Err(failure) = status {
         return Err(failure);

@@ -32,14 +32,14 @@ struct Verified {
     file: String,
     /// Whether the file is undamaged.
     whole: bool,
-    /// Whether everything recorded can be used, if necessary from the previous generation.
+    /// Whether everything recorded can be used, if necessary from the previous generation of the file.
     exact: bool,
-    /// Number of the usable snapshot's last record. `None` if no snapshot is usable.
+    /// Number of the last record that the usable snapshot includes. `None` if no snapshot is usable.
     snapshot: Option<u64>,
-    /// Number of usable records after it.
+    /// Number of usable records after the snapshot.
     records: usize,
     usable: Counts,
-    /// The reason, if the last append is incomplete.
+    /// Why the last record is incomplete. `None` if it is complete.
     torn: Option<String>,
     damage: Vec<String>,
 }

@@ -27,7 +27,7 @@ struct Waited {
     met: bool,
     /// The conditions that are not met yet.
     missing: Vec<String>,
-    /// Why they are not met.
+    /// Why the missing conditions are not met.
     why: Option<String>,
     seconds: f64,
 }

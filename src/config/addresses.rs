@@ -5,8 +5,8 @@ use std::net::{IpAddr, SocketAddr};
 use super::UsageError;
 use crate::ros_env::{self, Lookup};
 
-/// The announced host name or address. Unless the environment sets one, it is the only served address, because
-/// rosrescue listens at no other.
+/// The announced host name or address. The first of `listen` is announced if it is a single address and the environment
+/// sets no other, because rosrescue then listens only there.
 pub(super) fn advertised_host(
     listen: &[SocketAddr],
     env: Lookup<'_>,

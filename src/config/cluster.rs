@@ -31,7 +31,7 @@ pub struct ClusterConfig {
     pub advertised: MasterUri,
     /// How long the leader may be silent before another computer takes over.
     pub ttl: Duration,
-    /// When a write is answered.
+    /// When the leader answers a write.
     pub sync: ClusterSync,
     /// What to do with writes while this computer is cut off.
     pub alone: WhenCutOff,
@@ -206,7 +206,7 @@ fn is_on_loopback(endpoint: &str) -> bool {
     uri.is_ok_and(|uri| uri.host().is_some_and(is_loopback))
 }
 
-/// Parses `HOST`, which gets `port`, or `HOST:PORT`.
+/// Parses `HOST:PORT`, or `HOST`, to which it adds `port`.
 fn advertised(given: &str, port: u16) -> Result<MasterUri, ClusterError> {
     let given_host = match given.parse::<Ipv6Addr>() {
         Ok(address) => format!("[{address}]"),
@@ -279,7 +279,7 @@ mod tests {
             ("robot", "10.0.0.2", 11311, "robot-10.0.0.2"),
             ("robot", "10.0.0.2", 11312, "robot-10.0.0.2-11312"),
             ("robot", "fd00::2", 11311, "robot-fd00--2"),
-            // Other computers use that name to find it.
+            // Other computers use that name to find this computer.
             ("robot", "robot", 11311, "robot"),
             ("robot-0", "robot-0.fleet", 11311, "robot-0.fleet"),
             ("localhost", "10.0.0.1", 11311, "10.0.0.1"),

@@ -4,9 +4,9 @@ use super::Config;
 
 /// File descriptors reserved for nodes: health check and notifications open up to 320 at a time.
 const RESERVED: u64 = 320;
-/// Clients get one descriptor in four if there are few. The checkpoint, the connections to the
-/// master and its process take some 30 of the rest; health check and notifications share the others
-/// and retry.
+/// If the process may open only few files, clients get one descriptor in four. The checkpoint, the
+/// connections to the master and its process take some 30 of the rest; health check and
+/// notifications share the others and retry.
 const SHARE: u64 = 4;
 /// Client connections that are always allowed, unless fewer are configured.
 const FEWEST: u64 = 16;

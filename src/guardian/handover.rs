@@ -159,8 +159,8 @@ enum Giver {
     Guardian(u32),
 }
 
-/// Finds out which process passed the sockets, from the environment `env`. `None` if they are not meant for the process
-/// `own`, whose parent is `parent`.
+/// Finds out from the environment `env` which process passed the sockets. `own` is this process and `parent` its
+/// parent. `None` if the sockets are not meant for this process.
 fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     let number = |name: &str| env(name)?.parse::<u32>().ok();
     number(LISTEN_FDS).filter(|count| *count > 0)?;
@@ -176,7 +176,7 @@ pub fn restarts() -> u64 {
     restarts.and_then(|count| count.parse().ok()).unwrap_or(0)
 }
 
-/// Hides from a child process the variables that the guardian and systemd have set for its parent.
+/// Hides from a child process the variables that the guardian and systemd have set for rosrescue.
 pub fn keep_from(command: &mut Command) {
     for name in [
         LISTEN_FDS,

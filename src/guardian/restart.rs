@@ -6,11 +6,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// How many workers in a row may fail before they answer calls and still be replaced at once. Also the most deaths
-/// within [`SPAN`] that are not reported as repeated.
+/// Number of workers in a row that are replaced at once although they failed before they answered a call. Also the most
+/// deaths within [`SPAN`] that are not reported as repeated.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
-/// The first pause. Each following one is twice as long.
+/// The first pause. Each following pause is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
 /// The longest pause.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
@@ -68,12 +68,13 @@ pub struct Restarts {
     served: bool,
     /// The signal that asked rosrescue to stop.
     stop: Option<i32>,
-    /// Whether the present worker only has to end the processes that a killed one left running.
+    /// Whether the present worker only has to end the processes that a killed worker left running.
     cleaning: bool,
 }
 
 impl Restarts {
-    /// Notes a stop signal. From now on a worker is only started to end the processes that a killed one left running.
+    /// Notes a stop signal. From now on a worker is only started to end the processes that a killed worker left
+    /// running.
     pub fn stop(&mut self, signal: i32) {
         self.stop = Some(signal);
     }
@@ -210,8 +211,8 @@ mod tests {
         ] {
             assert_eq!(restarts.ended(end, true, now), NextStart::Exit(status));
         }
-        // The worker that was to stop has left its master running. So may its successor, but only
-        // once.
+        // The worker died while it stopped, so its master still runs. One more worker is started to
+        // end that master, but only one.
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(KILLED, true, now), NextStart::Exit(137));
         let mut restarts = Restarts::default();

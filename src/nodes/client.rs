@@ -55,7 +55,7 @@ pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
 pub(crate) struct Interview {
     pub sign: Reaction,
     pub pid: Option<i32>,
-    /// The topics that it publishes and subscribes to, if known.
+    /// The topics that the node publishes and subscribes to, if known.
     pub claims: Option<Claims>,
 }
 

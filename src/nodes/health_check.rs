@@ -51,7 +51,7 @@ pub(crate) struct CheckResult {
 }
 
 /// Completes a recovery from `outage`, in parallel with traffic: sends the missed notifications and asks all nodes.
-/// `None` if the next recovery begins before it is done.
+/// `None` if the next recovery begins before all nodes were asked.
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
@@ -244,7 +244,7 @@ struct Asked {
     unregistered: Vec<u64>,
 }
 
-/// What an answer means for the names at the address.
+/// What a node's answers mean for the names at its address.
 #[derive(Default)]
 struct Findings {
     others: Vec<RegisteredName>,
@@ -275,7 +275,7 @@ impl Asked {
         })
     }
 
-    /// The last calls of each name.
+    /// Each name with its last calls.
     fn calls(&self) -> impl Iterator<Item = (String, LastCalls)> {
         let calls = self.names.iter().zip(&self.unregistered);
         calls.map(|(name, unregistered)| {
@@ -287,7 +287,7 @@ impl Asked {
         })
     }
 
-    /// The findings about nodes that have registered nothing since the question.
+    /// What the answers in `interview` mean for the names that have registered nothing since the question.
     fn findings(&self, nodes: &Nodes, interview: &Interview) -> Findings {
         let api = self.api.as_str();
         let Interview { pid, claims, .. } = interview;
@@ -334,8 +334,8 @@ impl Asked {
     }
 }
 
-/// Whether the node at `api` names this rosrescue as its master. A node with another master may have meant its answers
-/// for that one. roscpp does not tell its master.
+/// Whether the node at `api` names this rosrescue as its master. If not, the node may have registered its topics at
+/// another master. False for roscpp nodes, which do not tell their master.
 async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     let limit = nodes.timeout;
     let Some(_admitted) = nodes.visits.admit(port_of(api), limit).await else {
@@ -354,7 +354,7 @@ async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     named.names(&own, &named_at, node_is_here, resolver::is_own)
 }
 
-/// The addresses of a host. `None` if it has no address within `limit`.
+/// The addresses of a host. Empty if none is found within `limit`.
 async fn addresses(at: &MasterUri, limit: Duration) -> Vec<IpAddr> {
     let found = tokio::time::timeout(limit, resolver::addresses(&at.host, at.port)).await;
     let found = found.ok().and_then(Result::ok).unwrap_or_default();
@@ -379,9 +379,9 @@ impl Findings {
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
-    /// Carries out the findings that are certain. The previous question must have found a removal as well. Removals
-    /// come first: a registration that rosrescue makes for a node counts as the node's own, and voids the other
-    /// findings about it.
+    /// Carries out the findings that are certain. A removal is certain only if the previous question led to it too.
+    /// Removals come first, because a registration that rosrescue makes for a node counts as the node's own, and voids
+    /// the other findings about that node.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.others {
             let mut earlier = before.others.iter();
@@ -427,7 +427,8 @@ async fn reconcile(
     call: Request,
     outcome: &mut CheckResult,
 ) {
-    // A multicall is never batched: an earlier call of its batch could make it displace a node.
+    // A multicall is never put into a batch. In a batch, the node could register at a new address just before this
+    // call. This call would then take the node's name away.
     let kind = call.kind();
     let alone = Request::multicall([call]);
     let reply = nodes.write_queue.call_if(alone, condition.clone()).await;
@@ -464,7 +465,7 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
 /// Unregisters a node as the node itself would. Does nothing if the node has come back since it was asked: its address
 /// has changed, or `same` rejects its last calls.
 async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
-    // The node's queued calls run before this.
+    // Lets the node's queued calls run first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(node);

@@ -21,7 +21,7 @@ pub(super) struct New(Mutex<BTreeMap<String, Vec<Name>>>);
 struct Name {
     node: String,
     api: String,
-    /// Number of its last registration.
+    /// Number of the name's last registration.
     registered: u64,
 }
 

@@ -43,7 +43,7 @@ pub(super) struct LivenessEvidence {
 #[derive(Debug, Default)]
 struct Known {
     liveness: health::Liveness,
-    /// For each port on this computer, its addresses.
+    /// For each port of a node on this computer, the addresses at which the node may listen.
     here: BTreeMap<String, Vec<SocketAddr>>,
 }
 
@@ -51,7 +51,7 @@ struct Known {
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub(crate) health: Health,
-    /// When there was evidence last. `None` if there never was.
+    /// Time of the latest evidence. `None` if there has been no evidence.
     pub(crate) checked: Option<Instant>,
 }
 
@@ -74,7 +74,7 @@ impl Nodes {
     /// Whether each registered node is alive, by name.
     pub(crate) fn lives(&self) -> BTreeMap<String, Life> {
         let now = Instant::now();
-        // The two locks must never be held together.
+        // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
         let nodes: Vec<_> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));

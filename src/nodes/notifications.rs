@@ -28,10 +28,10 @@ const AT_ONCE: usize = 64;
 /// Time after which a slow node no longer delays the next one. Living nodes answer within milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
 /// How long to wait for the answer of a node that never answers `paramUpdate` but answers other calls, like rosnodejs.
-/// The node only has to read the notification.
+/// That is long enough for the node to read the notification.
 const MUTE: Duration = Duration::from_millis(500);
-/// Maximum number of slow nodes whose answers are awaited in addition. There may be many on a computer that has
-/// vanished.
+/// Maximum number of slow nodes whose answers are awaited in addition to [`AT_ONCE`]. There may be many on a computer
+/// that has vanished.
 const SLOW: usize = 128;
 /// Pauses in seconds before each attempt to shut down a node that does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
@@ -52,7 +52,7 @@ impl Default for Notifications {
     }
 }
 
-/// Notifies every subscriber of `topic`. Returns whether there are any.
+/// Notifies every subscriber of `topic`. Returns whether there are subscribers.
 pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     let subscribers = nodes
         .ledger
@@ -163,8 +163,8 @@ async fn answers(nodes: &Nodes, port: &str) -> bool {
     client::ask(port, &master::get_pid(), nodes.timeout).await == Reaction::Alive
 }
 
-/// Asks a node to shut down because another one has taken its name, as a master does. If a different node listens at
-/// the address by now, that one is never shut down.
+/// Asks a node to shut down because another node has taken its name, as a master does. Does nothing if a different node
+/// listens at the address by now.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
     tokio::spawn(async move {

@@ -1,5 +1,5 @@
-//! Limits the questions to nodes, because any client can register any address: one at a time to each port, a bounded
-//! rate to each host, and a bounded number in all.
+//! Limits the questions to nodes, because any client can register any address. Each port gets one question at a time,
+//! each host gets questions at a bounded rate, and the total number at a time is bounded.
 
 use std::{
     collections::HashMap,

@@ -1,5 +1,5 @@
-//! Finds clients that bypass rosrescue and talk directly to the master of `proxy`. It reads the kernel's table of TCP
-//! sockets, and only reports them.
+//! Finds clients that bypass rosrescue and talk directly to the master of `proxy`. It finds them in the kernel's table
+//! of TCP sockets, and only reports them.
 
 use std::{
     collections::{BTreeMap, HashMap, HashSet},
@@ -39,10 +39,10 @@ pub(crate) enum Who {
     Process {
         name: String,
         pid: u32,
-        /// Start time, which identifies the process together with its id.
+        /// Start time. Together with the id it identifies the process.
         started: u64,
     },
-    /// A process of this user, which rosrescue may not inspect.
+    /// A process of the user with this id. rosrescue may not inspect it.
     User(u32),
     /// Another computer.
     Host(IpAddr),

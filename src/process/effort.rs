@@ -1,5 +1,5 @@
-//! Measures what the threads of a process do, and how much processor time they get (`proc_pid_task(5)`). It never needs
-//! the lock of the process's memory.
+//! Measures what the threads of a process do, and how much processor time they get (`proc_pid_task(5)`). This never
+//! needs the lock on the process's memory, so it does not wait for a busy process.
 
 use std::{fs, time::Duration};
 

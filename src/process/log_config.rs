@@ -13,8 +13,8 @@ use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 /// Environment variable that names the configuration file.
 pub(super) const VARIABLE: &str = "ROS_PYTHON_LOG_CONFIG_FILE";
 /// Logs to the file only. rosmaster's default configuration also has a handler for the screen,
-/// which imports half of rospy. Without it rosmaster starts in 72 ms instead of 132 ms, and
-/// master.log stays the same.
+/// which imports half of rospy. Without that handler rosmaster starts in 72 ms instead of 132 ms,
+/// and master.log stays the same.
 const TEXT: &str = "\
 # Written by rosrescue for the rosmaster that it supervises: as ROS's own, without the screen.
 [loggers]
@@ -41,7 +41,7 @@ pub(super) struct LogConfig(Arc<File>);
 
 impl LogConfig {
     /// Creates the file. `None` if the user has a configuration, or if the kernel does not support sealed files in
-    /// memory. Without it rosmaster only starts more slowly.
+    /// memory. Without the file rosmaster only starts more slowly.
     pub(super) fn unless_given() -> Option<Self> {
         match std::env::var_os(VARIABLE) {
             Some(given) if !given.is_empty() => None,
@@ -50,7 +50,7 @@ impl LogConfig {
     }
 
     fn new() -> io::Result<Self> {
-        // `exec` must not close it: a child opens it by its descriptor number in this process.
+        // `exec` must not close the file, because a child opens it by its descriptor number in this process.
         let file = memfd_create("rosmaster-logging.conf", MemfdFlags::ALLOW_SEALING)?;
         let mut file = File::from(file);
         file.write_all(TEXT.as_bytes())?;

@@ -19,7 +19,7 @@ use super::{Rosmaster, listeners, pid_file::Last, pidfd, runs, signal_process};
 /// Environment variable that names the checkpoint of the rosrescue that started the process.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
 
-/// The value of [`OWNER`] for processes of `checkpoint`.
+/// The value of [`OWNER`] in processes started by the rosrescue that uses `checkpoint`.
 pub(super) fn owner(checkpoint: &Path) -> OsString {
     let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
     // The checkpoint file may not exist yet.
@@ -78,9 +78,9 @@ impl Rosmaster {
     }
 }
 
-/// Chooses from `all` the process that listens at `port` or will listen there. A rosmaster that finds its port taken
-/// never listens. `is_told` says whether a process was given a port. If none of `all` listens, another process of
-/// `owner` may: a program given by `--rosmaster` may have started it.
+/// Chooses from `all` the process that listens at `port` or will listen there. `is_told` says whether a process was
+/// started with that port. If none of `all` listens, the listener may be another process of `owner`, because a program
+/// given by `--rosmaster` may have started the real rosmaster.
 fn choose(
     port: u16,
     all: &[u32],

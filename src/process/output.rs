@@ -31,7 +31,7 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// Whether the disk has not finished the last request. Until then it gets no other.
+    /// Whether the disk is still busy with the last request. Until the disk has finished, it gets no other request.
     asked: AtomicBool,
 }
 
@@ -99,7 +99,7 @@ impl Output {
         String::from_utf8_lossy(&tail).trim().to_owned()
     }
 
-    /// Runs `work` on the disk in another thread. `None` if that takes too long, or if earlier work has not ended.
+    /// Runs `work` on the disk in another thread. `None` if `work` takes too long, or if earlier work has not ended.
     async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         if self.shared.asked.swap(true, Ordering::AcqRel) {
             return None;

@@ -30,13 +30,13 @@ use crate::{
 
 /// Time limit for an injection. 1,000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
-/// Time limit for each step in which a late master catches up. Writes wait for it.
+/// Time limit for each step in which a late master catches up. Writes wait meanwhile.
 const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
 /// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 /// Time limit for calls of closed connections to end. A `setParam` of 60,000 keys takes some 10 s.
 const SETTLE_LIMIT: Duration = Duration::from_secs(60);
-/// Pause between two checks whether these calls have ended. No event reports their end.
+/// Pause between two checks whether calls of closed connections have ended. No event reports their end.
 const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a master could not be examined.
@@ -108,10 +108,11 @@ pub(crate) struct Manner {
 /// An injection that was prepared in advance.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// The mirror's version and the next token when it was prepared. `None` if it was not prepared in advance.
+    /// The mirror's version and the next token when this injection was prepared. `None` if it was not prepared in
+    /// advance.
     basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether it restores the mirror's complete state.
+    /// Whether this injection restores the mirror's complete state.
     complete: bool,
 }
 
@@ -244,7 +245,7 @@ impl Examiner {
     }
 
     /// Brings a late master, which has answered by now, up to date with the writes that the mirror has answered.
-    /// Returns whether it holds the mirror's state. Otherwise it must be examined.
+    /// Returns whether the master then holds the mirror's state. If not, the master must be examined.
     pub(super) async fn catch_up(&self) -> Result<bool, ExamineError> {
         let connect = self.upstream.connect();
         let mut connection = within(CATCH_UP_LIMIT, connect).await?;
@@ -288,14 +289,14 @@ impl Examiner {
             return Ok(());
         }
         match self.supervision {
-            // It is replaced, like a master that hangs.
+            // rosrescue replaces this master, as it replaces a master that hangs.
             Supervision::Ours => Err(ExamineError::Silent {
                 limit: SETTLE_LIMIT,
             }),
             Supervision::Theirs => {
                 rarely!(
                     warn,
-                    "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or it does not close its connections; what these calls still change may be lost. Restart the master if this happens again"
+                    "the master may still be running calls of closed connections after {SETTLE_LIMIT:?}; changes that these calls still make may be lost. Restart the master if this happens again"
                 );
                 Ok(())
             }
@@ -334,7 +335,7 @@ impl Examiner {
         };
         examination.look = start.elapsed();
         // From here until the gate opens the mirror must not change, because the master is compared
-        // with it.
+        // with the mirror.
         self.gate.set(State::Injecting);
         let Basis {
             mirror,
@@ -388,7 +389,8 @@ impl Examiner {
             say_difference(&self.ledger.adopt(state.clone()));
         }
         if bears == Bears::Nothing {
-            // A master that was only late finishes its notifications.
+            // This master has no token of ours, so the previous master is gone and sends no more notifications. A
+            // master that was only late finishes its own.
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
         let token = self.ledger.succeed();
@@ -490,8 +492,8 @@ impl Examiner {
     }
 }
 
-/// Whether a master has answered as planned. The reply is long and calls are waiting, so it is decoded only if its
-/// bytes differ from the prediction.
+/// Whether a master has answered as planned. Decodes the reply only if its bytes differ from the prediction, because
+/// the reply is long and calls are waiting.
 fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
     Ok(match raw.body == plan.answer() {
         true => Ok(()),
@@ -500,7 +502,7 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, Exami
     })
 }
 
-/// Like [`sockets::may_run_a_call`], without blocking the runtime: with 15,000 sockets it takes 100 ms.
+/// Runs [`sockets::may_run_a_call`] in another thread, because with 15,000 sockets it takes 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
@@ -529,7 +531,7 @@ fn say_older(difference: &[String]) {
         rarely!(
             warn,
             ?difference,
-            "the master's state is newer than the checkpoint, so it is kept: the disk was full, the checkpoint is an old copy, or the master was changed directly"
+            "the master's state is newer than the checkpoint, so it is kept; possible reasons: the disk was full, the checkpoint is an old copy, or the master was changed directly"
         );
     }
 }

@@ -25,7 +25,8 @@ pub(crate) struct MasterProcess {
     port: Option<u16>,
     /// Process id of the child, or of the master that an earlier rosrescue left running. Set until its end is reported.
     current: Option<u32>,
-    /// A master that an earlier rosrescue had just started. It has no state, and is used instead of a new one.
+    /// Process id of a master that an earlier rosrescue had just started. It has no state, so it is used instead of a
+    /// new master.
     starting: Option<u32>,
     /// Process id of a new child until it is called for the first time.
     new: Option<i32>,
@@ -100,7 +101,7 @@ impl MasterProcess {
         upstream: &Upstream,
     ) -> Result<(), ProcessError> {
         let pid = match self.starting.take() {
-            // The upstream has its address from the checkpoint.
+            // `upstream` already has this master's address, from the checkpoint.
             Some(pid) => pid,
             None => self.start(ledger, upstream).await?,
         };

@@ -82,13 +82,13 @@ fn write(checkpoint: &Path, kept: &ReportRecord) -> io::Result<()> {
         env!("CARGO_PKG_VERSION")
     )?;
     let mut others = files(checkpoint)?;
-    // This report stays in any case. If the clock was set back, it would count as the oldest.
+    // The new report always stays. If the clock was set back, its name would make it the oldest.
     others.retain(|other| *other != path);
     let surplus = (others.len() + 1).saturating_sub(KEPT);
     others.iter().take(surplus).try_for_each(fs::remove_file)
 }
 
-/// The prefix of the names of these files.
+/// The prefix of the names of report files.
 fn prefix(checkpoint: &Path) -> Option<String> {
     Some(format!(
         "{}.report-",
@@ -96,7 +96,7 @@ fn prefix(checkpoint: &Path) -> Option<String> {
     ))
 }
 
-/// The files of reports, by their dates.
+/// The report files, sorted by the dates in their names.
 fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(Vec::new());
@@ -151,7 +151,8 @@ pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64)
             report,
             ..
         } = kept;
-        // In a crash loop not every rescue has a report. The next report's total includes it.
+        // In a crash loop not every rescue has a report. The total in the next report also counts rescues without a
+        // report.
         earlier.rescues = earlier.rescues.max(rescues);
         earlier.deaths = earlier.deaths.max(deaths);
         let restarts = worker_restarts + u64::from(died);

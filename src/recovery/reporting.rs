@@ -99,11 +99,11 @@ impl Outage {
     }
 }
 
-/// The last repeated message.
+/// The last message of [`Driver::log_once`].
 pub(super) struct LastMessage {
     text: String,
     pause: Duration,
-    /// When it may be logged again.
+    /// When the message may be logged again.
     next: Instant,
 }
 
@@ -120,7 +120,7 @@ impl Driver {
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.ended.is_some() && quiet.contains(&cause) {
-            // The first sign was part of the process's end.
+            // What was noticed first, such as a closed connection, was part of the end of the master's process.
             report.cause = Cause::Exited.as_str().into();
         }
         if report.outcome == RecoveryOutcome::Resumed && quiet.contains(&cause) {

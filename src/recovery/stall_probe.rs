@@ -7,8 +7,8 @@ use crate::master;
 
 impl Examiner {
     /// Probes the master over separate connections until enough probes in a row are unanswered for it to count as hung.
-    /// Returns how long it has been silent. rosmaster serves each connection in a thread of its own, so a busy master
-    /// still answers.
+    /// Returns how long the master has been silent. rosmaster serves each connection in a thread of its own, so a busy
+    /// master still answers.
     pub(super) async fn silence(&self) -> Duration {
         let (probing, patience) = (self.probing, self.probe_timeout);
         let sign_of_life = master::get_pid();

@@ -18,8 +18,8 @@ const WATCHED: usize = 2;
 /// or later.
 const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits());
 
-/// Completes when one of the oldest threads of the process `pid` has ended. In rosmaster these live as long as the
-/// process. The first thread is not watched, because Linux reports its end only with that of the process.
+/// Completes when one of the oldest threads of the process `pid` has ended. In rosmaster the oldest threads live as
+/// long as the process. The first thread is not watched, because Linux reports its end only with that of the process.
 ///
 /// # Errors
 ///
@@ -51,7 +51,7 @@ mod tests {
 
     use super::*;
 
-    /// A program that starts threads and says so. When it reads a line, it ends one of them or itself.
+    /// A program that starts threads and says so. When it reads a line, it ends one of its threads or itself.
     const PROGRAM: &str = "
 import sys, threading, time
 end = threading.Event()

@@ -15,7 +15,8 @@ use crate::master::Kind;
 
 /// Pause between two log lines about the same address. A refused node calls again up to 20 times per second.
 const SAY_AGAIN: Duration = Duration::from_secs(60);
-/// Maximum number of addresses that are remembered for that. Calls from further addresses are counted but not logged.
+/// Maximum number of addresses whose last log line is remembered. Calls from further addresses are counted but not
+/// logged.
 const REMEMBERED: usize = 1000;
 
 /// The networks of `--allow` and `--allow-write`. An empty list allows all clients.
@@ -63,8 +64,8 @@ impl Grant {
         }
     }
 
-    /// Accepts or refuses a call of this kind. The kind is `None` if the call could not be decoded. A call that only
-    /// the master understands may make any change.
+    /// Accepts or refuses a call of this kind. The kind is `None` if the call could not be decoded. Such a call, and a
+    /// call of an unknown kind, counts as a change, because only the master knows what it does.
     pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Rejection> {
         match (self, kind) {
             (Self::Write, _) | (Self::Read, Some(Kind::Read | Kind::Identity)) => Ok(()),
@@ -121,7 +122,7 @@ impl fmt::Display for AccessRules {
     }
 }
 
-/// When each address was last logged.
+/// When a refusal of each address was last logged.
 #[derive(Debug, Default)]
 pub(crate) struct LastLogged(HashMap<IpAddr, Instant>);
 

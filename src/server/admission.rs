@@ -30,8 +30,9 @@ const BROWSER_TYPES: [&str; 3] = [
 
 /// Whether a POST with these headers may call the master. `names` are the names of this computer.
 ///
-/// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client
-/// does. The content type may be missing, as in a browser's POST of a typed array.
+/// A browser sends the page's origin with every POST, or `null` if it hides the origin. No ROS
+/// client sends an origin. The content type may be missing, as in a browser's POST of a typed
+/// array.
 pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
@@ -56,8 +57,8 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     Ok(())
 }
 
-/// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but such a
-/// page could occupy `/events`, which allows few connections.
+/// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but a page
+/// of another site could occupy `/events`, which allows few connections.
 pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     check_host(headers, names)?;
     check_origin(headers)

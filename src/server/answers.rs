@@ -1,4 +1,4 @@
-//! Limits the memory of large answers that are being sent, and closes slow readers when it is used up.
+//! Limits the memory of large answers that are being sent, and closes slow readers when the memory is used up.
 
 use std::{
     collections::HashMap,
@@ -19,10 +19,11 @@ use super::{body::SMALL, replies::HttpReply};
 /// Minimum rate at which a client must read a large answer, in bytes per second. A slower client is closed when other
 /// answers need its memory.
 const RATE: u32 = 256 << 10;
-/// Maximum credit that a client gains by reading faster than [`RATE`]. After a pause of this length it counts as slow.
+/// Maximum credit that a client gains by reading faster than [`RATE`]. A client that pauses for this long counts as
+/// slow.
 const AHEAD: Duration = Duration::from_millis(250);
-/// Maximum number of answers that may wait for memory although they are already encoded. They go before those that are
-/// not, so that few answers must be encoded twice.
+/// Maximum number of answers that may wait for memory although they are already encoded. They get memory before answers
+/// that are not encoded yet. Therefore only a few answers must be dropped and encoded again.
 const WAITING: usize = 4;
 
 /// Tracks how fast one connection reads its large answers.
@@ -30,7 +31,7 @@ const WAITING: usize = 4;
 pub(crate) struct Reader {
     /// Until when the reader counts as fast enough.
     fast_until: Mutex<Instant>,
-    /// Whether it has had a large answer.
+    /// Whether the client has been sent a large answer.
     counts: AtomicBool,
     close: Notify,
     /// Whether the connection was told to close and is still open.
@@ -69,18 +70,19 @@ impl Reader {
         self.told.store(false, Ordering::Relaxed);
     }
 
-    /// Whether the client is too slow. Try to write once more before asking, because rosrescue itself may have been
-    /// busy.
+    /// Whether the client is too slow. The caller should first try to write once more, because rosrescue itself may
+    /// have been busy.
     pub(crate) fn is_slow(&self) -> bool {
         *self.fast_until() <= Instant::now()
     }
 }
 
-/// Until when a reader counts as fast enough, after it has read `bytes` at `now` and counted so until `before`.
+/// Until when a reader counts as fast enough, if it has read `bytes` at `now` and counted as fast enough until
+/// `before`.
 fn fast_until(before: Instant, now: Instant, bytes: usize) -> Instant {
     let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
     let earned = Duration::from_secs(1) * bytes / RATE;
-    // A debt remains, so reading a single byte from time to time is not enough.
+    // The result may still be in the past, so a client that reads a single byte from time to time stays slow.
     (before + earned).min(now + AHEAD)
 }
 
@@ -216,7 +218,7 @@ impl Answers {
             reader.told.store(true, Ordering::Relaxed);
             reader.close.notify_one();
         }
-        // If that does not free enough, the next connection is closed.
+        // If this connection does not free enough memory, the next one is closed.
         now + Duration::from_millis(1)
     }
 

@@ -84,7 +84,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// Like [`grow`](Self::grow), but fails after the time that a body of `longest` bytes may take.
+    /// Waits until `bytes` in total are reserved. Fails after the time that a body of `longest` bytes may take.
     async fn grow_in_time(&mut self, bytes: usize, longest: usize) -> Result<(), BodyError> {
         let grown = timeout(time_for(longest), self.grow(bytes)).await;
         grown.map_err(|_| BodyError::NoRoom)
@@ -130,7 +130,7 @@ pub(crate) async fn read(
             let size = (2 * length).min(most);
             let waits = Instant::now();
             room.grow_in_time(size, most).await?;
-            // This wait is not the client's fault.
+            // The client is not charged for this wait.
             start += waits.elapsed();
             whole.reserve_exact(size.saturating_sub(whole.len()));
         }

@@ -38,18 +38,18 @@ use crate::{
     xmlrpc::{self, ListWriter, Reply, Value},
 };
 
-/// The connection is closed without an answer, so the node calls again. An error made up by rosrescue would cost the
-/// node its registration, or end the node.
+/// A call is not answered, and its connection is closed, so that the node calls again. An error made up by rosrescue
+/// would cost the node its registration, or end the node.
 #[derive(Debug, Error)]
 #[error("closed without an answer: {0}")]
 pub(crate) struct Closed(pub(super) &'static str);
 
-/// Time after which the mirror answers in place of the master, if it is exact. A rosmaster answers within a
-/// millisecond, or within some ten behind a call that keeps its interpreter busy.
+/// Time after which the mirror answers in place of a master that has not answered. A rosmaster answers within a
+/// millisecond, or within some ten milliseconds if another call keeps its Python interpreter busy.
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
 /// Values larger than this, in bytes, take more than a millisecond to encode.
 const LARGE: usize = 64 << 10;
-/// Largest answer that is kept, in bytes.
+/// Largest encoded answer that is kept for the next call, in bytes.
 const KEPT_MOST: usize = 16 << 20;
 /// The reason if a write is not answered.
 const UNANSWERED: &str = "the master did not answer";
@@ -145,7 +145,8 @@ impl Calls {
         }
     }
 
-    /// Like [`Self::answer`], if this computer has the master.
+    /// Answers a call on the computer that has the master. An error means that another computer has the master now, or
+    /// that there is no answer.
     pub(super) async fn answer_here(
         &self,
         head: Head,
@@ -222,7 +223,8 @@ impl Calls {
         Some(reply)
     }
 
-    /// The mirror's answer to a parameter subscription that is there already, while another computer has the master.
+    /// The mirror's answer to a `subscribeParam` whose subscription already exists, while another computer has the
+    /// master.
     pub(super) async fn stand_in_for_subscribed(&self, call: &Request) -> Option<HttpReply> {
         let reply = self
             .encode(|| self.ledger.answer_if_subscribed(call))
@@ -231,7 +233,7 @@ impl Calls {
         Some(reply)
     }
 
-    /// Encodes what `answer` gives. None if a master cannot marshal it.
+    /// Encodes the reply that `answer` returns. `None` if there is no reply, or if XML-RPC cannot express it.
     ///
     /// An answer that takes milliseconds is encoded outside of the runtime, one at a time. Equal answers in a row are
     /// encoded once. Values share memory, so comparing them is quick.
@@ -243,7 +245,7 @@ impl Calls {
         if !value.is_larger_than(LARGE) {
             return Some(encoded(xmlrpc::encode_result(&value).ok()?));
         }
-        // A waiting call must not hold a copy.
+        // A call that waits for its turn must not keep the large value in memory.
         drop(value);
         let mut last = self.last_large.lock().await;
         let value = match answer()? {
@@ -282,7 +284,7 @@ impl Calls {
     }
 
     /// Begins the answer to a read. Waits until the master has answered the calls that may notify the caller. Does not
-    /// wait for a late master, whose notifications are repeated later.
+    /// wait for a late master, because its notifications are repeated later.
     async fn begin_read(&self, read: Option<&Request>) -> Option<Delivery> {
         let mut changed = self.ledger.order_changed();
         let patience = self.patience();
@@ -301,7 +303,8 @@ impl Calls {
         }
     }
 
-    /// Like [`Self::read`], after the answer was begun. `known` is the call, if the mirror may answer it.
+    /// Does the work of [`Self::read`] after [`Self::begin_read`]. `known` is the decoded call; `None` if the mirror
+    /// must not answer it.
     async fn read_in_order(
         &self,
         head: Head,
@@ -318,8 +321,8 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // A mirror in doubt waits until probes have judged the master. A late master may know more methods
-                    // than rosmaster.
+                    // While the mirror may be outdated, it does not answer for a late master. Nor does it answer a call
+                    // of an unknown method, which that master may know.
                     let is_late =
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);
@@ -338,7 +341,7 @@ impl Calls {
                         Err(_) => {
                             self.slow.notify_one();
                             if let Some(reply) = self.stand_in(known_now).await {
-                                // When this read ends, the master answers again.
+                                // The read continues, because its end shows that the master answers again.
                                 let pool = self.pool.clone();
                                 tokio::spawn(async move {
                                     let _stalled = pool.stalled();
@@ -407,8 +410,8 @@ impl Calls {
         for part in parts {
             let part = Arc::new(part);
             let body = xmlrpc::encode_call(&Request::clone(&part).into());
-            // No node is notified of a subject and also writes about it in that many calls at once, so each part's
-            // answer counts as written when it arrives.
+            // Each part's answer counts as written when it arrives. That is safe, because no node makes so many calls
+            // at once about something of which it is also notified.
             let (answer, delivery) = self
                 .queue(
                     head.clone(),
@@ -450,7 +453,7 @@ impl Calls {
     }
 
     /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection, or while
-    /// the master takes too long, the mirror answers it only if it changes nothing.
+    /// the master takes too long, the mirror answers only a write that changes nothing.
     async fn queue(
         &self,
         head: Head,
@@ -489,7 +492,7 @@ impl Calls {
                 }
                 () = &mut patience, if patient => {
                     if !self.gate.is_open() {
-                        // The gate may open to a master that hangs.
+                        // The gate may open later, and the master behind it may hang.
                         patience.as_mut().reset(tokio::time::Instant::now() + PATIENCE);
                         continue;
                     }
@@ -520,7 +523,7 @@ impl Calls {
     ) -> Option<(Reply, Option<Delivery>)> {
         let call = call.filter(|call| call.is_answerable())?;
         let (reply, mark, delivery) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
-        // The write that made this one redundant may not be safe yet.
+        // The write that made this one redundant may not be recorded yet.
         if let Some(mark) = self.ledger.to_await(mark)
             && !self.ledger.durable(mark).await
         {

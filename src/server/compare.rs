@@ -33,8 +33,8 @@ impl Comparisons {
 }
 
 impl Calls {
-    /// The mirror's version if `read` is `getSystemState` and no write to the master is unanswered. `None` if answer
-    /// and mirror cannot be compared.
+    /// The mirror's version if `read` is `getSystemState` and no write to the master is unanswered. Otherwise `None`,
+    /// because answer and mirror cannot be compared.
     pub(super) fn comparable(&self, read: Option<&Request>) -> Option<u64> {
         let shows_graph = read.is_some_and(|read| *read.method() == Method::GetSystemState);
         (shows_graph && self.write_queue.unanswered_since().is_none())

@@ -10,8 +10,8 @@ use std::{
 
 use tokio::sync::Notify;
 
-/// Maximum number of idle connections, even if many more connections are allowed. Each takes some 16 KB, or 40 KB after
-/// a large body.
+/// Maximum number of idle connections, even if many more connections are allowed. Each connection takes some 16 KB, or
+/// 40 KB after a large body.
 const MOST: usize = 2000;
 
 #[derive(Debug)]

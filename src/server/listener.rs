@@ -190,7 +190,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let close = Arc::new(Notify::new());
     let timed = Timed::new(stream, deadlines.clone(), &here.idle, close.clone());
     let service = |request| {
-        // Boxed, so that idle connections hold no memory for it.
+        // The future is boxed, so that idle connections hold no memory for it.
         Box::pin(service::serve(
             server.clone(),
             peer,

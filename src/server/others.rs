@@ -73,7 +73,8 @@ pub(crate) struct Others {
 /// rosrescue's own method by which a follower tells the leader that it has passed an answer on to its caller.
 const PASSED_ON: &str = "rosrescue/passedOn";
 
-/// Answers on their way through followers to callers. Each keeps something until it has been written there.
+/// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
+/// the answer, because some notifications must wait for that.
 #[derive(Default)]
 pub(crate) struct Passing(Mutex<Passed>);
 
@@ -96,7 +97,7 @@ impl Passing {
     }
 
     /// Keeps `held`, which must not be dropped before the caller has the answer. Returns the answer's number, for
-    /// [`Self::end`]. A follower that stays silent delays others no longer than a client that does not read.
+    /// [`Self::end`]. Drops values that are older than [`ANSWER_LIMIT`], because their followers may have died.
     fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
@@ -206,7 +207,8 @@ impl Others {
         let mut sent = false;
         let mut unanswered = None;
         loop {
-            // The leader that ran this deletion died before its answer, and the next leader would refuse it.
+            // A leader has run this deletion but died before its answer. The next leader would refuse to delete the
+            // parameter again.
             if sent && deletes.is_some() && call.deletes().is_none() {
                 return Ok(deleted(deletes.as_deref().unwrap_or_default()));
             }
@@ -244,8 +246,8 @@ impl Others {
                     };
                     let answered = tokio::select! {
                         biased;
-                        // A cut-off computer answers only its own nodes. The computer that forwarded this call may
-                        // not be cut off, and may be about to lead.
+                        // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
+                        // be cut off, and may become the next leader.
                         _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, source) => answered,
                     };
@@ -268,7 +270,7 @@ impl Others {
                     let uri = MasterUri::parse(&uri).map_err(|_| Closed(NO_ADDRESS))?;
                     let leader = self.peers.at(&uri);
                     if call.hands_over().is_some() {
-                        // The request is sent only once: after a failure, the next leader would hand over as well.
+                        // The request is sent only once, because after a failure the next leader would hand over too.
                         let silent = || handed_over(Err("the leader does not answer".to_owned()));
                         return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
                     }
@@ -284,7 +286,7 @@ impl Others {
                             Some(reply) => return Ok(reply),
                             None => Some(Instant::now() + RETRY_PAUSE),
                         },
-                        // Its answer would never come, or no longer counts.
+                        // When the leader changes, the old leader's answer never comes or no longer counts.
                         _ = standing.changed(), if call.kind != Kind::Read => continue,
                     }
                 }
@@ -372,7 +374,8 @@ impl Call<'_> {
         is_it.then(|| call.text(1)?.parse().ok()).flatten()
     }
 
-    /// Passes the leader's answer on to the caller. From now on this computer's nodes know what it says.
+    /// Passes the leader's answer on to the caller. Notes the answer's place in the journal: from now on the mirror
+    /// answers here only if it has reached that place.
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
@@ -396,7 +399,7 @@ impl Call<'_> {
         reply
     }
 
-    /// The leader's answer. For a slow read, the mirror's answer. `None` if there is no answer now.
+    /// The leader's answer, or the mirror's if the leader is slow to answer a read. `None` if neither can answer now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
         if self.kind != Kind::Read && !self.is_subscribed() {
             return match leader.forward(term, &self.head, &self.body).await {
@@ -412,7 +415,8 @@ impl Call<'_> {
         {
             return Some(reply);
         }
-        // The request continues after the mirror has answered: the next answer in time shows that the leader is back.
+        // The request continues after the mirror has answered, because the leader's next answer in time shows that it
+        // is back.
         let mut asked = {
             let (leader, head, body) = (leader.clone(), self.head.clone(), self.body.clone());
             tokio::spawn(async move { leader.forward(term, &head, &body).await })
@@ -453,15 +457,15 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// Whether this is a parameter subscription that exists already. Nodes repeat it each time they log, and must not
-    /// wait for a takeover.
+    /// Whether the call is a `subscribeParam` whose subscription already exists. Nodes repeat such calls whenever they
+    /// log, and must not wait for a takeover.
     fn is_subscribed(&self) -> bool {
         let call = self.call.as_ref();
         call.is_some_and(|call| self.calls.ledger.answer_if_subscribed(call).is_some())
     }
 
-    /// The mirror's answer to a read or to an existing subscription. `None` for any other call, and `None` as long as
-    /// the mirror is behind the leader's earlier answers, so that no read goes back in time on one computer.
+    /// The mirror's answer to a read or to a repeated `subscribeParam`. `None` for any other call. Also `None` while
+    /// the mirror is behind the leader's earlier answers, so that no later read shows an older state.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let call = self.call.as_ref()?;
         let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
@@ -474,7 +478,7 @@ impl Call<'_> {
         }
     }
 
-    /// Waits until the mirror has caught up, then does as [`Self::by_mirror`].
+    /// Waits until the mirror has reached the leader's earlier answers, then answers as [`Self::by_mirror`] does.
     async fn by_mirror_when_fresh(&self) -> Option<HttpReply> {
         if self.kind != Kind::Read && !self.is_subscribed() {
             return None;

@@ -2,7 +2,7 @@
 //!
 //! | path | answer |
 //! |---|---|
-//! | `/` | the page for a browser, the status as text for anybody else |
+//! | `/` | the page for a browser, the status as text for other clients |
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
 //! | `/state.json` | nodes, topics, services and parameters |
 //! | `/events` | what changes, as it happens |
@@ -205,7 +205,7 @@ impl Asked {
 #[derive(Debug, Serialize)]
 struct WholeState {
     schema: u32,
-    /// The same version number as in the events.
+    /// Version of the state, as in the events of `/events`.
     version: u64,
     registrations: u64,
     /// Numbers of registered items. The lists may be shorter.
@@ -223,7 +223,7 @@ struct Totals {
 }
 
 async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
-    // Never closed.
+    // The semaphore is never closed.
     let _turn = server.pages.state.reading.acquire().await;
     let server = server.clone();
     let work = move || {

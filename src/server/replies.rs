@@ -153,7 +153,7 @@ pub(super) fn page(status: StatusCode, kind: &'static str, content: impl Into<By
     http
 }
 
-/// Like [`page`], in plain text.
+/// A plain-text reply that is not XML-RPC.
 pub(super) fn text(status: StatusCode, text: String) -> HttpReply {
     page(status, "text/plain; charset=utf-8", text)
 }

@@ -35,7 +35,7 @@ use crate::{
 /// and the call may be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and accepts such requests only from the master's own computer; send XML-RPC in UTF-8, without a document type";
 
-/// The reason if other large answers are waiting and this one cannot be made again.
+/// The reason if a large answer finds no memory and cannot be made again later.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
 /// How often an answer is made again because it has grown.
 const ATTEMPTS: u32 = 4;
@@ -116,7 +116,7 @@ async fn post(
             .filter(|name| !name.as_bytes().eq_ignore_ascii_case(b"identity"))
             .cloned(),
     };
-    // Reserved until the call is answered.
+    // The memory stays reserved until the call is answered.
     let mut room = Room::of(&server.bodies);
     let read = async {
         let limit = server.max_body;
@@ -219,7 +219,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// Like [`refuse`], but logs each address at most once a minute, because nodes call again and again.
+/// Refuses a request, and logs each address at most once a minute, because a refused node calls again and again.
 fn keep_out(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     let mut said = server
         .refused

@@ -10,7 +10,7 @@ pub struct ClusterFacts {
     /// This computer's name.
     pub name: String,
     pub role: Role,
-    /// Since when it has this role.
+    /// Since when this computer has this role.
     pub since: Instant,
     /// The present leader as far as this computer knows. If there is none, the last one.
     pub leader: Option<LeaderFacts>,
@@ -55,9 +55,10 @@ pub struct MemberFacts {
     pub uri: String,
     pub version: String,
     pub role: Role,
-    /// The last journal record in its mirror.
+    /// The last journal record in the described computer's mirror.
     pub seq: u64,
-    /// When this computer last heard from it. `None` if it has not, since this rosrescue started.
+    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
+    /// started.
     pub heard: Option<Instant>,
 }
 

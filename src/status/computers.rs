@@ -13,11 +13,11 @@ pub(crate) struct Computers {
     /// This computer's name.
     pub(crate) name: String,
     pub(crate) role: Role,
-    /// Since when it has this role.
+    /// Since when this computer has this role.
     pub(crate) since: f64,
     /// The present leader. If there is none, the last one.
     pub(crate) leader: Option<LeaderStatus>,
-    /// Since when there is no leader. `None` if there is one.
+    /// Since when there is no leader. `None` if there is a leader.
     pub(crate) leaderless_since: Option<f64>,
     /// The last journal record that this computer knows of.
     pub(crate) seq: u64,
@@ -62,12 +62,12 @@ pub(crate) struct Computer {
     pub(crate) uri: String,
     pub(crate) version: String,
     pub(crate) role: Role,
-    /// Number of journal records that its mirror lacks.
+    /// Number of journal records that the described computer's mirror lacks.
     pub(crate) behind: u64,
-    /// When this computer last heard from it. `None` for this computer itself, and if it has not, since this rosrescue
-    /// started.
+    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
+    /// started, and for this computer itself.
     pub(crate) heard: Option<f64>,
-    /// Whether it has been silent for 15 s.
+    /// Whether the described computer has been silent for 15 s.
     pub(crate) away: bool,
 }
 
@@ -250,7 +250,7 @@ impl Computers {
         if self.lost_writes > 0 {
             writeln!(
                 f,
-                "lost        {} of the changes made while cut off: others had changed the same. The log lists them",
+                "lost        {} of the changes made while cut off: others had changed the same data. The log lists them",
                 self.lost_writes
             )?;
         }
@@ -347,7 +347,7 @@ mod tests {
                 "etcd        NO ANSWER since THEN: no majority",
                 "not in etcd 3 changes made here",
                 "takeover    THEN from pc-3, took 2.04 s; 2 by this computer so far",
-                "lost        1 of the changes made while cut off: others had changed the same. The log lists them",
+                "lost        1 of the changes made while cut off: others had changed the same data. The log lists them",
             ]
         );
     }

@@ -122,7 +122,7 @@ pub(crate) struct Situation {
     pub(crate) gate: State,
     /// When the gate last opened or shut.
     pub(crate) gate_since: Instant,
-    /// Why changes are not recorded. `None` if they are.
+    /// Why changes are not recorded. `None` if they are recorded.
     pub(crate) unprotected: Option<String>,
     pub(crate) master: String,
 }

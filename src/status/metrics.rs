@@ -75,7 +75,7 @@ fn add_cluster(text: &mut String, of: &Computers) {
         ("cluster_computers_away", "computers that have not been heard from for 15 s", Some(away as f64)),
         ("cluster_takeovers_total", "takeovers by this computer", Some(of.takeovers as f64)),
         ("cluster_last_takeover_seconds", "duration of the last takeover, from the last sign of the previous leader to the first write answered here", last.map(|last| last.seconds)),
-        ("cluster_lost_writes_total", "changes made while cut off that were lost, because others had changed the same", Some(of.lost_writes as f64)),
+        ("cluster_lost_writes_total", "changes made while cut off that were lost, because others had changed the same data", Some(of.lost_writes as f64)),
     ];
     for (name, help, value) in values {
         if let Some(value) = value {

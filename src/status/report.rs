@@ -36,7 +36,7 @@ pub enum RecoveryOutcome {
 }
 
 impl RecoveryOutcome {
-    /// Whether the master is a new incarnation.
+    /// Whether the present master counts as a new incarnation. False if the same master as before continues.
     pub fn is_new(self) -> bool {
         !matches!(self, Self::Reconciled | Self::Resumed)
     }
@@ -96,7 +96,7 @@ pub struct Report {
     pub health_check_ms: Option<f64>,
     /// Number of items of each kind that the master holds now.
     pub restored: Counts,
-    /// What could not be given to the master, and why.
+    /// Parts of the state that could not be given to the master, with the reasons.
     pub not_restored: Vec<String>,
     /// Differences between what the master was given and what was read back. This list should be
     /// empty.

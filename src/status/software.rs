@@ -1,7 +1,7 @@
 //! HTTP and Python versions of a master, and what follows from them.
 
-/// Describes HTTP version and Python version of a master for people. Whether the master keeps connections open gives
-/// the HTTP version. Its `Server` header gives the Python version.
+/// Describes HTTP version and Python version of a master for people. The HTTP version follows from whether the master
+/// keeps connections open, the Python version from its `Server` header.
 pub(crate) fn speaks(keeps_alive: bool, server: Option<&str>) -> String {
     let http = match keeps_alive {
         true => "HTTP/1.1",

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A counter that only grows.
+/// A count of events. It only grows.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 

@@ -98,7 +98,7 @@ pub(crate) struct Status {
     #[serde(default)]
     pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
-    /// Why the state is not recorded. `None` if it is.
+    /// Why the state is not recorded. `None` if it is recorded.
     pub(crate) unprotected: Option<String>,
     pub(crate) journal: JournalStatus,
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
@@ -121,7 +121,7 @@ pub(crate) struct Status {
     pub(crate) recoveries: u64,
     /// Report of the last recovery.
     pub(crate) last_recovery: Option<Report>,
-    /// Number of rescues in this session. The reports of the last 20 follow, oldest first.
+    /// Number of rescues in this session. `last_rescues` has the reports of the last 20, oldest first.
     pub(crate) rescues: u64,
     pub(crate) last_rescues: Vec<Report>,
     /// Calls per second between the last two requests for the status that were at least a second

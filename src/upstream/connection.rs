@@ -32,13 +32,13 @@ use crate::{
 /// Size in bytes from which a reply takes more than a millisecond to decode.
 const LONG: usize = 256 << 10;
 
-/// The hyper object that sends and receives.
+/// The hyper object that sends and receives on the connection.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A connection to the master, for one call at a time.
 ///
-/// The caller's task drives it: another task would have to be woken twice for each call. So its end is not noticed
-/// between two calls; [`Self::is_closed`] checks for it.
+/// The caller's task drives the connection, because another task would have to be woken twice for each call. So an end
+/// of the connection between two calls goes unnoticed; [`Self::is_closed`] checks for it.
 ///
 /// If the server closes the connection after one answer, as HTTP/1.0 servers do, the next call gets a new connection.
 /// Another process may listen there by then.
@@ -56,8 +56,8 @@ pub struct Connection {
     server: Option<HeaderValue>,
 }
 
-/// The connection that the caller drives. `None` if it has ended. Dropping it also ends the count of connections for
-/// writes.
+/// The connection that the caller drives, with the [`Writer`] that counts it if it is for writes. `None` if the
+/// connection has ended.
 #[derive(Debug)]
 struct Drive(Option<(Box<Driver>, Option<Writer>)>);
 
@@ -70,7 +70,7 @@ impl Drive {
                 return Poll::Ready(done);
             }
             self.poll(context);
-            // So data that has arrived is seen at once.
+            // `work` is polled again after the connection, so that it sees arrived data at once.
             work.as_mut().poll(context)
         })
         .await
@@ -80,7 +80,7 @@ impl Drive {
         if let Some((driver, _)) = &mut self.0
             && Pin::new(driver).poll(context).is_ready()
         {
-            // The running call gets the error, if there is one.
+            // If the connection ended with an error, the running call gets that error.
             self.0 = None;
         }
     }
@@ -179,7 +179,7 @@ impl Connection {
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
-            // An empty body needs it too: without it rosmaster answers with status 500 and no body.
+            // An empty body needs this header too. Without it rosmaster answers with status 500 and no body.
             .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {

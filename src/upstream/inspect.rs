@@ -20,7 +20,8 @@ pub(crate) enum InspectError {
     NotAMaster(#[from] NotAMaster),
 }
 
-/// Makes the first request. Leaves out the parameters if the master cannot return one of them.
+/// Makes the first of two requests that read a master. Repeats it without the parameters if the master cannot return
+/// one of them.
 pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
@@ -48,7 +49,7 @@ async fn look(
     Ok(Inspection::decode(&reply, token)?)
 }
 
-/// Whether a parameter may have broken the document. A master does not escape the text of a date.
+/// Whether a parameter may have made the reply invalid XML: a master does not escape the text of a date.
 fn is_broken_document(error: &InspectError) -> bool {
     matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
@@ -62,7 +63,7 @@ pub(crate) async fn second(
     if !first.has_params() {
         rarely!(
             warn,
-            "the master holds a parameter that it can never return, so getParam of it and of every namespace that contains it fails for all nodes; delete it, or set it to 32-bit integers and dates without markup"
+            "the master holds a parameter that it can never return; getParam fails for it and for every namespace that contains it. Delete it, or set a value without nil, without integers beyond 32 bits, and without `<` or `&` in dates"
         );
     }
     let second = match first.second_call(previous) {

@@ -7,7 +7,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::{RawReply, VerifyError, verify::Verified};
 
-/// Longest time until a prepared connection is used, because a master may close idle connections. `core` starts
+/// Longest age at which a prepared connection is still used, because a master may close idle connections. `core` starts
 /// rosmaster with `-t 5`, and timeouts below a second make no sense.
 const AGE_MAX: Duration = Duration::from_millis(500);
 
@@ -22,8 +22,8 @@ pub(crate) enum NextConnection {
 }
 
 impl NextConnection {
-    /// The connection after `reply` has come on `verified`: the same one, or a new one made by `connect`. `None` if the
-    /// next call has to connect.
+    /// The connection for the next call, after `reply` has arrived on `verified`: the same connection if the master
+    /// leaves it open, or a new one made by `connect`. `None` if the next call has to connect.
     pub(crate) fn after(
         verified: Verified,
         reply: &RawReply,

@@ -61,7 +61,7 @@ impl Peer {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether its last answer was late.
+    /// Whether the last answer of the other computer was late.
     pub(crate) fn is_late(&self) -> bool {
         self.late.load(Ordering::Relaxed)
     }
@@ -70,7 +70,7 @@ impl Peer {
         self.late.store(late, Ordering::Relaxed);
     }
 
-    /// Sends a call to it as the leader of `term`. Even without an answer, the call may have been run.
+    /// Sends a call to the other computer as the leader of `term`. Even without an answer, the call may have been run.
     pub(crate) async fn forward(
         &self,
         term: u64,
@@ -114,7 +114,7 @@ impl Peer {
         Ok(reply)
     }
 
-    /// Whether it confirms that it leads in `term`.
+    /// Whether the other computer confirms that it leads in `term`.
     pub(crate) async fn leads(&self, term: u64) -> bool {
         let call = master::get_pid();
         let body = Bytes::from(xmlrpc::encode_call(&call));
@@ -140,7 +140,7 @@ impl Peers {
         }
     }
 
-    /// The rosrescue at `uri`. Drops the connections to any other one.
+    /// The rosrescue at `uri`. Drops the connections to any other rosrescue.
     pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {

@@ -33,19 +33,19 @@ pub enum ReadError {
     Shut,
 }
 
-/// The pool. It is small, because a Python master is slow with many connections.
+/// The pool of connections for reads. It is small, because a Python master is slow with many connections.
 pub struct Pool {
     upstream: Arc<Upstream>,
     ledger: Arc<Ledger>,
     gate: gate::Rx,
     permits: Semaphore,
-    /// Idle connections, each with its incarnation.
+    /// Idle connections, each with the number of the incarnation that it leads to.
     idle: Mutex<Vec<(u64, NextConnection)>>,
-    /// Number of reads that have waited too long for the master.
+    /// Number of reads that are waiting too long for the master.
     stalled: AtomicUsize,
 }
 
-/// Counts a read that has waited too long; see [`Pool::stalled`].
+/// Counts a read that waits too long, until this value is dropped; see [`Pool::stalled`].
 pub struct Stalled<'a>(&'a Pool);
 
 impl Drop for Stalled<'_> {
@@ -68,7 +68,7 @@ impl Pool {
         }
     }
 
-    /// Whether a read has waited for the master too long.
+    /// Whether a read is waiting too long for the master.
     pub fn is_stalled(&self) -> bool {
         self.stalled.load(Ordering::Relaxed) > 0
     }

@@ -8,8 +8,8 @@ use tokio::{net::TcpStream, sync::watch};
 
 use super::{ConnectError, Upstream, is_local};
 
-/// Pause after which the sentinel is renewed if nothing else has renewed it. That is before a master with the shortest
-/// sensible `-t` closes it.
+/// Pause after which the sentinel is renewed if nothing else has renewed it. A rosmaster with a sensible `-t` does not
+/// close an idle connection so soon.
 const RENEWAL: Duration = Duration::from_secs(1);
 
 /// A connection on which nothing is ever sent. Even a master that closes each connection after one

@@ -3,11 +3,12 @@
 //!
 //! A rosmaster runs each connection in a thread of its own, and closes its end only after it has run what has arrived.
 //! rosrescue, or the death of an earlier rosrescue, may have closed a connection whose call still runs. Then the
-//! master's end, on this computer, is in the state CLOSE_WAIT, whether accepted or not. The other end, which belongs to
-//! no process any more, is in FIN_WAIT1 or FIN_WAIT2.
+//! master's end is in the state CLOSE_WAIT, even if the master has not accepted the connection. Only a master on this
+//! computer has its end in this table. rosrescue's end, which belongs to no process any more, is in FIN_WAIT1 or
+//! FIN_WAIT2.
 //!
-//! Linux drops that end a minute after the master's side has acknowledged the close. So a master on another computer
-//! gets no more time than that; see `docs/decisions/0003-no-call-in-flight.md`.
+//! Linux drops rosrescue's end a minute after the master's side has acknowledged the close. So a call in a master on
+//! another computer is waited for no longer than a minute; see `docs/decisions/0003-no-call-in-flight.md`.
 
 use std::{
     collections::HashSet,

@@ -16,7 +16,7 @@ pub enum VerifyError {
     Connect(#[from] ConnectError),
     #[error(transparent)]
     Call(#[from] CallError),
-    /// Another incarnation answered. It does not hold the state yet.
+    /// Another incarnation answered. That master does not hold the state yet.
     #[error("the master behind a new connection does not have the present incarnation's token")]
     OtherIncarnation,
     /// The present incarnation has ended.
@@ -57,8 +57,8 @@ pub(crate) struct Verified {
 }
 
 impl Verified {
-    /// Whether the connection leads to that incarnation as long as it is open. A tunnel may lead an unused connection
-    /// elsewhere.
+    /// Whether the connection, once verified, leads to the same incarnation as long as it is open. A tunnel may lead an
+    /// unused connection elsewhere.
     pub(crate) fn stays_verified(&self) -> bool {
         !matches!(self.by, Verification::TokenAfterwards)
     }
@@ -76,7 +76,7 @@ impl Verified {
         Ok(reply)
     }
 
-    /// Whether answers since the verification come from the right incarnation.
+    /// Checks that answers since the verification come from the incarnation with `token`.
     pub(crate) async fn confirm(
         &self,
         upstream: &Upstream,

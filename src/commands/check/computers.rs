@@ -25,9 +25,9 @@ pub(in crate::commands::check) struct Cluster {
     pub(super) tried: Vec<Tried>,
     /// The present or last leader. `None` if etcd does not know the robot.
     pub(super) leader: Option<String>,
-    /// The robots in etcd, if this one is not among them.
+    /// The robots in etcd, if this robot is not among them.
     pub(super) others: Vec<String>,
-    /// Address of another computer with the same name.
+    /// Address of another computer that has this computer's name.
     pub(super) namesake: Option<String>,
 }
 
@@ -47,7 +47,8 @@ struct Entry {
 }
 
 impl Cluster {
-    /// Gathers the facts. `None` without `--cluster`. `usual` is where other computers reach this one.
+    /// Gathers the facts. `None` without `--cluster`. `usual` is the address where other computers reach this one by
+    /// default.
     pub(super) async fn look(
         args: &ClusterArgs,
         usual: &MasterUri,

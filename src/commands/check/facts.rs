@@ -68,12 +68,12 @@ pub(super) struct SetupFacts {
     pub(super) master_host: Option<Host>,
     /// What answers at `ROS_MASTER_URI`, if that is another computer.
     pub(super) elsewhere: Option<ros::Responder>,
-    /// The host that a rosrescue at `ROS_MASTER_URI` calls itself.
+    /// The host name that a rosrescue at `ROS_MASTER_URI` gives as its own.
     pub(super) elsewhere_host: Option<Host>,
     /// Hosts of registered nodes, each with some of its nodes, if rosrescue runs.
     pub(super) node_hosts: Vec<(Host, Vec<String>)>,
     pub(super) disk: CheckpointDisk,
-    /// The limit of open files that this process may ask for.
+    /// The hard limit of open files: the highest limit that this process may set.
     pub(super) files: u64,
     pub(super) clock: Clock,
     /// How to run rosmaster. `None` for `proxy`.
@@ -182,17 +182,17 @@ pub(super) struct CheckpointDisk {
     pub(super) checkpoint: PathBuf,
     /// The checkpoint's folder, or its nearest parent that exists.
     pub(super) folder: PathBuf,
-    /// Free bytes, and whether it is mounted read-only; or why that is unknown.
+    /// Free bytes, and whether the file system is mounted read-only. An error says why both are unknown.
     pub(super) space: Result<(u64, bool), String>,
     /// How many more files can be created. `None` if the file system has no limit.
     pub(super) inodes: Option<u64>,
-    /// Why writing there fails.
+    /// Why rosrescue cannot write into the folder. `None` if it can.
     pub(super) refused: Option<String>,
     /// Type and source of the file system, such as `ext4` and `/dev/sda1`.
     pub(super) mount: Option<(String, String)>,
-    /// The other rosrescue that uses the file.
+    /// Another rosrescue that uses the checkpoint.
     pub(super) holder: Option<LockHolder>,
-    /// Whether the path is a folder.
+    /// Whether the checkpoint's path is a folder.
     pub(super) is_folder: bool,
 }
 
@@ -387,9 +387,9 @@ impl Port {
 #[derive(Clone, Debug)]
 pub(super) struct UpstreamMaster {
     pub(super) uri: MasterUri,
-    /// Programs that talk to it directly.
+    /// Clients that talk to this master directly.
     pub(super) bypassing: Vec<String>,
-    /// Whether it runs on this computer and accepts connections from other computers.
+    /// Whether this master runs on this computer and accepts connections from other computers.
     pub(super) is_open: bool,
 }
 
@@ -504,7 +504,7 @@ fn masters() -> Vec<Process> {
 }
 
 /// Listening processes in this network namespace that were started with another `ROS_MASTER_URI` than `own`. Only root
-/// sees those of other users.
+/// sees the processes of other users.
 fn strays(own: &str) -> Vec<(Process, String)> {
     const NAME: &[u8] = b"ROS_MASTER_URI=";
     let strays = process::all().filter_map(|pid| {
@@ -517,13 +517,13 @@ fn strays(own: &str) -> Vec<(Process, String)> {
             return None;
         }
         let process = Process::of(pid);
-        // Shells have the variable too, but do not listen.
+        // Shells have the variable too, but they do not listen.
         (!process.ports.is_empty() && process.name != "rosrescue").then_some((process, uri))
     });
     strays.collect()
 }
 
-/// Whether `uri` leads to the master at `far`, or to `port` of this computer.
+/// Whether `uri` leads to the robot's master: to `far`, or to `port` of this computer.
 async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bool {
     let Ok(uri) = MasterUri::parse(uri) else {
         return false;
@@ -547,7 +547,7 @@ pub(super) struct Lease {
 }
 
 impl Lease {
-    /// Asks `ip` of iproute2. `None` if there is no such program.
+    /// Asks `ip`, a program of iproute2. `None` if it is not installed.
     async fn find(address: &str) -> Option<Self> {
         let mut ip = tokio::process::Command::new("ip");
         let ip = ip.args(["-o", "addr", "show"]).kill_on_drop(true).output();
@@ -593,7 +593,7 @@ mod tests {
     async fn hosts_are_told_by_their_addresses() {
         let local = Host::find("127.0.0.1").await;
         assert!(local.is_here && local.is_loopback());
-        // Reserved for documentation.
+        // This network is reserved for documentation.
         let far = Host::find("192.0.2.1").await;
         assert!(!far.is_here && !far.is_loopback());
         let nobody = Host::find("nobody.invalid").await;

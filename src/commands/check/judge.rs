@@ -18,7 +18,7 @@ pub(super) fn judge(facts: &SetupFacts) -> Vec<Finding> {
     if let (Some(Responder::Rosrescue { .. } | Responder::Master(_)), Some(uri)) =
         (&facts.elsewhere, &facts.env.master_uri)
     {
-        // Only nodes run on this computer. What serves the robot is checked on the other one.
+        // Only nodes run on this computer. The master's own setup is checked on the master's computer.
         found.elsewhere(facts, uri);
         found.address(facts);
         found.own_name(facts);

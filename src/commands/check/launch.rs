@@ -33,7 +33,7 @@ pub(super) struct Setting {
     pub(super) file: PathBuf,
     /// Line number, counted from 1.
     pub(super) line: usize,
-    /// The value as written, with substitutions such as `$(arg robot)`.
+    /// The value as it is written in the file, with substitutions such as `$(arg robot)`.
     pub(super) uri: String,
 }
 

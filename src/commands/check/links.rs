@@ -50,7 +50,7 @@ async fn ask(live: &mut Live) -> Result<Found, CommandFailure> {
     for (name, api) in state.nodes().filter(|(name, _)| !Token::is_ours(name)) {
         let (name, api, permits) = (name.to_owned(), api.to_owned(), permits.clone());
         answers.spawn(async move {
-            // Never closed.
+            // The semaphore is never closed.
             let _permit = permits.acquire().await;
             let answer = client::ask_for(&api, &question("getBusInfo"), ANSWER_LIMIT).await;
             (name, Answer::read(answer))
@@ -72,7 +72,7 @@ enum Answer {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Connection {
     topic: String,
-    /// For an incoming connection the publisher's address, else the subscriber's name.
+    /// The publisher's address if the connection is incoming, the subscriber's name if it is outgoing.
     peer: String,
     is_incoming: bool,
 }
@@ -122,7 +122,7 @@ struct Found {
     /// Number of connections that the subscriber confirms.
     seen: usize,
     missing: BTreeSet<Link>,
-    /// Connections that the answers do not mention, or contradict each other about.
+    /// Connections that the subscriber's answer neither shows nor rules out.
     unknown: BTreeSet<Link>,
     /// Nodes that did not answer.
     silent: BTreeSet<String>,

@@ -38,7 +38,7 @@ pub(super) enum Responder {
         version: String,
         uri: String,
         unprotected: Option<String>,
-        /// The master behind that rosrescue. `None` for `core`.
+        /// The master behind that rosrescue. `None` if it runs as `core`.
         proxied: Option<MasterUri>,
         /// Clients that bypass rosrescue.
         bypassing: Vec<String>,
@@ -47,9 +47,9 @@ pub(super) enum Responder {
     Master(Option<i32>),
     /// A program that does not speak XML-RPC.
     Other,
-    /// No program listens there.
+    /// No program listens at the address.
     Nobody,
-    /// There was no answer in time.
+    /// A program does not answer in time, or the address cannot be reached.
     Silent,
 }
 
@@ -152,7 +152,8 @@ pub(super) struct Program {
     pub(super) version: Option<String>,
     /// The first line of the script.
     pub(super) interpreter: String,
-    /// Python's error when it runs the program. `None` if there is none or the program is not Python.
+    /// Python's error when it runs the program. `None` if there is no error, or if the program is not written in
+    /// Python.
     pub(super) broken: Option<String>,
 }
 

@@ -5,7 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Folders of the system's units. Earlier ones override later ones.
+/// Folders of the system's units. A unit in an earlier folder overrides one in a later folder.
 const FOLDERS: [&str; 4] = [
     "/etc/systemd/system",
     "/run/systemd/system",
@@ -76,7 +76,7 @@ pub(super) fn read(path: &Path) -> String {
     }
 }
 
-/// Classifies a unit by the command that it starts, or by the script that it starts, as those of robot_upstart.
+/// Classifies a unit by the command that it starts. If the command is a script, as with robot_upstart, its text counts.
 fn kind_of(unit: &str) -> Option<UnitKind> {
     let mut found = None;
     for line in unit.lines() {

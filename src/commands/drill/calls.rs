@@ -15,7 +15,7 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// A call that takes longer has failed. rosrescue answers all calls sooner.
+/// Longest time for a call. A call that takes longer has failed, because rosrescue answers all calls sooner.
 const LIMIT: Duration = Duration::from_secs(10);
 /// Pause between two calls of a loop.
 const PAUSE: Duration = Duration::from_millis(5);
@@ -80,7 +80,7 @@ pub(super) struct Waits {
     /// Number of calls that were repeated because the connection had broken.
     pub(super) again: u64,
     pub(super) failed: u64,
-    /// The first failures.
+    /// The first failures, at most [`MOST`].
     pub(super) failures: Vec<String>,
 }
 
@@ -209,8 +209,8 @@ impl Callers {
         let (topic, api) = (self.topic.as_str(), self.node_api.as_str());
         while !stop.is_cancelled() {
             let register = [topic.into(), "*".into(), api.into()];
-            // The node claims the subscription before it registers, as real nodes do. Else the health check would
-            // remove it.
+            // The node claims the subscription before it registers, as real nodes do. Otherwise a health check would
+            // remove the registration.
             self.heard.subscribes(topic, true);
             let answer = self.api.ask("registerSubscriber", &register).await;
             waits.add(answer);

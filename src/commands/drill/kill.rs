@@ -78,8 +78,8 @@ impl Drill<'_> {
         Ok(kills)
     }
 
-    /// Waits until calls pass to a living master again, and each killed process has a successor. A stopped master may
-    /// also continue.
+    /// Waits until calls pass to a living master again, and each killed process has a successor. A master that was only
+    /// stopped may continue instead.
     async fn recovered(&self, victims: &[(&'static str, u32)], mut stopped: Option<Stopped>) {
         let start = Instant::now();
         loop {

@@ -34,7 +34,7 @@ const MAX_CALL: usize = 16 << 20;
 pub(super) struct NodeLog {
     /// The number in the last `paramUpdate` of a drill's parameter.
     pub(super) param: watch::Sender<i32>,
-    /// Other parameters or namespaces that changed.
+    /// Parameters and namespaces that other programs have changed.
     changed: Mutex<BTreeSet<String>>,
     /// Topic and publishers of each `publisherUpdate`.
     updates: Mutex<Vec<(String, Vec<String>)>>,
@@ -131,7 +131,7 @@ impl NodeLog {
 #[derive(Debug)]
 pub(super) struct DrillNode {
     pub(super) name: String,
-    /// The address that it registers.
+    /// The address that this node registers.
     pub(super) api: String,
     pub(super) heard: Arc<NodeLog>,
     server: tokio::task::JoinHandle<()>,

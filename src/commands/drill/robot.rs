@@ -25,7 +25,7 @@ const PARAMETER: &str = "the parameter ";
 pub(super) struct RobotState {
     /// Registrations, types and parameters, each under a name for people.
     facts: BTreeMap<String, Value>,
-    /// Each node's process id. `None` if it did not answer.
+    /// Each node's process id. `None` if the node did not answer.
     nodes: BTreeMap<String, Option<i32>>,
 }
 
@@ -68,8 +68,8 @@ impl RobotState {
         (answering, self.facts.len())
     }
 
-    /// What `later` has lost or changed, leaving out what already differed in `meanwhile`, before the first kill.
-    /// `changed` are the parameters and namespaces that other programs were seen to change.
+    /// How the state `later` differs from this state. Facts that already differed in `meanwhile`, just before the first
+    /// kill, do not count as lost. `changed` are the parameters and namespaces that other programs were seen to change.
     pub(super) fn compare(
         &self,
         meanwhile: &Self,
@@ -162,7 +162,7 @@ fn flatten(key: &str, value: &Value, facts: &mut BTreeMap<String, Value>) {
     }
 }
 
-/// Whether this fact is one of the parameters `changed`, or is in one of their namespaces.
+/// Whether this fact is about a parameter in `changed`, or about a parameter in a namespace in `changed`.
 fn is_below(fact: &str, changed: &BTreeSet<String>) -> bool {
     let Some(key) = fact.strip_prefix(PARAMETER) else {
         return false;

@@ -40,7 +40,8 @@ impl Target {
         Ok(victims)
     }
 
-    /// The master's process id. `getPid` reports it, and that process must listen at the address that rosrescue calls.
+    /// The master's process id, as `getPid` reports it. Fails unless that process listens at the address where
+    /// rosrescue reaches the master.
     async fn master(&self, status: &Status) -> Result<u32, CommandFailure> {
         if status.elsewhere {
             return Err(CommandFailure::Usage(
@@ -76,7 +77,8 @@ impl Target {
         pid.ok_or_else(|| "getPid gave no process id".to_owned())
     }
 
-    /// The process id of rosrescue's worker. The status reports it, and that process must listen at the port.
+    /// The process id of rosrescue's worker, as the status reports it. Fails unless that process listens at rosrescue's
+    /// port.
     fn worker(&self, status: &Status) -> Result<u32, CommandFailure> {
         if !status.guarded {
             return Err(CommandFailure::Usage(

@@ -57,7 +57,7 @@ impl Seen {
         }
     }
 
-    /// Starts the part with kills.
+    /// Keeps the longest pause so far as the normal one. From now on pauses are compared with it.
     fn begin(&mut self) {
         self.normal = (self.messages >= FEWEST).then_some(self.longest);
         self.longest = Duration::ZERO;
@@ -115,7 +115,7 @@ pub(super) struct TopicReport {
     pub(super) topic: String,
     pub(super) publishers: usize,
     pub(super) messages: u64,
-    /// `None` if the messages have no sequence number.
+    /// Number of lost messages. `None` if the messages have no sequence number.
     pub(super) lost: Option<u64>,
     pub(super) longest_gap_ms: f64,
     /// The longest pause before the first kill. `None` if too few messages came.
@@ -172,7 +172,7 @@ impl Topic {
             .sum()
     }
 
-    /// Starts the part with kills.
+    /// Notes that the kills begin: pauses from now on are compared with those before.
     pub(super) fn begin(&self) {
         for link in &self.links {
             lock(&link.seen).begin();
@@ -269,7 +269,7 @@ pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
     Ok(topics)
 }
 
-/// Whether another subscriber to this type would load the robot.
+/// Whether messages of this type are usually so large that another subscriber would load the robot.
 fn is_heavy(message_type: &str) -> bool {
     [
         "Image",

@@ -17,7 +17,7 @@ const MOST: usize = 12;
 /// One kill.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Kill {
-    /// Roles and process ids.
+    /// The killed processes, each with its role and process id.
     pub(super) killed: Vec<(&'static str, u32)>,
     /// `SIGKILL`, or `SIGSTOP` for a process that was made to hang.
     pub(super) signal: &'static str,

@@ -60,7 +60,8 @@ impl UnitSettings<'_> {
         if let Some(user) = self.run_as {
             lines.extend(["DynamicUser=no".to_owned(), "StateDirectory=".to_owned()]);
             lines.push(format!("User={user}"));
-            // Restores the user's own ROS_HOME. The unit's other variables stay.
+            // An empty `Environment=` removes all variables of the unit. All but ROS_HOME are set again, because the
+            // user has their own ROS_HOME.
             lines.push("Environment=".to_owned());
             let [unit, _] = units(false);
             let variables = unit.lines().filter(|line| {

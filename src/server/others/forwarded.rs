@@ -1,5 +1,5 @@
-//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now, they may be in the
-//! journal. There they must not count as changes by other computers.
+//! Writes that were sent to a leader and are not answered yet. If this computer is cut off before the answers arrive,
+//! the writes may still be in the journal. In the journal they must not count as changes by other computers.
 
 use std::{
     collections::BTreeMap,

@@ -27,7 +27,7 @@ const TERM: u64 = 7;
 struct Computer {
     calls: Calls,
     standing: watch::Sender<Standing>,
-    /// How far its mirror holds the journal.
+    /// How much of the journal this computer's mirror holds.
     followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
 }
@@ -54,7 +54,7 @@ fn handover() -> Request {
 }
 
 impl Computer {
-    /// Its mirror holds one parameter.
+    /// Creates a computer whose mirror holds one parameter.
     fn new(standing: Standing) -> Self {
         let (gate_tx, gate) = gate::gate();
         gate_tx.set(gate::State::Elsewhere);
@@ -378,8 +378,8 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     let later = others.hold / 2;
     let get = get();
     told(TERM, 7);
-    // The last position is of another leader. The first leader announced records that it did not commit, so they are
-    // gone.
+    // The last position comes from a second leader. The first leader announced records that it did not commit, so those
+    // records are gone.
     for (term, seq) in [(TERM, 7), (TERM + 1, 8)] {
         let start = Instant::now();
         let behind = async {
@@ -396,7 +396,7 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     assert!(computer.ask("/", &get).await.is_err(), "it is never fresh");
 }
 
-/// `rospy.loginfo` and `get_param_cached` subscribe each time.
+/// `rospy.loginfo` and `get_param_cached` call `subscribeParam` each time.
 #[tokio::test]
 async fn a_subscription_that_is_there_already_waits_for_no_leader() {
     let subscribe = |key| Request::new(Method::SubscribeParam, ["/n", "http://n:1/", key]);
@@ -416,7 +416,7 @@ async fn a_subscription_that_is_there_already_waits_for_no_leader() {
         let answer = tokio::time::timeout(prompt, computer.ask("/RPC2", &there)).await;
         let expected = made_by(&there);
         assert_eq!(reply(answer.unwrap().unwrap()).await, expected);
-        // One that is new is the leader's affair.
+        // Only the leader may answer a new subscription.
         let answer = tokio::time::timeout(prompt, computer.ask("/RPC2", &new)).await;
         assert!(answer.is_err());
     }

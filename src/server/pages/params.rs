@@ -137,7 +137,7 @@ impl ParamEntry {
         }
     }
 
-    /// Makes an entry of a value. It is shown as `name`, and is `full` in the tree.
+    /// Makes the entry of a parameter. `name` is the name to show, `full` the parameter's full name.
     fn of(name: String, full: &str, value: &Value, hide: &Hide) -> Self {
         let kind = match value {
             Value::Nil => "none",
@@ -158,7 +158,7 @@ impl ParamEntry {
         }
         let mut text = String::new();
         match value {
-            // Structs in a list have names of their own, which may be hidden.
+            // A list may contain structs, whose members may have to be hidden by their names.
             Value::Array(_) => write(&hide.mask(full, value), &mut text),
             Value::String(words) => text.extend(words.chars().take(TEXT + 1)),
             value => write(value, &mut text),

@@ -13,16 +13,16 @@ use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Node
 pub(super) struct NodeRow {
     pub(super) name: String,
     pub(super) health: Health,
-    /// When `health` was last known, in seconds since 1970.
+    /// When the node's `health` was last checked, in seconds since 1970.
     pub(super) checked_at: Option<u64>,
     /// The node's XML-RPC address.
     pub(super) api: String,
-    /// The node's process id, if it was asked for it.
+    /// The node's process id, if the node has reported it.
     pub(super) pid: Option<i32>,
     pub(super) publishes: Vec<String>,
     pub(super) subscribes: Vec<String>,
     pub(super) serves: Vec<String>,
-    /// When it was unregistered, in seconds since 1970.
+    /// When the node was unregistered as dead, in seconds since 1970.
     pub(super) removed_at: Option<u64>,
 }
 

@@ -25,7 +25,7 @@ const SAMPLE: f64 = 1.0;
 /// Number of callers listed as the slowest.
 const SLOWEST: usize = 20;
 
-/// Calls per second, counted between two requests for the status. Without requests it costs nothing.
+/// Calls per second, counted between two requests for the status. Without requests, counting costs nothing.
 #[derive(Debug)]
 pub(crate) struct Rate(Mutex<Sample>);
 

@@ -98,7 +98,7 @@ fn alone(gate: State, of: &ClusterFacts) -> ClusterCondition {
         }
         _ => format!(
             "The nodes of this computer keep working. Their changes ({kept}) go to the leader later, except \
-             where others change the same"
+             where others change the same data"
         ),
     };
     ClusterCondition {
@@ -121,7 +121,7 @@ fn alone(gate: State, of: &ClusterFacts) -> ClusterCondition {
     }
 }
 
-/// Additional sentences of the leader about the other computers, and what to do.
+/// What the leader's status adds about the other computers: sentences, and what to do.
 pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     let others = of.members.iter().filter(|member| member.name != of.name);
     let (away, here): (Vec<_>, Vec<_>) = others.partition(|member| member.is_away());

@@ -23,7 +23,7 @@ impl Findings {
             taken,
         }) = &facts.port
         else {
-            // The finding about ROS_MASTER_URI covers it.
+            // The finding about ROS_MASTER_URI reports this error.
             return;
         };
         if let Some(error) = error {
@@ -217,7 +217,7 @@ impl Findings {
             false => ("host name", &own.name),
         };
         if name.trim() != name {
-            // The finding about the variable covers it.
+            // The finding about the variable reports the spaces.
             return;
         }
         let other_computer = other_computer(facts);

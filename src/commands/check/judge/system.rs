@@ -11,21 +11,21 @@ use super::{
 };
 use crate::{clock, status::software};
 
-/// Minimum free space, in bytes. A checkpoint and ROS's logs soon use up less.
+/// Minimum free space, in bytes. A checkpoint and ROS's logs could soon use up less space than this.
 const LITTLE_SPACE: u64 = 500 << 20;
 const NO_SPACE: u64 = 20 << 20;
 /// Minimum number of files that can still be created. Each start and each rescue creates some ten files: checkpoint,
 /// reports and logs.
 const FEW_INODES: u64 = 1000;
 const NO_INODES: u64 = 10;
-/// Minimum limit of open files. With a lower one, client connections run out.
+/// Minimum limit of open files. With a lower limit, client connections may be refused for lack of files.
 const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
 /// Minimum free memory, in bytes. rosmaster and rosrescue need some 40 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
 /// Maximum number of settings in launch files that are listed. More would hide the other findings.
 const SETTINGS_MOST: usize = 10;
-/// 2024-01-01, in seconds since 1970. A clock before it is wrong, because this program is younger.
+/// 2024-01-01, in seconds since 1970. A clock that shows an earlier time is wrong, because this program is younger.
 const EARLIEST: f64 = 1_704_067_200.0;
 /// A clock that is this many seconds behind existing files was set back.
 const BEHIND_FILES: f64 = 120.0;
@@ -206,7 +206,7 @@ impl Findings {
         let proxied = facts.proxied.as_ref().map(|(uri, _)| uri.port);
         let others = facts.masters.iter().filter(|process| {
             let at = |port: Option<u16>| port.is_some_and(|port| process.ports.contains(&port));
-            // The finding about the port covers the first one, and the second one is intended.
+            // The finding about the port reports a master at `port`. A master at `proxied` is intended.
             !at(port) && !at(proxied)
         });
         let others: Vec<_> = others.map(named).collect();

@@ -16,7 +16,7 @@ use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
 fn a_robot_without_problems_has_no_findings() {
     assert_eq!(said(|_| {}), []);
     assert!(judge(&robot()).len() >= 8);
-    // The same holds while rosrescue runs, with its own master and its checkpoint in use.
+    // There is no finding either while rosrescue runs, with its own master and its checkpoint in use.
     let found = said(|facts| {
         port(facts).taken = taken(rosrescue(None));
         facts.disk.holder = Some(LockHolder { pid: Some(7) });
@@ -212,7 +212,7 @@ fn names_that_lead_nowhere_or_elsewhere() {
     );
 }
 
-/// On a computer with nodes alone, the check does not ask for what serves the robot.
+/// On a computer that only runs nodes, the check does not ask for what a master needs.
 #[test]
 fn another_computer_of_the_robot() {
     let elsewhere = |facts: &mut SetupFacts| {
