@@ -35,8 +35,7 @@ pub(super) struct Journal {
     shared: Arc<StoreQueue>,
     /// Number of the last entry, recorded or not.
     seq: u64,
-    /// Whether entries are passed to the store. After a silence of the disk they are not, until the next complete
-    /// checkpoint.
+    /// Whether entries are passed to the store. False after the disk was silent, until the next complete checkpoint.
     gives: bool,
 }
 
@@ -83,7 +82,7 @@ impl StoreQueue {
                 job(&mut store);
             }
             drop(store);
-            // This thread also runs a job that was queued before it released the lock.
+            // Another thread may have queued a job while this one held the lock. This thread runs that job, too.
             if self.jobs().is_empty() {
                 return;
             }
@@ -212,8 +211,8 @@ impl Journal {
         })
     }
 
-    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on the store
-    /// receives records again.
+    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on entries are
+    /// passed to the store again.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
         checkpoint: Checkpoint,
