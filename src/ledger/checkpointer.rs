@@ -230,7 +230,7 @@ impl Checkpointer {
             Some(Err(error)) => {
                 ledger.set_attempted(Err(&error));
                 self.failed_at = Some(Instant::now());
-                tracing::debug!(%error, "compaction");
+                tracing::debug!(%error, "compaction failed");
             }
             _ => {
                 let now = Instant::now();

@@ -183,7 +183,7 @@ impl Journal {
         }
         let given = self.run(move |store| {
             if let Err(error) = store.append(&entries) {
-                tracing::debug!(%error, "append");
+                tracing::debug!(%error, "appending to the journal failed");
             }
         });
         if given.is_none() {

@@ -480,8 +480,8 @@ impl Drain {
         if self.in_flight.is_some() {
             self.link.ledger.abandon_batch();
         }
-        // A master that comes back is examined only when this connection has ended, because only then it can run no
-        // more call of this connection.
+        // A master that comes back is examined only when this connection has ended, because only then can no call of
+        // this connection still be running.
         self.connection = None;
         if let Some(batch) = self
             .in_flight

@@ -1,5 +1,5 @@
-//! Sends long multicalls to the master in parts, so that other writes pass in between. No client can rely on one step
-//! anyway: in rosmaster, entries of concurrent multicalls take turns.
+//! Sends long multicalls to the master in parts, so that other writes pass in between. No client can rely on a
+//! multicall running in one step: in rosmaster, entries of concurrent multicalls take turns.
 
 use std::{iter::Peekable, vec};
 

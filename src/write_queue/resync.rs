@@ -1,4 +1,4 @@
-//! Schedules *inspections*: reading the master's whole state to compare it with the mirror. Pure: the time is an
+//! Schedules *inspections*, which read the master's whole state to compare it with the mirror. Pure: the time is an
 //! argument.
 
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! Logs what the member reports.
+//! Logs the events that the cluster's state machine reports.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -103,8 +103,8 @@ pub(super) fn cause(of: Cause) -> &'static str {
     }
 }
 
-/// Logs the lost ones among the writes that were answered while cut off. One line per subject, because a node may
-/// have written to it a thousand times.
+/// Logs which of the writes that were answered while cut off are lost. Logs one line per subject, because a node may
+/// have written to the same subject a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
     for (call, outcome) in &outcomes {
