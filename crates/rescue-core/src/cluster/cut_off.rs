@@ -1,5 +1,5 @@
-//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; the shell also
-//! stores them beside the checkpoint.
+//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; `app/cluster`
+//! also stores them beside the checkpoint.
 
 use std::collections::VecDeque;
 
@@ -23,9 +23,9 @@ const EXPECTED_MOST: usize = 4_000;
 pub struct Time {
     /// The state when this computer was cut off.
     pub base: Master,
-    /// The writes answered since.
+    /// The writes answered since then.
     pub pending: WritesToSend,
-    /// The others' changes since.
+    /// The other computers' changes since then.
     pub changes: Changes,
     /// How many of the writes may also be in the journal.
     expected: usize,
@@ -79,7 +79,7 @@ impl CutOff {
         if is_empty && self.times.len() > 1 {
             self.times.pop_back();
         }
-        // The oldest period may be on its way.
+        // The oldest period stays, because its writes may be on their way. The next two become one.
         if self.times.len() >= TIMES_MOST
             && let Some(second) = self.times.remove(2)
             && let Some(first) = self.times.get_mut(1)
@@ -159,7 +159,7 @@ impl CutOff {
                 continue;
             };
             let call = Request::from(call.clone());
-            // Only so many can be on their way at once.
+            // No more writes than this can be on their way to etcd at once.
             if given && time.expected < EXPECTED_MOST {
                 time.expected += 1;
                 time.changes.expect_record(record.seq, call.clone());

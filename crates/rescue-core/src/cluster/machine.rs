@@ -234,7 +234,7 @@ impl Machine {
         let view = match answer {
             EtcdAnswer::Silence => {
                 self.retry_at = Some(now + RETRY);
-                // Its effect is unknown, so it is sent again. The keys show whether a claim succeeded.
+                // The effect of a beat is unknown, so it is sent again. The keys show whether a claim succeeded.
                 self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
                     silent: true,
                     ..flight
@@ -314,7 +314,7 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Does not claim leadership before `until`.
+    /// Makes this computer claim leadership no earlier than `until`.
     pub fn hold_claims(&mut self, until: Instant) {
         self.claim_not_before = Some(until);
     }
@@ -385,7 +385,7 @@ impl Machine {
             self.committed = self.view.seq();
         }
         if released.is_some() {
-            // Another write may have come in between.
+            // After a release, another computer may lead.
             self.deposed(actions);
             actions.push(Action::Released);
             return;

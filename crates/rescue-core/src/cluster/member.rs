@@ -88,7 +88,7 @@ struct Before {
 struct Namesake {
     /// Set if the member entry of this name belongs to another computer.
     sign: Option<Sign>,
-    /// Looks for such a computer. Set once etcd has been read.
+    /// Looks for a living computer with this one's name. Set once etcd has been read.
     watch: Option<namesake::NamesakeWatch>,
     /// Whether this process has led.
     led: bool,
@@ -315,7 +315,7 @@ impl Member {
     /// Passes an input to the machine, and does what it decides.
     fn drive(&mut self, now: Instant, input: machine::Input) {
         let actions = self.machine.on(now, input);
-        // First, so that the next request does not send them again.
+        // Committed changes leave first, so that the next request does not send them again.
         for change in self.outgoing.committed(self.machine.committed()) {
             self.hold(now, change);
         }

@@ -14,7 +14,7 @@ use crate::{
 
 /// How many changes may be on their way at once.
 const FIRST: usize = journal::BATCH_RECORDS;
-/// The approximate size limit of the changes behind them while this computer is cut off, in bytes.
+/// The approximate size limit of the changes after the [`FIRST`] ones while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
 
 /// The changes, in the order of their numbers.
@@ -131,14 +131,15 @@ impl Outgoing {
         }
     }
 
-    /// The parts of the next beat's entry that are not in etcd, because it was made while this computer was cut off.
+    /// The parts of the next beat's entry that are not in etcd, because the change was recorded while this computer was
+    /// cut off.
     pub fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
         let first = self.changes.front().filter(|of| of.seq() > self.written);
         let parts = first.map(|change| parts(keys, change));
         parts.and_then(Result::ok).unwrap_or_default()
     }
 
-    /// The journal entry of the next beat, up to `seq`.
+    /// The journal entry of the next beat, with the changes up to `seq`.
     pub fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
         if let Some(first @ Change::State { .. }) =
             self.changes.front().filter(|of| of.seq() <= seq)
@@ -181,7 +182,7 @@ fn weight_of(change: &Change) -> usize {
             RecordContent::Call { call, .. } => call.params.iter().map(Value::size).sum(),
             RecordContent::Session(_) => 0,
         },
-        // There is one.
+        // A state does not count, because replacing it by a state would save nothing.
         Change::State { .. } => 0,
     }
 }

@@ -24,11 +24,11 @@ pub(super) struct Leadership {
 pub(super) struct Flight {
     pub(super) number: u64,
     pub(super) op: Op,
-    /// When it was sent for the first time.
+    /// When the request was sent for the first time.
     pub(super) first: Instant,
-    /// When it was sent for the last time.
+    /// When the request was sent for the last time.
     pub(super) sent: Instant,
-    /// Whether it got no answer and is not under way now.
+    /// Whether the request got no answer and is not under way now.
     pub(super) silent: bool,
 }
 

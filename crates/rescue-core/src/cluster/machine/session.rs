@@ -8,12 +8,12 @@ use super::types::Alive;
 /// What is known about the journal's session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum JournalSession {
-    /// Nothing: no computer was seen leading it. The next leader has to decide.
+    /// It is unknown whether the session continues. The next leader has to decide.
     #[default]
     Unknown,
-    /// It continues.
+    /// The session continues.
     GoesOn,
-    /// It ended with this record. The leader replaces the state by an empty one, as the next record.
+    /// The session ended with this record. The leader replaces the state by an empty one, as the next record.
     Over(u64),
 }
 

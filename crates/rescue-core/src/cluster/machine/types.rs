@@ -7,18 +7,18 @@ use serde::{Deserialize, Serialize};
 /// When a write is acknowledged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Commit {
-    /// When a majority of etcd has it.
+    /// When a majority of etcd has the write.
     Always,
-    /// At once, while no other computer can lead. It is committed within 200 ms.
+    /// At once, while no other computer can lead. The write is committed within 200 ms.
     Interval,
 }
 
 /// What a computer does with writes while it is cut off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WhenAlone {
-    /// It answers them, and sends them to the leader later.
+    /// The mirror answers writes, and the leader gets them later.
     Serve,
-    /// It lets them wait.
+    /// Writes wait until this computer reaches the others again, or fail after `--hold`.
     Refuse,
 }
 
@@ -68,7 +68,7 @@ pub struct Leader {
 pub struct Alive {
     /// The revision of the key.
     pub revision: u64,
-    /// The number of the leader's transaction that wrote it.
+    /// The number of the leader's transaction that wrote this key.
     pub beat: u64,
     /// The journal's last record.
     pub seq: u64,
@@ -78,7 +78,7 @@ pub struct Alive {
     pub settled: bool,
 }
 
-/// Both keys at one revision of etcd.
+/// The keys `leader` and `alive` at one revision of etcd.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct View {
     pub revision: u64,
@@ -111,7 +111,7 @@ pub struct RevisionGuard {
 /// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read both keys, not from a member that may be behind.
+    /// Read both keys. The answer must not come from a member of etcd that may be behind.
     Read,
     /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
     Claim {
@@ -171,14 +171,15 @@ pub enum Input {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Nothing is known yet.
+    /// This computer does not know yet who leads.
     Joining,
     /// Calls go to the leader. While there is none, the mirror answers reads and writes wait.
     Following,
-    /// Its claim has succeeded. It reads the rest of the journal, and decides whether its session continues.
+    /// This computer's claim has succeeded. It reads the rest of the journal, and decides whether the session
+    /// continues.
     CatchingUp,
     Leading,
-    /// Cut off from the majority, or from the leader.
+    /// Cut off from etcd's majority, or from the leader.
     Alone,
 }
 

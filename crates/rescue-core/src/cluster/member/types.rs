@@ -91,7 +91,8 @@ pub enum Entry {
 pub struct Read {
     /// The leader's two keys at the same revision.
     pub view: View,
-    /// The state before the records, and who was displaced until then. `None` if the records follow the known journal.
+    /// The state before the records, and the nodes displaced until then. `None` if the records follow the known
+    /// journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
@@ -246,7 +247,7 @@ pub enum Action {
     },
     /// Apply these records of another computer.
     Follow(Vec<Record>),
-    /// Take over this state of another computer.
+    /// Replace the ledger's state by this state of another computer.
     FollowState(Master),
     /// Answer the calls up to this record.
     Acknowledge(u64),

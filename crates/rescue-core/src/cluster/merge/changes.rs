@@ -228,8 +228,8 @@ impl Own {
         }
     }
 
-    /// Whether `call` is one of these. It may be in the journal several times, because it is sent again after a lost
-    /// answer.
+    /// Whether `call` is one of these calls. It may be in the journal several times, because it is sent again after a
+    /// lost answer.
     fn has(&self, call: &Request) -> bool {
         if Mutant::GuessesByValues.lives() {
             let mut own = self.calls.values().flatten();

@@ -1,4 +1,4 @@
-//! The request by which a computer that was cut off sends its writes to the leader, and its answer.
+//! The request by which a computer that was cut off sends its writes to the leader, and the leader's answer.
 
 use std::sync::Arc;
 
@@ -50,9 +50,9 @@ impl Ask {
 /// The outcome of one write.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WriteOutcome {
-    /// It was made, or its value is already set.
+    /// The write was made, or its value is already set.
     Holds,
-    /// The master refused it.
+    /// The master refused the write.
     Refused(String),
     /// Others have changed the same subject.
     Lost { why: String, present: Option<Value> },
