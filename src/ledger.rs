@@ -78,7 +78,7 @@ pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
     stats: &'static Stats,
-    /// The last record that answers need not wait for.
+    /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
     /// Whether the disk is late with a sync.
     sync_is_late: AtomicBool,

@@ -31,8 +31,7 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Number of calls between the clients and the queue. The worker always empties this channel at
-/// once.
+/// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
 const CHANNEL: usize = 64;
 
 /// The clients' handle to the queue.

@@ -452,7 +452,7 @@ impl ClusterDriver {
     }
 }
 
-/// Converts what was read from etcd.
+/// Converts what was read from etcd for the [`Member`]. `None` if the state in etcd is invalid.
 fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     let members = loaded.members.iter();
     let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));

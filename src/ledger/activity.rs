@@ -19,7 +19,7 @@ use crate::{
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
 /// Longest time to tell a node to shut down, with all retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// Limit for three lists: topics, parameters of one node, and changes in the outbox.
+/// Maximum length of each list of changes, of displaced nodes and of removed registrations.
 const NOTICES: usize = 4096;
 /// A removed registration is remembered only if its names have at most this many bytes.
 const LOST_MOST: usize = 1024;
@@ -70,7 +70,7 @@ pub struct LastCalls {
 struct Lost {
     node: String,
     api: String,
-    /// Whether the node published the topic. Otherwise it subscribed to it.
+    /// True if the node published the topic, false if it subscribed to the topic.
     publishes: bool,
     topic: String,
 }
@@ -124,7 +124,7 @@ type Unsent = (String, Subject, Arc<Call>);
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
-    /// Maximum number of subscribers of any single topic.
+    /// The number of subscribers of the topic that has the most.
     subscribers: usize,
     /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,
@@ -388,8 +388,8 @@ impl Activity {
         all.into_values().cloned().collect()
     }
 
-    /// Treats all that nodes subscribe to as changed now, and the journal's displaced nodes as displaced now. `mirror`
-    /// must equal the master: a node that has taken its name back is not displaced.
+    /// Treats all that nodes subscribe to as changed now, and the checkpoint's displaced nodes as displaced now.
+    /// `mirror` must equal the master, because a node that has taken its name back is not displaced.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,

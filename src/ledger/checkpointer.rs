@@ -28,7 +28,7 @@ const LOOK: Duration = Duration::from_millis(500);
 const AGAIN: Duration = Duration::from_secs(1);
 /// Time without a new record after which the journal is compacted.
 const QUIET: Duration = Duration::from_secs(2);
-/// Shortest time between two compactions. Each wears out memory cards.
+/// Shortest time between two compactions, because each one wears out memory cards.
 const BETWEEN: Duration = Duration::from_secs(10);
 
 /// Limits the log lines about a failure to record the state, and about its end.

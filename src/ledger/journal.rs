@@ -44,7 +44,7 @@ pub(super) struct StoreQueue {
     jobs: Mutex<VecDeque<Job>>,
     store: Mutex<Store>,
     seen: Mutex<StoreState>,
-    /// The last record that answers need not wait for.
+    /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
     sync: SyncPolicy,
 }

@@ -43,7 +43,7 @@ const PATIENCE: u64 = 100_000;
 /// When notifications that a dead master may not have sent are sent, in microseconds.
 const OWED_AFTER: u64 = 50_000;
 
-/// A part of production's order that is left out, to show that the simulation notices.
+/// A rule of the order that is left out, to show that the simulation notices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mutant {
     None,
@@ -255,7 +255,7 @@ impl World {
         });
     }
 
-    /// The answer is ready; its task writes it when it runs.
+    /// Readies an answer, which its task writes as soon as the task runs.
     fn answer(&mut self, node: usize, call: Request, reply: Reply, delivery: Option<Delivery>) {
         let number = delivery.map(Delivery::into_number);
         self.answers += 1;

@@ -81,7 +81,7 @@ impl Kept {
         (this, left)
     }
 
-    /// Stores exactly `calls`, answered since the state was `base`.
+    /// Replaces the file's content by `calls`, which were answered since the state was `base`.
     pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
         let path = path_of(checkpoint);
         let store = match self.store.take() {

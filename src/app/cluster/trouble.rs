@@ -1,4 +1,4 @@
-//! The trouble with etcd, for the status and the log.
+//! Keeps whether etcd answers, for the status and the log.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},

@@ -4,7 +4,7 @@
 //! ROBOT/leader, ROBOT/alive           see `machine`
 //! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large; or
 //!                                     that of a snapshot, if the state was replaced by record N
-//! ROBOT/values/blob/N/PART            such records, in parts, written before the journal names them
+//! ROBOT/values/blob/N/PART            a blob's records, in parts, written before the journal names them
 //! ROBOT/snapshot                      the name of the snapshot that is whole, and what it stands for
 //! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
 //! ```
@@ -331,7 +331,7 @@ pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
 /// How far a mirror has followed the journal, and the journal's size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
-    /// The last record.
+    /// The last record that the mirror contains.
     pub seq: u64,
     entries: usize,
     bytes: usize,

@@ -1,8 +1,8 @@
 //! Decides what one computer of several does: whom it follows, what its mirror holds, which calls it answers, what it
 //! writes to the journal and merges, and when it may run a master. Pure.
 //!
-//! [`Machine`], a part of it, decides who leads. The shell passes in what happened and when, and carries out the
-//! returned actions in order. The shell decides nothing, so the simulation in `cluster/tests` tests what production
+//! [`Machine`], a part of it, decides who leads. `app/cluster` passes in what happened and when, and carries out the
+//! returned actions in order. It decides nothing, so the simulation in `cluster/tests` tests what production
 //! decides.
 
 use std::{
@@ -99,7 +99,7 @@ struct Namesake {
 pub struct Member {
     keys: Keys,
     machine: Machine,
-    /// The role that the shell was told last.
+    /// The machine's role after the actions that were returned last.
     role: Role,
     standing: Standing,
     has_master: bool,
@@ -124,7 +124,7 @@ pub struct Member {
     queue: Queue,
 }
 
-/// Inputs for the machine and actions for the shell, in order.
+/// Inputs for the machine and actions for `app/cluster`, in order.
 #[derive(Debug, Default)]
 struct Queue {
     inputs: VecDeque<machine::Input>,

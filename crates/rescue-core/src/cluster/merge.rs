@@ -107,7 +107,7 @@ pub fn merge<'a>(
         match judge(changes, now, call) {
             Verdict::Runs => merged.send.push(call.clone()),
             Verdict::Holds => {}
-            // A value that was deleted again is not lost.
+            // A value that this computer itself deleted later does not count as lost.
             Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
             Verdict::Lost(lost) => merged.lost.push(lost),
         }
@@ -120,7 +120,7 @@ pub fn merge<'a>(
     merged
 }
 
-/// Judges `call`, which is no multicall.
+/// Decides whether `call`, which must not be a multicall, still holds.
 pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let Some(why) = conflict(changes, now, call) else {
         return Verdict::Runs;

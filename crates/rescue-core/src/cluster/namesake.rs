@@ -16,7 +16,7 @@ const YOUNG: Duration = Duration::from_secs(15);
 /// The key that shows a namesake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Key {
-    /// `leader` and `alive`.
+    /// The keys `leader` and `alive`.
     Leader,
     /// The entry among the members.
     Member,
@@ -91,7 +91,7 @@ impl NamesakeWatch {
         signs.iter().find(|sign| {
             let counts = match sign.key {
                 Key::Leader => now < self.since + YOUNG,
-                // Of two that start together, only the one that does not lead stops.
+                // Of two namesakes that start together, only the one that does not lead stops.
                 Key::Member => !self.is_over(now),
             };
             counts && !self.first.contains(sign)

@@ -12,7 +12,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// How many changes may be on their way at once.
+/// How many changes may be on their way to etcd at once.
 const FIRST: usize = journal::BATCH_RECORDS;
 /// The approximate size limit of the changes after the [`FIRST`] ones while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
@@ -30,7 +30,7 @@ pub struct Outgoing {
 }
 
 impl Outgoing {
-    /// Starts over. The next change has a number after `seq`.
+    /// Drops everything. The next change has a number after `seq`.
     pub fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
@@ -259,11 +259,11 @@ mod tests {
         let parts = outgoing.prepare(&keys).unwrap().unwrap();
         assert_eq!((outgoing.ready(), parts.len()), (5, 1));
         outgoing.preparing = true;
-        // Once at a time.
+        // Only one change is prepared at a time.
         assert!(outgoing.prepare(&keys).unwrap().is_none());
         assert_eq!(outgoing.ready(), 5);
         outgoing.preparing = false;
-        // They were not written, and are given again.
+        // The parts were not written, so they are returned again.
         assert_eq!(outgoing.prepare(&keys).unwrap(), Some(parts));
         outgoing.prepared();
         assert_eq!(outgoing.ready(), 6);
@@ -298,7 +298,7 @@ mod tests {
         outgoing.prepared();
         outgoing.prepare(&keys).unwrap();
         assert_eq!(outgoing.ready(), 7);
-        // Calls go before it and after it.
+        // The calls before and after the state go in other beats.
         assert_eq!(added(&outgoing, &keys, 7), [5]);
         outgoing.committed(5);
         let entry = outgoing.entry(&keys, 7).unwrap().unwrap();
@@ -321,7 +321,7 @@ mod tests {
         outgoing.replace_rest(Some(state(6 + count)));
         outgoing.all_ready();
         assert_eq!((outgoing.count(), outgoing.ready()), (FIRST + 1, 6 + count));
-        // A beat that is sent again has what it had.
+        // A repeated beat has the same records.
         assert_eq!(added(&outgoing, &keys, 4 + count), before);
         outgoing.committed(4 + FIRST as u64);
         let entry = outgoing.entry(&keys, 6 + count).unwrap().unwrap();

@@ -31,7 +31,7 @@ pub enum Source {
 /// The latest changes, oldest first.
 #[derive(Debug, Default)]
 struct Recent {
-    /// The list is complete after this record.
+    /// The list holds all changes after this record.
     after: u64,
     changes: VecDeque<(u64, Source, Vec<ChangeSubject>)>,
     bytes: usize,

@@ -13,9 +13,9 @@ pub(super) struct Leadership {
     pub(super) beat: u64,
     /// Whether the mirror had the whole journal when the term began.
     pub(super) caught_up: bool,
-    /// Whether records were left over after the last beat.
+    /// Whether records were left over after the last heartbeat.
     pub(super) full: bool,
-    /// Whether another computer may have led since the last beat.
+    /// Whether another computer may have led since the last heartbeat.
     pub(super) lapsed: bool,
 }
 

@@ -18,7 +18,7 @@ pub enum JournalSession {
 }
 
 impl JournalSession {
-    /// Applies the shell's decision about the journal up to record `seq`, unless another computer was faster.
+    /// Applies the decision about the journal up to record `seq`, unless another computer was faster.
     pub(super) fn decided(&mut self, seq: u64, goes_on: bool) {
         if *self == Self::Unknown {
             *self = match goes_on {

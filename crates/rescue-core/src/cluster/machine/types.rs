@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub enum Commit {
     /// When a majority of etcd has the write.
     Always,
-    /// At once, while no other computer can lead. The write is committed within 200 ms.
+    /// At once, while no other computer can lead. The write is in etcd within 200 ms.
     Interval,
 }
 
@@ -101,7 +101,7 @@ impl View {
     }
 }
 
-/// The revisions that both keys must have for a transaction to succeed. 0 stands for a missing key.
+/// The revisions that the keys `leader` and `alive` must have for a transaction to succeed. 0 stands for a missing key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct RevisionGuard {
     pub leader: u64,
@@ -136,20 +136,20 @@ pub enum Op {
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The transaction failed, or it was a read. These are the keys.
+    /// The keys, as the answer to a read or to a transaction that failed.
     Is(View),
     /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,
 }
 
-/// What happened.
+/// An event that the machine must know of.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Input {
     /// The machine starts. The checkpoint contains the journal up to this record.
     Start(u64),
     /// The answer to request `number`.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch delivers the keys.
+    /// The watch on etcd has delivered the leader's keys.
     View(View),
     /// The mirror contains the journal up to this record.
     Followed(u64),
@@ -173,7 +173,7 @@ pub enum Input {
 pub enum Role {
     /// This computer does not know yet who leads.
     Joining,
-    /// Calls go to the leader. While there is none, the mirror answers reads and writes wait.
+    /// Calls go to the leader. While no computer leads, the mirror answers reads and writes wait.
     Following,
     /// This computer's claim has succeeded. It reads the rest of the journal, and decides whether the session
     /// continues.
@@ -205,7 +205,7 @@ impl Role {
     }
 }
 
-/// An action for the shell. Actions must be carried out in order.
+/// What the member must do. Actions must be carried out in order.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Send a request. Its answer is [`Input::Answer`] with this number, within [`super::ANSWER_LIMIT`].
@@ -225,6 +225,6 @@ pub enum Action {
         committed: u64,
         acknowledged: u64,
     },
-    /// Another computer may lead now.
+    /// This computer has given up leadership, so another one may lead now.
     Released,
 }

@@ -13,7 +13,7 @@ use crate::{
     master::Master,
 };
 
-/// Probes of the leader's rosrescue per time to live.
+/// How often a follower asks the leader's rosrescue whether it leads, per time to live.
 pub const PROBES: u32 = 4;
 /// Probes per time to live while etcd is silent, when only the leader itself shows whether it still leads.
 const PROBES_IN_SILENCE: u32 = 20;

@@ -99,7 +99,7 @@ pub struct Read {
     pub heard: Vec<Heard>,
 }
 
-/// What happened.
+/// An event that the member must handle.
 #[derive(Debug)]
 #[allow(
     clippy::large_enum_variant,
@@ -203,7 +203,7 @@ pub enum News {
     },
 }
 
-/// What the shell must do, in order.
+/// What `app/cluster` must do. Actions must be carried out in order.
 #[derive(Debug)]
 #[allow(
     clippy::large_enum_variant,
