@@ -216,7 +216,7 @@ impl ClusterDriver {
                 self.spawn(otherwise, decide(seq, state, self.setup.restore, evidence));
             }
             Action::Stand(standing) => {
-                tracing::debug!(?standing, "calls");
+                tracing::debug!(?standing, "this computer's standing has changed");
                 self.standing.send_replace(standing);
             }
             Action::Leave => ledger.leave(),

@@ -19,7 +19,7 @@ use crate::{
 };
 
 /// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and several can queue
-/// up. A robot stops if calls are not answered.
+/// up. The limit exists because a robot stops if calls are not answered.
 pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Why nothing is recorded after [`DISK_PATIENCE`].
@@ -175,7 +175,7 @@ impl Journal {
         self.shared.seen().kept.take()
     }
 
-    /// Records `entries`. A failure is kept in the store.
+    /// Passes `entries` to the store, which records them later and keeps a failure.
     pub(super) fn append(&mut self, entries: Vec<RecordContent>) {
         self.seq += entries.len() as u64;
         if !self.gives {
@@ -223,7 +223,7 @@ impl Journal {
         let shared = Arc::clone(&self.shared);
         let given = self.run(move |store| {
             if shared.seen().gaps_over < gaps {
-                // The file lacks records.
+                // The file lacks the records that were withheld.
                 store.give_up(SILENT);
                 shared.seen().gaps_over = gaps;
             }

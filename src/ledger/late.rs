@@ -29,7 +29,7 @@ pub(crate) enum CatchUp {
     Run(Box<Missed>),
 }
 
-/// What a late master has missed.
+/// The writes that a late master has missed, and the states before and after them.
 #[derive(Debug)]
 pub(crate) struct Missed {
     /// The state that the master holds.
@@ -54,7 +54,8 @@ impl Ledger {
         });
     }
 
-    /// Notes that the present incarnation has answered its outstanding calls. It may notify nodes only now.
+    /// Notes that the present incarnation has answered its outstanding calls. So that master may notify nodes of them
+    /// only now.
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
         let Inner {

@@ -25,7 +25,7 @@ impl PendingWrites {
     ///
     /// # Errors
     ///
-    /// If there are too many. Then all pending writes are dropped.
+    /// If there are too many pending writes. Then all of them are dropped.
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,

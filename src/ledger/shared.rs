@@ -63,7 +63,7 @@ impl Ledger {
     }
 
     /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is
-    /// the state that they hold; if this computer's state differs, they get it as a whole.
+    /// the state that the others hold. If this computer's state differs, the others get the whole state.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let times_led = self.agreed.borrow().times_led;
@@ -239,7 +239,7 @@ impl Inner {
         if let Shared::Here { sharing, .. } = &mut self.shared {
             sharing.record_state(&self.mirror);
             // The state takes a number in that journal, so the session's record must be written again: later calls have
-            // other numbers than it tells.
+            // other numbers than that record tells.
             self.session_unwritten = true;
         }
     }
@@ -405,7 +405,7 @@ mod tests {
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
-        // The same holds when this computer leads again and uses the same numbers for other calls.
+        // The old calls stay unacknowledged when this computer leads again and uses their numbers for other calls.
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));

@@ -143,7 +143,7 @@ impl Sharing {
     /// Records that the state was replaced by `mirror`.
     pub fn record_state(&mut self, mirror: &Master) {
         self.last += 1;
-        // Anything may have changed.
+        // A new state may differ in any part, so earlier changes say nothing.
         self.recent = Recent::from(self.last);
         let (seq, state) = (self.last, Box::new(mirror.clone()));
         self.changes.push(Change::State { seq, state });
@@ -154,7 +154,7 @@ impl Sharing {
         std::mem::take(&mut self.changes)
     }
 
-    /// Returns the recorded changes as one: their result, which is `mirror`.
+    /// Takes the recorded changes as a single one: their result, which is `mirror`.
     pub fn take_as_state(&mut self, mirror: &Master) -> Change {
         self.changes.clear();
         let (seq, state) = (self.last, Box::new(mirror.clone()));

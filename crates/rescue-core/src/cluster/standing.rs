@@ -52,7 +52,7 @@ pub struct Place {
     pub epoch: u64,
     /// The leader's term.
     pub term: u64,
-    /// The record number.
+    /// The number of a record.
     pub seq: u64,
 }
 

@@ -261,18 +261,18 @@ pub enum Action {
     BeginMaster(Cause),
     /// Kill the master at once.
     EndMaster,
-    /// The mirror answers, because there is no master.
+    /// Let the mirror answer, because this computer has no master.
     StandIn,
     /// Answer no call on this computer.
     TurnAway,
-    /// Whether to notify this computer's nodes only.
+    /// Notify only this computer's own nodes if true, all nodes if false.
     ServeOwnOnly(bool),
-    /// Keep exactly these writes, answered while cut off since the state was `base`.
+    /// Keep exactly these writes, which were answered while cut off. `base` is the state before them.
     KeepAll {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Keep these writes as well.
+    /// Add these writes to the kept ones.
     Keep(Vec<Request>),
     /// Delete the kept writes.
     KeepNothing,
@@ -300,9 +300,9 @@ pub enum Action {
     },
     /// Compact etcd up to this revision.
     Forget(u64),
-    /// Answer a handover request: done, or why not.
+    /// Answer a handover request with success, or with the reason why it failed.
     HandedOver(Result<(), String>),
-    /// Stop roscore's other duties while calls still pass.
+    /// Stop roscore's other duties while calls still pass to the master.
     EndRosout,
     Tell(News),
     /// Stop.

@@ -8,7 +8,7 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The method's name.
+/// The name of the XML-RPC method.
 pub const METHOD: &str = "rosrescue/merge";
 /// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
@@ -16,7 +16,7 @@ const MULTICALL: &str = "system.multicall";
 /// A portion of writes that were answered while cut off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all portions of one period are sent.
+    /// The name under which all portions of one period of being cut off are sent.
     pub id: Arc<str>,
     /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,
@@ -34,7 +34,7 @@ impl Ask {
         )
     }
 
-    /// Reads a request. `None` if it is another method.
+    /// Reads a request. `None` if it calls another method.
     pub fn read(request: &Request) -> Option<Self> {
         let is_it = matches!(request.method(), Method::Unknown(name) if **name == *METHOD);
         let calls = request.params().get(3).filter(|_| is_it)?;
@@ -54,7 +54,7 @@ pub enum WriteOutcome {
     Holds,
     /// The master refused the write.
     Refused(String),
-    /// Others have changed the same subject.
+    /// Another computer has changed the subject of the write.
     Lost { why: String, present: Option<Value> },
 }
 

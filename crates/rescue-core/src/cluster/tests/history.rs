@@ -188,7 +188,7 @@ impl History {
         self.of(call).held = true;
     }
 
-    /// A leader has made `call` for the computer `from`.
+    /// Notes that a leader has made `call` for the computer `from`.
     pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
         // A value that the merge sets again, to notify nodes, is no call of a node.
         let call = self.find(call.params());

@@ -1,4 +1,4 @@
-//! The calls and notifications of the simulated nodes: writes, reads, merges and notifications.
+//! The simulated nodes' writes, reads and notifications, and the merges of their writes.
 
 use super::*;
 
