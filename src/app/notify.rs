@@ -32,7 +32,7 @@ const JOINING: Duration = Duration::from_millis(20);
 /// Pause between two checks whether the guardian is stopped.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Limits the log lines about a stopped guardian, and about one that runs again.
+/// Limits the log lines about a stopped guardian, and about a guardian that runs again.
 static STOPPED: Pair = Pair::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.

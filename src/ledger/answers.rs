@@ -50,7 +50,7 @@ impl Ledger {
 
     /// Like [`Self::answer`], for a write that changes nothing. Notifies nodes as a master would.
     ///
-    /// Also returns the mark of the last record, because that may be the earlier write that made this one redundant.
+    /// Also returns the mark of the last record, which may be that of the earlier write that made this one redundant.
     /// `None` if the write changes something, or if the master may notify the caller of newer changes before the answer
     /// arrives.
     pub(crate) fn answer_if_unchanged(
@@ -165,10 +165,10 @@ impl Ledger {
             }
         };
         if !changes {
-            // Such a call still becomes pending, because the master may hold what the mirror lacks: a registration that
-            // it ran for a rosrescue that died before the reply, or any state if the checkpoint is older than the
-            // master. Parameter subscriptions are left out: they cannot be read from the master, and loggers repeat
-            // them all the time.
+            // A call that changes nothing still becomes pending, because the master may hold what the mirror lacks: a
+            // registration that it ran for a rosrescue that died before the reply, or any state if the checkpoint is
+            // older than the master. Parameter subscriptions are left out: they cannot be read from the master, and
+            // loggers repeat them all the time.
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             let unsure = |call: &Request| {
                 is_unregistration(call)

@@ -163,7 +163,7 @@ impl Machine {
                 Some((false, since)) => Some(silent.min(since + patience)),
                 None => Some(silent),
             },
-            // Until then, only committed writes are acknowledged, unless no other computer can lead.
+            // Before this time, only committed writes are acknowledged, unless no other computer can lead.
             Role::Leading => Some(self.leadership?.sent? + patience),
             Role::Alone => None,
         };

@@ -287,7 +287,8 @@ impl Member {
     /// Updates the place up to which the mirror is current.
     pub(super) fn look_at_place(&mut self) {
         let seq = self.journal.progress.seq;
-        // Then the mirror is at no place of the journal: it holds records or kept writes that the journal lacks.
+        // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
+        // lacks.
         let differs = self.own.seq > seq || !self.cut_off.is_empty();
         if self.own_wins && differs && !self.records() {
             return;
