@@ -74,8 +74,7 @@ pub enum RunError {
     /// The etcd options cannot be used.
     #[error(transparent)]
     Cluster(#[from] EtcdError),
-    /// The kernel's random id is not a valid header value. This does not happen with the kernel's
-    /// own ids.
+    /// The id in `/proc/sys/kernel/random/uuid` is not a valid header value. A real kernel's ids always are.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),
 }
@@ -107,7 +106,7 @@ pub async fn run(
     say(&beginning.story);
     let restored = beginning.restored;
     let last = last_master(&config, &beginning.session);
-    // It marks our requests: one that comes back shows that the master's address is our own.
+    // This id marks our requests to the master. If such a request comes back, the master's address is our own.
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let mark = HeaderValue::from_str(&instance)?;
     let (context, drain) = assemble(&config, beginning, last.clone(), mark.clone()).await;
@@ -125,8 +124,8 @@ pub async fn run(
     );
     let connections = TaskTracker::new();
     let mut tasks = accept(listeners, &config, server, &connections, &halt);
-    // Meanwhile the mirror answers reads; writes wait, and so does everything that goes to the
-    // master.
+    // While the first checkpoint is written, the mirror answers reads. Writes wait, and so does everything that goes to
+    // the master.
     let checkpointer = Checkpointer::begin(
         context.ledger.clone(),
         context.board.clone(),
@@ -154,7 +153,7 @@ pub async fn run(
     if let Some(process) = process {
         process.stop().await;
     }
-    // systemd may not be reading.
+    // The time is limited, because systemd may not be reading.
     let _ = tokio::time::timeout(DRAIN, notified).await;
     Ok(())
 }
@@ -210,7 +209,7 @@ fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
     }
 }
 
-/// Whether this computer has the master to itself or is one of several.
+/// Whether this is the only computer that may have the master, or one of several.
 enum Runs {
     /// The only computer. `None` for an external master.
     Single(Option<Supervised>),
@@ -219,7 +218,7 @@ enum Runs {
 }
 
 impl Runs {
-    /// Joins the other computers, if there are others. Also returns how to reach them.
+    /// Joins the other computers, if `config` names a cluster. Also returns the handle through which calls reach them.
     async fn choose(
         config: &Config,
         context: &Arc<Context>,
@@ -230,8 +229,7 @@ impl Runs {
     ) -> Result<(Option<Others>, Self), RunError> {
         let (Some(cluster), Some(supervised)) = (&config.cluster, &supervised) else {
             if restored {
-                // The mirror answers while orphans of an earlier rosrescue are still being looked
-                // for.
+                // The mirror answers while masters that an earlier rosrescue left are still being looked for.
                 context.gate_tx.set(State::StandingIn);
             }
             return Ok((None, Self::Single(supervised)));
@@ -284,7 +282,7 @@ enum Begun {
 }
 
 impl Begun {
-    /// Manages the master until the end. Returns the master's process, if it is ours and still runs.
+    /// Manages the master until rosrescue stops. Returns the master's process, if it is ours and still runs.
     async fn run(
         self,
         stop: CancellationToken,

@@ -1,8 +1,9 @@
-//! The ledger: mirror and journal under one lock. A write is applied and passed to the journal in one step, and its
-//! answer waits until it is [written](journal).
+//! The ledger: the mirror, which is a model of the master's whole state, and the journal of its changes, under one
+//! lock. A write is applied to the mirror and passed to the journal in one step, and its answer waits until the journal
+//! is [written](journal).
 //!
-//! The lock also orders writes and the start of a new incarnation. A reply of the old master is not acknowledged if it
-//! arrives after the state for the injection was taken.
+//! The same lock orders writes and the start of a new incarnation, which is one life of a master process. So a reply of
+//! the old master does not count if it arrives after the state for the new master was taken.
 
 pub(crate) mod activity;
 mod answers;
@@ -49,21 +50,21 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// The answer is out of date: another incarnation has taken over, or the mirror has changed since. The call must go to
-/// the master again.
+/// Refuses an outdated result: another incarnation has begun, the mirror has changed since, or the master is on another
+/// computer than the caller assumed.
 #[derive(Debug)]
 pub struct Superseded;
 
 /// The result of recording answered calls.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Recorded {
-    /// Mark of the calls' last record.
+    /// Identifies the last record of the calls, for [`Ledger::durable`].
     pub mark: Mark,
     /// Whether the mirror may differ from the master now.
     pub doubtful: bool,
 }
 
-/// The state from which an injection is planned.
+/// What is needed to plan an injection, which brings a master to the mirror's state.
 #[derive(Debug)]
 pub struct Basis {
     pub mirror: Master,
@@ -77,7 +78,7 @@ pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
     stats: &'static Stats,
-    /// The last record that answers need not wait for.
+    /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
     /// Whether the disk is late with a sync.
     sync_is_late: AtomicBool,
@@ -87,7 +88,7 @@ pub struct Ledger {
     agreed: watch::Sender<Agreed>,
     /// The time until which this computer may act as leader. See [`Ledger::set_lease`].
     lease: watch::Sender<Option<Instant>>,
-    /// The mirror's version in the last complete checkpoint that was tried.
+    /// The mirror's version in the last complete checkpoint that was written or failed.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
@@ -119,19 +120,19 @@ struct Inner {
     doubted: bool,
     /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
-    /// The state of a late incarnation once it has answered its outstanding calls.
+    /// The state that a late master will have once it has answered its outstanding calls.
     behind: Option<LateState>,
-    /// The incarnation that answered calls last.
+    /// The last incarnation to which calls have passed.
     served: Option<u64>,
-    /// Whether the mirror comes from a checkpoint and no master has been compared with it. A living
-    /// master may be newer.
+    /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
+    /// be newer than the mirror.
     unconfirmed: bool,
     /// Whether the session has changed and the change is not in the journal yet.
     session_unwritten: bool,
 }
 
 impl Ledger {
-    /// Creates a ledger of `mirror`, recorded in `store`. `pending` are writes that the incarnation of `session` may
+    /// Creates a ledger of `mirror`, recorded in `store`. `pending` are writes that the last master of `session` may
     /// not have run. `sync` says when a record must be on the disk.
     pub fn new(
         mirror: Master,
@@ -250,8 +251,8 @@ impl Ledger {
         self.record_from(now, incarnation, &batch)
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in the order in
-    /// which it ran them.
+    /// Records and applies calls that the master of `incarnation` has answered, in the order in which the master ran
+    /// them.
     pub(crate) fn record_from(
         &self,
         now: Instant,
@@ -277,7 +278,7 @@ impl Ledger {
         let mut sources = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
         for (index, (answered, source)) in answered.into_iter().enumerate() {
-            // Then mirror and master are known to differ: the master holds values that cannot be read from it.
+            // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
@@ -333,7 +334,8 @@ impl Ledger {
         self.lock().pending.calls().len()
     }
 
-    /// Parameter subscriptions that the present incarnation may hold. They cannot be read from it.
+    /// The parameter subscriptions that the present incarnation may hold. They follow from the mirror and the pending
+    /// writes, because they cannot be read from a master.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         replay::may_hold(&inner.mirror, inner.pending.calls())
@@ -400,7 +402,8 @@ impl Ledger {
 }
 
 impl Inner {
-    /// Applies `call`. `standing_in` collects its notifications. It is `None` if a master notifies the nodes.
+    /// Applies `call` to the mirror. `standing_in` is `None` if a master notifies the nodes. Otherwise rosrescue must
+    /// notify them, and the value says whether `call` changes the mirror.
     fn apply(
         &mut self,
         now: Instant,
@@ -449,7 +452,7 @@ impl Inner {
             self.version += 1;
         }
         let (unordered, old) = (self.mirror.is_unordered(), self.mirror.is_old());
-        // An equal state replaces the mirror too, because it may be known more exactly.
+        // An equal `state` replaces the mirror too, because the new one may be known more exactly.
         self.mirror = state;
         self.mirror.set_unordered(unordered);
         self.mirror.set_old(old);
@@ -462,7 +465,7 @@ impl Inner {
 
     fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
-            // If the present incarnation answers again, the mirror's state replaces everything in it.
+            // If the present master answers again, it gets the mirror's whole state.
             self.raise_incarnation();
             self.write_session();
         }
@@ -484,7 +487,7 @@ impl Inner {
 
     fn write_session(&mut self) {
         if std::mem::take(&mut self.session_unwritten) {
-            // The file lacks what was not recorded.
+            // While a complete checkpoint is due, the file lacks changes that have no record.
             self.session.cluster_seq = match self.whole.is_due() {
                 true => 0,
                 false => self.cluster_seq(),

@@ -1,6 +1,6 @@
 //! The write queue sends writes to the master one batch at a time, so the journal's order is the
-//! order in which the master ran them. Writes that arrive meanwhile form the next batch. While the
-//! master is away the mirror answers them, in the same order.
+//! order in which the master ran them. Writes that arrive meanwhile form the next batch. While the master is away, the
+//! mirror answers the queued writes in the same order.
 
 pub(crate) mod batch;
 mod drain;
@@ -31,8 +31,7 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Number of calls between the clients and the queue. The worker always empties this channel at
-/// once.
+/// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
 const CHANNEL: usize = 64;
 
 /// The clients' handle to the queue.
@@ -49,7 +48,7 @@ impl WriteQueue {
         let _ = self.items.send(item).await;
     }
 
-    /// When the unanswered batch was sent. `None` if there is none.
+    /// When the batch that the master has not answered yet was sent. `None` without such a batch.
     pub(crate) fn unanswered_since(&self) -> Option<Instant> {
         *self.sent.borrow()
     }
@@ -64,8 +63,8 @@ impl WriteQueue {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes the calls of `ask`, except those that conflict with changes by other computers. `None` if there is no
-    /// answer.
+    /// Makes the writes in `ask`, which another computer answered while it was cut off. Leaves out those that conflict
+    /// with changes by other computers. `None` if there is no answer.
     pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::MergeAnswer> {
         let (item, answered, judged) = merge::item(ask);
         self.items.send(item).await.ok()?;
@@ -91,14 +90,14 @@ impl WriteQueue {
         }
     }
 
-    /// Waits until a batch was lost: the master may have run it, and may be dead. Nothing is sent until the gate has
-    /// changed. Called by the gate's only writer.
+    /// Waits until a batch is lost: its connection ended before the answer. The master may have run the batch, and may
+    /// be dead. Nothing is sent until the gate has changed, so the caller must set the gate.
     pub async fn lost(&self) {
         self.signals.lost.notified().await;
     }
 
-    /// Waits until a write has waited for the [patience](Self::set_patience), if the mirror can answer it and all other
-    /// calls that the master has not answered.
+    /// Waits until the master has left a write unanswered for the [patience](Self::set_patience), and the mirror can
+    /// answer all calls that the master has not answered.
     pub(crate) async fn late(&self) {
         self.signals.is_late.notified().await;
     }
@@ -163,7 +162,7 @@ pub(crate) fn write_queue(
     (queue, drain)
 }
 
-/// What a round trip needs.
+/// What a round trip to the master needs.
 #[derive(Clone)]
 struct Link {
     ledger: Arc<Ledger>,

@@ -1,4 +1,4 @@
-//! Creates the context of the program from its settings and the state that it starts with.
+//! Creates what all tasks of this process share, from the settings and the state at the start.
 
 use std::{
     sync::Arc,
@@ -131,7 +131,7 @@ pub(super) async fn assemble(
     (context, drain)
 }
 
-/// What earlier processes of this session left on the disk about rescues.
+/// Reads the reports of rescues that earlier processes of this session left on the disk.
 async fn earlier(beginning: &Beginning) -> Earlier {
     let mut earlier = match &beginning.store {
         Some(store) => {
@@ -155,7 +155,7 @@ fn ledger(config: &Config, beginning: Beginning, uri: &str, stats: &'static Stat
         config.sync,
         stats,
     );
-    // In a cluster each leader starts with a new master.
+    // In a cluster each leader starts a new master, which cannot be newer than the mirror.
     if beginning.restored && config.cluster.is_none() {
         ledger.set_unconfirmed();
         ledger.with_activity(|_, activity| activity.restore_displaced(beginning.displaced));
@@ -167,14 +167,14 @@ fn ledger(config: &Config, beginning: Beginning, uri: &str, stats: &'static Stat
 
 /// How others know this process.
 pub(super) struct Identity {
-    /// Host names under which clients reach it.
+    /// Host names under which clients reach this process.
     pub(super) names: Vec<String>,
-    /// The value of the header that marks its own requests to a master.
+    /// The value of the header that marks this process's requests to a master.
     pub(super) instance: String,
 }
 
-/// Creates what answers the clients' requests. Notifies the first of `ends` when a request of our own comes back;
-/// the second one ends the page's streams.
+/// Creates the server for the clients' requests. The server notifies the first of `ends` when one of our own requests
+/// to the master comes back. The second of `ends` ends the streams of the status page.
 pub(super) fn server(
     config: &Config,
     context: &Context,

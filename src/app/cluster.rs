@@ -59,10 +59,10 @@ const LIMIT: Duration = Duration::from_secs(5);
 /// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
 
-/// Maximum number of the watch's messages that become one input.
+/// Maximum number of messages from etcd's watch that become one input.
 const WATCHED_MOST: usize = 64;
 
-/// Work whose result is an input.
+/// Tasks whose results become inputs of the [`Member`].
 type Work = JoinSet<Input>;
 
 /// Passes events to this computer's [`Member`], and carries out its actions.
@@ -82,7 +82,7 @@ pub(super) struct ClusterDriver {
     /// The next inputs.
     inbox: VecDeque<Input>,
     work: Work,
-    /// Background work.
+    /// Background tasks without a result.
     beside: JoinSet<()>,
     watch: Option<Watching>,
     /// The leader's keys as the watch delivered them.
@@ -216,13 +216,13 @@ impl ClusterDriver {
                 self.spawn(otherwise, decide(seq, state, self.setup.restore, evidence));
             }
             Action::Stand(standing) => {
-                tracing::debug!(?standing, "calls");
+                tracing::debug!(?standing, "this computer's standing has changed");
                 self.standing.send_replace(standing);
             }
             Action::Leave => ledger.leave(),
             Action::Lead { seq, held, state } => {
                 if let Some(state) = state {
-                    // Only if this computer still has the master.
+                    // This fails only if this computer already has the master.
                     let _ = ledger.follow_state(state);
                 }
                 ledger.lead(seq, &held);
@@ -322,7 +322,7 @@ impl ClusterDriver {
                 let client = self.replica.client.clone();
                 self.beside.spawn(async move {
                     if let Err(error) = client.compact(revision, LIMIT).await {
-                        tracing::debug!(%error, "compaction of etcd");
+                        tracing::debug!(%error, "could not compact etcd");
                     }
                 });
             }
@@ -371,7 +371,7 @@ impl ClusterDriver {
     /// The next input.
     async fn next(&mut self) -> Result<Input, ProcessError> {
         let wake = self.member.deadline();
-        // Inputs may be ready all the time. Requests that this thread runs as well must go on.
+        // Inputs may be ready all the time, so this thread's other tasks get a turn here.
         tokio::task::yield_now().await;
         loop {
             tokio::select! {
@@ -452,7 +452,7 @@ impl ClusterDriver {
     }
 }
 
-/// Converts what was read from etcd.
+/// Converts what was read from etcd for the [`Member`]. `None` if the state in etcd is invalid.
 fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     let members = loaded.members.iter();
     let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));
@@ -476,7 +476,7 @@ fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     })
 }
 
-/// A member entry, if `key` is one.
+/// The member entry at `key`, if `key` belongs to a member.
 fn said(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
     let name = key.strip_prefix(&keys.member(""))?.to_owned();
     let said = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
@@ -525,7 +525,8 @@ async fn decide(
     Input::Decided { seq, goes_on }
 }
 
-/// Sends writes that were answered while cut off to the leader at an address, or to this computer.
+/// Sends writes that were answered while cut off to the leader. `to` is its address and term, or `None` if this
+/// computer leads.
 async fn merge(
     ask: Ask,
     to: Option<(String, u64)>,
@@ -546,7 +547,7 @@ async fn merge(
     let count = ask.calls.len();
     match wire::MergeAnswer::read(&reply, count) {
         Some(answer) => Some(answer),
-        // An earlier version, which does not know this method.
+        // The leader runs an earlier version, which does not know this method.
         None => {
             let reply = send(Request::multicall(ask.calls)).await;
             reply.map(|reply| wire::MergeAnswer::of(&vec![Verdict::Runs; count], &reply))
@@ -561,7 +562,7 @@ async fn say(client: Etcd, put: Put) {
         client.put_with_lease(&put, lease, LIMIT).await
     };
     if let Err(error) = said.await {
-        tracing::debug!(%error, "the entry among the members");
+        tracing::debug!(%error, "could not write this computer's member entry");
     }
 }
 
@@ -581,7 +582,7 @@ async fn failed(duties: &mut Option<MasterDuties>) -> ProcessError {
     }
 }
 
-/// A watch, read by a task of its own: what arrives while the member works becomes one input.
+/// A watch on etcd, read by a separate task: all changes that arrive while the member works become one input.
 struct Watching {
     changes: mpsc::Receiver<Vec<KeyChange>>,
     _task: AbortOnDropHandle<()>,

@@ -1,4 +1,4 @@
-//! Runs the computer that has the master: recovery, and roscore's other duties.
+//! Runs recovery, and roscore's other duties (rosout and the run id), on the computer that has the master.
 
 use std::{
     path::PathBuf,
@@ -25,7 +25,7 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// What the tasks of this process share, and the settings of those that manage the master.
+/// What the tasks of this process share, and the settings of the tasks that manage the master.
 pub(super) struct Context {
     pub(super) ledger: Arc<Ledger>,
     pub(super) upstream: Arc<Upstream>,
@@ -92,7 +92,7 @@ impl Context {
 
     /// Creates the driver of a single computer, with its first actions.
     ///
-    /// `rosmaster` starts masters; the last one was at `port`. It is `None` for an external master. `rosout` says
+    /// `rosmaster` starts masters, and is `None` for an external master. The last master was at `port`. `rosout` says
     /// whether to run rosout; `None` skips all of roscore's other duties. `restored` says whether the mirror comes from
     /// a checkpoint whose session continues. When the first token of `ends` is cancelled, rosout is stopped, and then
     /// the second token is cancelled.
@@ -169,13 +169,14 @@ impl MasterDuties {
     pub(super) async fn failed(&mut self) -> ProcessError {
         match (&mut self.driver).await {
             Ok(Err(error)) => error,
-            // Otherwise the driver ends only after `stop`.
+            // Without an error the driver ends only after `stop`.
             Ok(Ok(_)) => std::future::pending().await,
             Err(panic) => resume(panic),
         }
     }
 
-    /// Stops roscore's other duties while calls still pass to the master: rosout unregisters there when it stops.
+    /// Stops roscore's other duties while calls still pass to the master, because rosout unregisters there when it
+    /// stops.
     pub(super) fn end_roscore(&mut self) -> impl Future<Output = ()> + Send + 'static {
         self.roscore_stop.cancel();
         let roscore = self.roscore.take();

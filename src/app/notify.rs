@@ -32,7 +32,7 @@ const JOINING: Duration = Duration::from_millis(20);
 /// Pause between two checks whether the guardian is stopped.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Limits the log lines about a stopped guardian, and about one that runs again.
+/// Limits the log lines about a stopped guardian, and about a guardian that runs again.
 static STOPPED: Pair = Pair::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.
@@ -82,7 +82,7 @@ impl Context {
     }
 
     /// Checks whether the guardian `pid` is stopped. A stopped guardian starts no worker, and neither its link nor its
-    /// exit would show that. `guarded` is the state to report while it runs.
+    /// exit would show that. `guarded` is the state to report while the guardian runs.
     fn see_guardian(&self, pid: u32, guarded: Guarded) {
         let now = match Stat::of(pid).is_some_and(Stat::is_stopped) {
             true => Guarded::Stopped(pid),
@@ -135,7 +135,7 @@ fn is_restarted(pid: u32) -> bool {
 }
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
-/// state to report while it runs.
+/// state to report while the guardian runs.
 async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, context: Arc<Context>) {
     let link = link
         .set_nonblocking(true)

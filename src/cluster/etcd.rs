@@ -202,7 +202,8 @@ struct AliveValue {
     beat: u64,
     seq: u64,
     released: Option<String>,
-    /// Whether the session was settled. Versions before this field settle the session when they lead.
+    /// Whether it is decided that the journal's session continues. Versions without this field decide it when they
+    /// lead.
     #[serde(default = "settled_before")]
     settled: bool,
 }

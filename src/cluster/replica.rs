@@ -53,7 +53,7 @@ pub struct Replica {
 }
 
 impl Replica {
-    /// Reads what follows `known`. A watch can continue from the view's revision.
+    /// Reads the journal after `known`. A watch can continue from the view's revision.
     ///
     /// # Errors
     ///

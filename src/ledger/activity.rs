@@ -14,16 +14,16 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// A dead master may not have sent the notifications of changes that happened up to this long before the outage.
-/// Unreachable nodes can hold up its three notifier threads.
+/// A dead master may not have sent the notifications of changes that happened up to this long before the outage,
+/// because unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
 /// Longest time to tell a node to shut down, with all retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// Limit for three lists: topics, parameters of one node, and changes in the outbox.
+/// Maximum length of each list of changes, of displaced nodes and of removed registrations.
 const NOTICES: usize = 4096;
-/// Maximum number of bytes of names in a remembered registration.
+/// A removed registration is remembered only if its names have at most this many bytes.
 const LOST_MOST: usize = 1024;
-/// Maximum number of nodes that are remembered after they unregistered.
+/// Up to this many nodes are remembered even after they have unregistered.
 const NODES: usize = 1024;
 
 /// A change for which a master may send a late notification.
@@ -70,7 +70,7 @@ pub struct LastCalls {
 struct Lost {
     node: String,
     api: String,
-    /// Whether the node published the topic. Otherwise it subscribed to it.
+    /// True if the node published the topic, false if it subscribed to the topic.
     publishes: bool,
     topic: String,
 }
@@ -86,7 +86,7 @@ struct Pid {
 #[derive(Clone, Copy, Debug)]
 struct Noted {
     at: Instant,
-    /// Whether rosrescue has notified the nodes itself. Otherwise a master did, and may have died before it finished.
+    /// Whether rosrescue has notified the nodes itself. False if a master did, which may have died before it finished.
     told: bool,
 }
 
@@ -105,14 +105,14 @@ pub struct Activity {
     unidentified: IndexMap<String, Instant>,
     /// The latest topic registrations that any client has removed.
     lost: VecDeque<Lost>,
-    /// Nodes that a master had to shut down, with the time.
+    /// Nodes that a master had to tell to shut down, with the time.
     displaced: Vec<(Instant, Displaced)>,
     /// All nodes that were displaced recently, with the time. The next start cannot know whether they were told to shut
     /// down.
     lately: Vec<(Instant, Displaced)>,
     /// Displaced nodes from a checkpoint. They may not have been told to shut down.
     restored: Vec<Displaced>,
-    /// Whether changes are collected that a master notifies nodes of.
+    /// Whether the changes that a master notifies nodes of are collected in the outbox.
     notifying: bool,
     outbox: OwedNotifications,
 }
@@ -120,11 +120,11 @@ pub struct Activity {
 /// A notification that rosrescue must send because there is no master: receiver, subject, and call.
 type Unsent = (String, Subject, Arc<Call>);
 
-/// The nodes that must be notified of a call.
+/// Collects what one call changes, and which nodes must be notified of the changes.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
-    /// Maximum number of subscribers of any single topic.
+    /// The number of subscribers of the topic that has the most.
     subscribers: usize,
     /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,
@@ -374,7 +374,7 @@ impl Activity {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Keeps the `displaced` nodes of the journal until [`Self::notice_all`].
+    /// Keeps the `displaced` nodes of a checkpoint until [`Self::notice_all`].
     pub fn restore_displaced(&mut self, displaced: Vec<Displaced>) {
         self.restored = displaced;
     }
@@ -388,8 +388,8 @@ impl Activity {
         all.into_values().cloned().collect()
     }
 
-    /// Treats all that nodes subscribe to as changed now, and the journal's displaced nodes as displaced now. `mirror`
-    /// must equal the master: a node that has taken its name back is not displaced.
+    /// Treats all that nodes subscribe to as changed now, and the checkpoint's displaced nodes as displaced now.
+    /// `mirror` must equal the master, because a node that has taken its name back is not displaced.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,

@@ -1,4 +1,4 @@
-//! The mirror's answers: predictions while there is a master, and answers in its place.
+//! The mirror's answers: predictions while there is a master, and answers in the master's place.
 
 use std::{sync::Arc, time::Instant};
 
@@ -12,14 +12,15 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Up to this many pending writes, an unregistration that changes nothing in the mirror also becomes pending.
+/// While fewer writes than this are pending, an unregistration that changes nothing in the mirror becomes pending, too.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
 /// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
 /// large state could need any amount. Larger multicalls wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
-/// The same limit while there is a master. It then answers larger multicalls.
+/// Maximum memory for the answers to all reads of one multicall while there is a master, in bytes. Larger multicalls go
+/// to the master.
 const EXACT_ANSWER_MOST: usize = 1 << 20;
 
 impl Ledger {
@@ -30,15 +31,16 @@ impl Ledger {
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
-    /// The result of a read, if the present master would answer with the same bytes. It includes every acknowledged
-    /// write.
+    /// The result of a read, if the present master would answer with the same bytes. The result includes every
+    /// acknowledged write.
     pub fn exact_answer(&self, read: &Request) -> Option<Value> {
         let mut inner = self.lock();
         if inner.doubted || !inner.mirror.fits(read, EXACT_ANSWER_MOST) {
             return None;
         }
         if *read.method() == Method::GetParamNames {
-            // This walks the whole tree. It works on a copy without the lock, and copying the tree costs nothing.
+            // Listing the names walks the whole tree, so it is done on a copy without the lock. Copying the tree costs
+            // nothing.
             let mut params = inner.mirror.with_params_only();
             drop(inner);
             return params.exact_answer(read);
@@ -48,7 +50,7 @@ impl Ledger {
 
     /// Like [`Self::answer`], for a write that changes nothing. Notifies nodes as a master would.
     ///
-    /// Also returns the mark of the last record: it may belong to the earlier write that made this one redundant.
+    /// Also returns the mark of the last record, which may be that of the earlier write that made this one redundant.
     /// `None` if the write changes something, or if the master may notify the caller of newer changes before the answer
     /// arrives.
     pub(crate) fn answer_if_unchanged(
@@ -58,7 +60,7 @@ impl Ledger {
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
         let concern = Concern::of(Some(write));
         let mut inner = self.lock();
-        // An unregistration may concern a registration that the master has not run yet.
+        // Unregistrations are left out: they may concern a registration that the master has not run yet.
         let idle = !inner.doubted
             && !inner.unconfirmed
             && !inner.is_elsewhere()
@@ -85,8 +87,8 @@ impl Ledger {
         (!refused).then_some((reply, mark, delivery))
     }
 
-    /// The answer to a parameter subscription that exists already, on any computer. Only the node itself ends it, so
-    /// the call changes nothing for the leader either.
+    /// The answer to a `subscribeParam` whose subscription already exists. A computer that does not lead may give it
+    /// too: only the node can end its subscription, so the leader still has it.
     pub(crate) fn answer_if_subscribed(&self, call: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let there = *call.method() == Method::SubscribeParam
@@ -106,15 +108,16 @@ impl Ledger {
     /// returns the mark of the last record. That is this call's record, or if it changes nothing, the record that made
     /// it redundant.
     ///
-    /// `None` during an injection, if another computer has the master, or if the call also reads too much. Then the
-    /// call has to wait.
+    /// `None` during an injection, if another computer has the master, or if the answers to the reads in a multicall
+    /// are too large. Then the call has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
         Some((reply, mark))
     }
 
-    /// Like [`Self::stand_in`], for a client's call whose answer the order tracks as `concern`.
+    /// Like [`Self::stand_in`], for a client's call from `source`. The answer counts as on its way to the client, with
+    /// the subjects in `concern`, until the returned [`Delivery`] is dropped.
     pub(crate) fn stand_in_for(
         self: &Arc<Self>,
         now: Instant,
@@ -138,13 +141,14 @@ impl Ledger {
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
-        // This comes first, because the call may notify its own caller.
+        // The answer is begun before the call is applied, because the call may notify its own caller.
         let heard = concern.heard();
         let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // The writes were applied, but the answer cannot be encoded. The master refuses a refused write again.
+            // The answer cannot be encoded, so it does not show which writes were accepted. All count as accepted,
+            // because a master refuses a refused write again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()
@@ -161,10 +165,10 @@ impl Ledger {
             }
         };
         if !changes {
-            // Such a call still becomes pending, because the master may hold what the mirror lacks: a registration that
-            // it ran for a rosrescue that died before the reply, or any state if the checkpoint is older than the
-            // master. Parameter subscriptions are left out: they cannot be read from the master, and loggers repeat
-            // them all the time.
+            // A call that changes nothing still becomes pending, because the master may hold what the mirror lacks: a
+            // registration that it ran for a rosrescue that died before the reply, or any state if the checkpoint is
+            // older than the master. Parameter subscriptions are left out: they cannot be read from the master, and
+            // loggers repeat them all the time.
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             let unsure = |call: &Request| {
                 is_unregistration(call)
@@ -175,7 +179,7 @@ impl Ledger {
         if writes.is_empty() {
             return Some((reply, inner.mark(), number));
         }
-        // Outdates a running inspection, which could restore what this call removes.
+        // The new version outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| RecordContent::Call {

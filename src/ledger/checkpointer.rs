@@ -28,7 +28,7 @@ const LOOK: Duration = Duration::from_millis(500);
 const AGAIN: Duration = Duration::from_secs(1);
 /// Time without a new record after which the journal is compacted.
 const QUIET: Duration = Duration::from_secs(2);
-/// Shortest time between two compactions. Each wears out memory cards.
+/// Shortest time between two compactions, because each one wears out memory cards.
 const BETWEEN: Duration = Duration::from_secs(10);
 
 /// Limits the log lines about a failure to record the state, and about its end.
@@ -49,8 +49,8 @@ pub(crate) struct Checkpointer {
 
 impl Checkpointer {
     /// Writes the first generation of the checkpoint of `ledger` at `path`. Before that, no write may be answered,
-    /// because no journal would have it. Later the file is synced every `sync_interval`, unless the ledger's policy
-    /// differs. Waits for the disk for [`DISK_PATIENCE`] at most.
+    /// because no journal would have it. Later the file is synced every `sync_interval`, unless the ledger's sync
+    /// policy says otherwise. Waits for the disk for [`DISK_PATIENCE`] at most.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,
@@ -58,7 +58,7 @@ impl Checkpointer {
         sync_interval: Duration,
     ) -> Self {
         let opened = ledger.seen_store().is_some();
-        // If the checkpoint could not be opened, that was logged then.
+        // A checkpoint that could not be opened was already logged at the start.
         let said = ledger.unprotected().filter(|_| !opened);
         let mut checkpointer = Self {
             seq: 0,
@@ -127,7 +127,7 @@ impl Checkpointer {
             self.open_again().await;
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
-        // Comes before the repair below, so that a failure is logged even if it is repaired at once.
+        // Logs before the repair below, so that a failure is logged even if it is repaired at once.
         self.voice.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
@@ -136,7 +136,7 @@ impl Checkpointer {
     }
 
     /// Waits for the result of `work`, however long the disk takes. Calls `silent` when the disk has been silent for
-    /// too long.
+    /// [`DISK_PATIENCE`].
     async fn waited_for<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
         let mut work = std::pin::pin!(work);
         match timeout(DISK_PATIENCE, &mut work).await {
@@ -148,7 +148,7 @@ impl Checkpointer {
         }
     }
 
-    /// Like [`Ledger::on_store`], but reports a disk that is silent for too long.
+    /// Like [`Ledger::on_store`], but gives up on a disk that is silent for [`DISK_PATIENCE`].
     async fn on_store<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -230,7 +230,7 @@ impl Checkpointer {
             Some(Err(error)) => {
                 ledger.set_attempted(Err(&error));
                 self.failed_at = Some(Instant::now());
-                tracing::debug!(%error, "compaction");
+                tracing::debug!(%error, "compaction failed");
             }
             _ => {
                 let now = Instant::now();
@@ -238,7 +238,7 @@ impl Checkpointer {
                 let board = &self.voice.board;
                 board.update(|facts| facts.disk.compacted = Some((now, seq)));
                 if self.sync == SyncPolicy::Always {
-                    // The new file's name is not yet on the disk.
+                    // The new file's name must be synced, too.
                     self.sync(true).await;
                 }
                 ledger.set_attempted(Ok(()));

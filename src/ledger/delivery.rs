@@ -1,5 +1,5 @@
-//! Answers on their way to nodes, and the work that waits for them: the [order](crate::order), combined with the
-//! mirror.
+//! Tracks answers on their way to nodes, and wakes the calls and notifications that wait for them. The rules are in
+//! [`crate::order`].
 
 use std::{sync::Arc, time::Instant};
 
@@ -11,7 +11,7 @@ use crate::{
     order::{NextNotification, Order, heard_by_read},
 };
 
-/// An answer on its way to its caller. It is dropped once it was written or cannot be written any more.
+/// An answer on its way to its caller. Drop this handle once the answer has been written or can no longer be written.
 pub(crate) struct Delivery {
     /// `None` in simulations, which have their own time.
     ledger: Option<Arc<Ledger>>,
@@ -25,7 +25,8 @@ impl std::fmt::Debug for Delivery {
 }
 
 impl Delivery {
-    /// Tracks the answer with this number in the [`Order`] of `ledger`. It must not be dropped under the ledger's lock.
+    /// Tracks the answer with this number in the [`Order`] of `ledger`. The handle must not be dropped under the
+    /// ledger's lock.
     pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
         let ledger = Some(ledger.clone());
         Self { ledger, number }
@@ -77,7 +78,7 @@ impl Ledger {
         result
     }
 
-    /// Signals that answers or notifications that others [wait](Order) for may have ended.
+    /// Signals that a call or notification that [waits](Order) may be able to go on.
     pub(crate) fn order_changed(&self) -> watch::Receiver<()> {
         self.order_changed.subscribe()
     }
@@ -88,7 +89,8 @@ impl Ledger {
         }
     }
 
-    /// Begins the answer to a read. `None` if nodes are not notified of what it shows.
+    /// Begins the answer to `read`, so that later notifications of its caller wait for it. Returns `Ok(None)` if the
+    /// answer shows nothing that nodes are notified of.
     pub(crate) fn begin_read(
         self: &Arc<Self>,
         now: Instant,
@@ -105,7 +107,7 @@ impl Ledger {
         Ok(begun?.map(|number| Delivery::new(self, number)))
     }
 
-    /// Like [`Self::begin_read`], but never has to wait for the master.
+    /// Like [`Self::begin_read`], but begins the answer even if the master may be notifying the caller right now.
     pub(crate) fn begin_read_now(self: &Arc<Self>, read: &Request) -> Option<Delivery> {
         let begun = self.with_order(|order, mirror| {
             let heard = heard_by_read(read, mirror);
@@ -114,7 +116,7 @@ impl Ledger {
         Some(Delivery::new(self, begun?))
     }
 
-    /// Notes that the master has answered all calls.
+    /// Notes that the master has no unanswered calls left, or that the mirror has answered them.
     pub(crate) fn settled_calls(&self) {
         let awaited = self.lock().order.settled();
         self.report(awaited);

@@ -40,10 +40,10 @@ impl Mark {
     }
 }
 
-/// Progress of whole checkpoints, in versions of the mirror.
+/// Which versions of the mirror have been taken for, and written in, complete checkpoints.
 #[derive(Debug, Default)]
 pub(super) struct Whole {
-    /// The version after the last change that has no record.
+    /// The version after the last change that has no record, so only a complete checkpoint holds it.
     pub(super) unrecorded: u64,
     /// The version of the last checkpoint that was taken.
     taken: u64,
@@ -160,7 +160,7 @@ impl Ledger {
         raise(&self.attempted, taken);
     }
 
-    /// Runs `work` on the store after everything recorded so far. `None` without a store. Waits for the disk.
+    /// Runs `work` on the store after all earlier records were written. `None` without a store. Waits for the disk.
     pub async fn on_store<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -211,7 +211,7 @@ impl Ledger {
         self.lock().whole.is_due()
     }
 
-    /// Why the state is not recorded. `None` if it is.
+    /// Why the state is not recorded. `None` if the state is recorded.
     pub fn unprotected(&self) -> Option<String> {
         let inner = self.lock();
         let Some(journal) = &inner.journal else {

@@ -1,4 +1,5 @@
-//! The steps from an examined master to an open gate.
+//! The ledger's part in an injection: freezes the mirror while a master is brought to its state, and starts the new
+//! incarnation.
 
 use super::{Basis, Ledger};
 use crate::{master::Master, replay::Token};
@@ -43,8 +44,8 @@ impl Ledger {
 
     /// Starts the next incarnation, so that replies of the previous one no longer count. Returns the new token.
     ///
-    /// The journal records the new number once the master has it. A rosrescue that starts in between finds a master
-    /// with a higher number, or a master without the pending writes.
+    /// The journal records the new number once the master has it. A rosrescue that starts before that finds either a
+    /// master with a higher number than the recorded one, or a master without the pending writes.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.raise_incarnation();
@@ -84,19 +85,19 @@ impl Ledger {
         inner.served.map(|of| of == inner.session.incarnation)
     }
 
-    /// Allows the mirror to change again.
+    /// Ends the freeze of [`Self::begin_injection`] and [`Self::resume`]: the mirror may change again.
     pub fn end_injection(&self) {
         self.lock().injecting = false;
     }
 
     /// Notes that the connection to the present incarnation ended before the answer to a batch. The master may still
-    /// run it.
+    /// run that batch.
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
     }
 
-    /// Notes that the present incarnation no longer runs an earlier call.
+    /// Notes that the present incarnation can no longer be running a batch of an ended connection.
     pub fn settled(&self) {
         self.lock().abandoned = false;
     }

@@ -19,7 +19,7 @@ use crate::{
 };
 
 /// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and several can queue
-/// up. A robot stops if calls are not answered.
+/// up. The limit exists because a robot stops if calls are not answered.
 pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Why nothing is recorded after [`DISK_PATIENCE`].
@@ -35,8 +35,7 @@ pub(super) struct Journal {
     shared: Arc<StoreQueue>,
     /// Number of the last entry, recorded or not.
     seq: u64,
-    /// Whether entries are passed to the store. After a silence of the disk they are not, until the next complete
-    /// checkpoint.
+    /// Whether entries are passed to the store. False after the disk was silent, until the next complete checkpoint.
     gives: bool,
 }
 
@@ -45,7 +44,7 @@ pub(super) struct StoreQueue {
     jobs: Mutex<VecDeque<Job>>,
     store: Mutex<Store>,
     seen: Mutex<StoreState>,
-    /// The last record that answers need not wait for.
+    /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
     sync: SyncPolicy,
 }
@@ -83,7 +82,7 @@ impl StoreQueue {
                 job(&mut store);
             }
             drop(store);
-            // This thread also runs a job that was queued before it released the lock.
+            // Another thread may have queued a job while this one held the lock. This thread runs that job, too.
             if self.jobs().is_empty() {
                 return;
             }
@@ -176,7 +175,7 @@ impl Journal {
         self.shared.seen().kept.take()
     }
 
-    /// Records `entries`. A failure is kept in the store.
+    /// Passes `entries` to the store, which records them later and keeps a failure.
     pub(super) fn append(&mut self, entries: Vec<RecordContent>) {
         self.seq += entries.len() as u64;
         if !self.gives {
@@ -184,7 +183,7 @@ impl Journal {
         }
         let given = self.run(move |store| {
             if let Err(error) = store.append(&entries) {
-                tracing::debug!(%error, "append");
+                tracing::debug!(%error, "appending to the journal failed");
             }
         });
         if given.is_none() {
@@ -212,8 +211,8 @@ impl Journal {
         })
     }
 
-    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on the store
-    /// receives records again.
+    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on entries are
+    /// passed to the store again.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
         checkpoint: Checkpoint,
@@ -224,7 +223,7 @@ impl Journal {
         let shared = Arc::clone(&self.shared);
         let given = self.run(move |store| {
             if shared.seen().gaps_over < gaps {
-                // The file lacks records.
+                // The file lacks the records that were withheld.
                 store.give_up(SILENT);
                 shared.seen().gaps_over = gaps;
             }

@@ -13,7 +13,7 @@ use crate::{
 /// The state of a late master once it has answered its outstanding calls.
 pub(super) struct LateState {
     state: Master,
-    /// Number of pending writes that it will have run by then.
+    /// How many of the pending writes the master will have run by then.
     ran: usize,
     /// Subjects of the notifications that the outstanding writes may cause.
     tells: Vec<Subject>,
@@ -29,7 +29,7 @@ pub(crate) enum CatchUp {
     Run(Box<Missed>),
 }
 
-/// What a late master has missed.
+/// The writes that a late master has missed, and the states before and after them.
 #[derive(Debug)]
 pub(crate) struct Missed {
     /// The state that the master holds.
@@ -54,7 +54,8 @@ impl Ledger {
         });
     }
 
-    /// Notes that the present incarnation has answered its outstanding calls. It may notify nodes only now.
+    /// Notes that the present incarnation has answered its outstanding calls. So that master may notify nodes of them
+    /// only now.
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
         let Inner {
@@ -82,8 +83,8 @@ impl Ledger {
     /// Decides what the present incarnation needs after it was late and has answered. Freezes the mirror until
     /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation if the master gets any writes.
     ///
-    /// `None` if the master must be examined instead. That is so if it has not answered, if a node would have to shut
-    /// down, or if a node would be notified twice of one subject and get the older value last.
+    /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
+    /// shut down, or a node would be notified twice of one subject and could get the older value last.
     pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
         let mut inner = self.lock();
         let behind = inner.behind.take().filter(|behind| behind.answered)?;

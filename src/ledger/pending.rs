@@ -7,7 +7,7 @@ const COUNT_MAX: usize = 10_000;
 /// Maximum memory of the pending writes in bytes, approximately.
 const BYTES_MAX: usize = 16 << 20;
 
-/// There are too many pending writes to tell which parts of a master's state are newer than the mirror.
+/// There were more pending writes than [`COUNT_MAX`] or [`BYTES_MAX`] allow, so all were dropped.
 #[derive(Debug)]
 pub(super) struct TooMany;
 
@@ -25,7 +25,7 @@ impl PendingWrites {
     ///
     /// # Errors
     ///
-    /// If there are too many. Then all pending writes are dropped.
+    /// If there are too many pending writes. Then all of them are dropped.
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,

@@ -21,12 +21,12 @@ pub(super) enum Shared {
     Nobody,
     /// Another computer has the master. Only its records are applied and recorded.
     Elsewhere,
-    /// Ours: the others are given them.
+    /// This computer has the master. The other computers get its writes.
     Here { times_led: u64, sharing: Sharing },
 }
 
-/// A position in the journal that all computers share: how often this computer has begun a term, and the number of a
-/// record.
+/// A position in the journal that all computers share: a record's number, and a count of [`Ledger::leave`] calls, which
+/// tells the terms of this computer apart.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
     times_led: u64,
@@ -63,7 +63,7 @@ impl Ledger {
     }
 
     /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is
-    /// the state that they hold; if this computer's state differs, they get it as a whole.
+    /// the state that the others hold. If this computer's state differs, the others get the whole state.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let times_led = self.agreed.borrow().times_led;
@@ -91,8 +91,8 @@ impl Ledger {
         }
     }
 
-    /// Takes the same changes as a single one: the state that they have led to. `None` if this computer does not have
-    /// the master.
+    /// Like [`Self::take_changes`], but takes the changes as a single one: the state that they have led to. `None` if
+    /// this computer does not have the master.
     pub(crate) fn take_as_state(&self) -> Option<Change> {
         let inner = &mut *self.lock();
         match &mut inner.shared {
@@ -101,9 +101,9 @@ impl Ledger {
         }
     }
 
-    /// Judges `calls`, which a computer answered while it was cut off, as if they were made now. The computer sends
-    /// them under the name `merge`, and knows the other computers' changes up to record `seq`. `None` if some of the
-    /// changes after that were dropped.
+    /// Judges whether each of `calls`, which another computer answered while it was cut off, conflicts with a change
+    /// after record `seq`. That computer sends them under the name `merge`, so changes of this name are no conflict.
+    /// `None` if this computer does not lead, or no longer knows all changes after `seq`.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
         match &inner.shared {
@@ -160,7 +160,7 @@ impl Ledger {
         }
     }
 
-    /// Waits until the other computers have the record at `place`. False if this computer no longer has the master.
+    /// Waits until the other computers have the record at `place`. False if this computer stopped leading before that.
     pub(super) async fn agreed(&self, place: Agreed) -> bool {
         let mut agreed = self.agreed.subscribe();
         // This cannot fail: the ledger owns the sender.
@@ -238,7 +238,8 @@ impl Inner {
     pub(super) fn share_state(&mut self) {
         if let Shared::Here { sharing, .. } = &mut self.shared {
             sharing.record_state(&self.mirror);
-            // The calls that follow have other numbers than the session tells.
+            // The state takes a number in that journal, so the session's record must be written again: later calls have
+            // other numbers than that record tells.
             self.session_unwritten = true;
         }
     }
@@ -404,7 +405,7 @@ mod tests {
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
-        // The same holds when this computer leads again and uses the same numbers for other calls.
+        // The old calls stay unacknowledged when this computer leads again and uses their numbers for other calls.
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));

@@ -168,7 +168,8 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert!(ledger.stand_in(now, &bye).is_some());
 }
 
-/// A call in flight when the master goes away may still run when it is back, even if the call changes nothing now.
+/// A call in flight when the master goes away may still run when the master is back, even if the call changes nothing
+/// now.
 #[test]
 fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     let ledger = ledger();
@@ -193,7 +194,7 @@ fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     assert!(ledger.resume());
 }
 
-/// The registration that it removes may be on its way to a slow master.
+/// The registration that the call removes may still be on its way to a slow master.
 #[test]
 fn an_unregistration_without_effect_is_left_to_the_master() {
     let ledger = ledger();
@@ -209,7 +210,7 @@ fn an_unregistration_without_effect_is_left_to_the_master() {
     assert!(ledger.answer_if_unchanged(now, &bye).is_none());
 }
 
-/// Loggers repeat these calls all the time. They use no memory, and do not outdate a prepared injection.
+/// Loggers repeat parameter subscriptions all the time, so these use no memory and do not outdate a prepared injection.
 #[test]
 fn what_changes_nothing_leaves_no_trace() {
     let ledger = ledger();
@@ -258,7 +259,8 @@ fn a_write_behind_a_subscription_is_no_divergence() {
     assert!(!recorded.doubtful);
 }
 
-/// The same holds for calls that remove nothing from the mirror: a master that comes back may have it.
+/// An unregistration that removes nothing from the mirror is pending, because a master that comes back may have the
+/// registration.
 #[test]
 fn what_takes_nothing_away_is_pending_within_limits() {
     let ledger = ledger();
@@ -424,7 +426,7 @@ fn topics_are_remembered_while_a_dead_master_may_owe_notifications() {
     assert_eq!(owed(start + NOTICE_MEMORY / 2), ["/t"]);
 }
 
-/// A compaction runs between the record and the deaths of master and rosrescue.
+/// A compaction may run between the record and the deaths of master and rosrescue.
 #[test]
 fn who_was_displaced_lately_is_in_the_snapshot() {
     let ledger = ledger();
@@ -441,7 +443,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     let rebuilt = crate::checkpoint::session::rebuild(Some(read), Vec::new());
     let apis: Vec<_> = rebuilt.displaced.iter().map(|it| &*it.api).collect();
     assert_eq!(apis, ["http://n:1/"]);
-    // They are also in the next start's snapshot, until the master is examined.
+    // The displaced nodes are also in the next start's snapshot, until the master is examined.
     let next = self::ledger();
     next.with_activity(|_, activity| activity.restore_displaced(rebuilt.displaced));
     assert_eq!(next.checkpoint().displaced, checkpoint.displaced);

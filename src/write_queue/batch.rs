@@ -44,7 +44,7 @@ pub(crate) struct Item {
     concern: Concern,
     /// The answer's place in the order. Set once the call is on its way to the master, or the mirror has answered it.
     pub delivery: Option<Delivery>,
-    /// For a call made by rosrescue: the condition under which it is still wanted.
+    /// For a call made by rosrescue: the condition under which the call is still wanted.
     pub condition: Option<Precondition>,
     /// Whether nodes whose port the call takes have been unregistered.
     pub way_made: bool,
@@ -53,7 +53,7 @@ pub(crate) struct Item {
     pub(super) merge: Option<Merge>,
 }
 
-/// An answer, and what must be dropped when the caller has it.
+/// An answer, and the handle to drop when the caller has the answer.
 pub(crate) type AnswerAndDelivery = (CallAnswer, Option<Delivery>);
 
 /// A node and its last calls at the time when rosrescue decided to register or unregister something for it. The
@@ -115,8 +115,8 @@ impl Item {
         self.answer.is_closed()
     }
 
-    /// Whether the call must stay behind all calls that were queued before it: it may change anything, or was decided
-    /// from their effects.
+    /// Whether the call must stay behind all calls that were queued before it. A call that cannot be decoded may change
+    /// anything, and a call by rosrescue was decided from the effects of earlier calls.
     fn is_last(&self) -> bool {
         self.raw.is_none() || self.call.is_none()
     }
@@ -130,8 +130,8 @@ impl Item {
         format!("{:.100} of {caller_id:.200}", call.method().name())
     }
 
-    /// Whether it may share a batch. It may not if its reply contains a parameter's value, because
-    /// a value that the master cannot return would spoil the whole reply.
+    /// Whether the call may share a batch with others. It may not if its reply contains a parameter's value, because a
+    /// value that the master cannot return would spoil the whole reply.
     fn may_share(&self) -> bool {
         let shareable = |call: &Arc<Request>| {
             let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
@@ -231,7 +231,7 @@ pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     (Head::default(), Bytes::from(body))
 }
 
-/// The replies to the `count` calls of a batch. `None` if the master did not answer each.
+/// The replies to the `count` calls of a batch. `None` if the master did not answer each call.
 pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     let Reply::Value(Value::Array(results)) = reply else {
         return None;

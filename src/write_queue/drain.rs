@@ -30,20 +30,19 @@ use crate::{
 
 /// Pause before an unsent batch is retried while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed
-/// master closes its connections within milliseconds; a master that only closed an idle connection
-/// answers.
+/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master closes its
+/// connections within milliseconds. A master that only closed an idle connection still answers.
 const GRACE: Duration = Duration::from_millis(5);
 
 /// A batch on its way to the master. Without items, the master's state is being read.
 struct InFlight {
     incarnation: u64,
-    /// The mirror's version when it was sent.
+    /// The mirror's version when the batch was sent.
     version: u64,
     items: Vec<Item>,
     /// Whether the mirror can answer these items.
     answerable: bool,
-    /// Whether it has been reported as late.
+    /// Whether the batch has been reported as late.
     told_late: bool,
     /// Whether the mirror has answered the items and the master has not.
     late: bool,
@@ -67,7 +66,7 @@ pub(crate) struct Drain {
     signals: Arc<Signals>,
     /// When the batch in flight becomes late.
     late_at: Option<tokio::time::Instant>,
-    /// Whether the late master has answered. The gate follows.
+    /// Whether the late batch has ended, although the gate is still [`State::Late`].
     late_over: bool,
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     /// The incarnation for which the gate was last open.
@@ -187,8 +186,8 @@ impl Drain {
         }
     }
 
-    /// When the mirror must answer for the master. It waits for the probes' verdict while the
-    /// mirror is in doubt, and while something is under way that only a master can answer.
+    /// When the mirror must answer in the master's place. `None` while the mirror is in doubt, or a call is under way
+    /// that only a master can answer. Then only the probes find that the master hangs.
     fn late_at(&self, state: State) -> Option<tokio::time::Instant> {
         let batch = self
             .in_flight
@@ -251,7 +250,7 @@ impl Drain {
             false => self.pack(),
         };
         if items.is_empty() && self.queue.is_empty() {
-            // The callers of lost calls are gone.
+            // No call is left: the callers of lost calls have gone.
             self.link.ledger.settled_calls();
         }
         if items.is_empty() && !inspects {
@@ -377,8 +376,7 @@ impl Drain {
         self.take_back(items);
         if error.may_have_run() {
             self.link.ledger.abandon_batch();
-            // Whether the master ran it is known only when the master is back. Until then the
-            // mirror answers.
+            // Whether the master ran the batch is known only when the master is back. Until then the mirror answers.
             self.lost = true;
             self.signals.lost.notify_one();
         } else {
@@ -404,9 +402,8 @@ impl Drain {
                 opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
                 vec![reply]
             }
-            // A call that cannot be decoded may change anything, so the master's state must be
-            // read. That does not show parameter subscriptions, which are recorded as if they went
-            // as predicted.
+            // The reply cannot be decoded, so the effect is unknown and the master's state must be read. Reading does
+            // not show parameter subscriptions, so these are recorded as the mirror predicts.
             ([item], None) if raw.status.is_success() => {
                 opaque = true;
                 let call = item.call.as_deref().filter(|call| subscribes_params(call));
@@ -437,8 +434,7 @@ impl Drain {
         };
         if opaque {
             self.link.ledger.doubt();
-            // Answers may be waiting already: after a failed read, calls are sent before the next
-            // one.
+            // Answers may be waiting already: after a failed read of the state, calls are sent before the next read.
             self.opaque.incarnation = incarnation;
             self.opaque.mark = self.opaque.mark.max(recorded.mark);
             let answers = items
@@ -484,8 +480,8 @@ impl Drain {
         if self.in_flight.is_some() {
             self.link.ledger.abandon_batch();
         }
-        // A master that comes back is examined only when this connection has ended, because it then
-        // runs no call of it any more.
+        // A master that comes back is examined only when this connection has ended, because only then can no call of
+        // this connection still be running.
         self.connection = None;
         if let Some(batch) = self
             .in_flight
@@ -496,7 +492,7 @@ impl Drain {
             rarely!(
                 info,
                 ?calls,
-                "in flight when the master went away; the mirror answers them"
+                "these writes were in flight when the master went away; the mirror answers them"
             );
             self.take_back(batch.items);
         }
@@ -504,8 +500,8 @@ impl Drain {
         self.link.ledger.settled_calls();
     }
 
-    /// Answers from the mirror what the master is late with, then the queue. The batch continues;
-    /// when the master has answered it, it is given the rest.
+    /// Answers from the mirror the batch that the master is late with, then the queue. The batch continues. When the
+    /// master has answered it, the recovery gives the master the writes that it missed.
     fn stand_in_for_late(&mut self) {
         self.grace = None;
         let ledger = self.link.ledger.clone();
@@ -514,7 +510,7 @@ impl Drain {
             Some(batch) => {
                 batch.late = true;
                 if batch.items.is_empty() {
-                    // A look at the master was under way, and is repeated.
+                    // A read of the master's state was under way, and must be repeated.
                     self.resync.request();
                 }
                 let mut answers = Answers::default();
@@ -530,7 +526,7 @@ impl Drain {
                 self.stats.calls_without_master.add(answers.count());
                 self.answer(answers.mark, None, answers.made);
             }
-            // It has answered just now.
+            // The master has answered the batch just now.
             None if !self.late_over => {
                 ledger.fall_behind(Vec::new());
                 self.late_done(Ok(()));

@@ -15,8 +15,8 @@ use crate::{
 };
 
 impl Drain {
-    /// Takes the next batch. A call that takes a port is the first of its batch, and the eviction
-    /// precedes it.
+    /// Takes the next batch. A call that registers the port of another node is the first of its batch. The eviction,
+    /// which unregisters that node, goes before it.
     pub(super) fn pack(&mut self) -> Vec<Item> {
         let ledger = self.link.ledger.clone();
         let mut items = loop {
@@ -30,7 +30,7 @@ impl Drain {
                 .into_iter()
                 .filter_map(|item| merge::judged(&ledger, item))
                 .collect();
-            // Answered calls leave room for more.
+            // If all these calls were answered without the master, the next ones are taken.
             if !any || !items.is_empty() {
                 break items;
             }
@@ -68,7 +68,7 @@ fn eviction(ledger: &Ledger, call: &Request) -> Option<Eviction> {
     ledger.with_mirror(|mirror| Eviction::before(mirror, call))
 }
 
-/// Unregisters at once, while the mirror stands in.
+/// Unregisters the nodes whose port `call` takes, while the mirror stands in.
 pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     if let Some(eviction) = eviction(ledger, call)
         && ledger.stand_in(Instant::now(), &eviction.call).is_some()

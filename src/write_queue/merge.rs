@@ -1,5 +1,5 @@
-//! Merges the writes of a computer that was cut off. Conflicts with changes by other computers are left out at the last
-//! moment, when no other call is on its way to the master.
+//! Merges the writes of a computer that was cut off. Writes that conflict with changes by other computers are left out
+//! at the last moment, when no other call is on its way to the master.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -29,7 +29,7 @@ impl Judged {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = verdicts;
     }
 
-    /// The answer to the computer that sent the writes. `reply` is the master's reply to those that were made.
+    /// The answer to the computer that sent the writes. `reply` is the master's reply to the writes that were made.
     pub(super) fn answer(&self, reply: &Reply) -> wire::MergeAnswer {
         match &*self.0.lock().unwrap_or_else(PoisonError::into_inner) {
             Some(verdicts) => wire::MergeAnswer::of(verdicts, reply),
@@ -69,7 +69,8 @@ fn set_call(item: &mut Item, call: Request) {
     item.call = Some(call);
 }
 
-/// Leaves out writes that conflict with changes by other computers. `None` if none remain and the item is answered.
+/// Leaves out writes that conflict with changes by other computers. `None` if no write remains. Then the item is
+/// answered.
 pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);

@@ -6,8 +6,9 @@ use crate::{
     master::Master,
 };
 
-/// Whether a call made by rosrescue is no longer right. The node has registered at another address, and the call would
-/// shut it down; or the node itself has done the opposite.
+/// Whether a call made by rosrescue is no longer right. It is outdated if its
+/// [precondition](super::batch::Precondition) no longer holds, or if it would shut a node down that has registered at
+/// another address meanwhile.
 pub(super) fn is_outdated(ledger: &Ledger, item: &Item) -> bool {
     let Some(call) = item.call.as_deref().filter(|_| item.raw.is_none()) else {
         return false;

@@ -1,5 +1,5 @@
-//! Sends long multicalls to the master in parts, so that other writes pass in between. rosmaster does not run a
-//! multicall as one step either: entries of concurrent multicalls take turns.
+//! Sends long multicalls to the master in parts, so that other writes pass in between. No client can rely on a
+//! multicall running in one step: in rosmaster, entries of concurrent multicalls take turns.
 
 use std::{iter::Peekable, vec};
 
@@ -45,7 +45,8 @@ impl Iterator for Parts {
 }
 
 /// Whether the entry's result is independent of other entries. A malformed entry, or a parameter's value that the
-/// master cannot return, turns the whole multicall into a fault. A dict among the results shows later writes.
+/// master cannot return, turns the whole multicall into a fault. A dict among the results also shows the writes of
+/// later entries.
 fn stands_alone(entry: &Entry) -> bool {
     let Entry::Request(call) = entry else {
         return false;

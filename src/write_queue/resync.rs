@@ -1,5 +1,5 @@
-//! Schedules when the master's state is read again to compare it with the mirror. Pure: the time is
-//! an argument.
+//! Schedules *inspections*, which read the master's whole state to compare it with the mirror. Pure: the time is an
+//! argument.
 
 use std::time::Duration;
 
@@ -7,10 +7,10 @@ use tokio::time::Instant;
 
 /// Pause after an inspection that failed.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);
-/// After each inspection writes pass for this many times its duration, because they wait for inspections and a larger
-/// state takes longer. Requests that come meanwhile share the next inspection.
+/// The pause after an inspection is this many times its duration. Writes pass only in the pauses, because they wait
+/// during an inspection. All requests during a pause share the next inspection.
 const SPACING: u32 = 10;
-/// Longest pause between two inspections. Answers may be waiting for the next one.
+/// Longest pause between two inspections, because answers may be waiting for the next one.
 const SPACING_MOST: Duration = Duration::from_secs(30);
 
 /// The schedule of inspections.

@@ -50,8 +50,8 @@ impl RoundTripError {
     }
 }
 
-/// Sends `request`, or without one reads the master's state. The future owns what it needs, so dropping it closes the
-/// connection.
+/// Sends `request`, or without one reads the master's state. The future owns the connection, so dropping the future
+/// closes it.
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,

@@ -43,7 +43,7 @@ const PATIENCE: u64 = 100_000;
 /// When notifications that a dead master may not have sent are sent, in microseconds.
 const OWED_AFTER: u64 = 50_000;
 
-/// A part of production's order that is left out, to show that the simulation notices.
+/// A rule of the order that is left out, to show that the simulation notices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mutant {
     None,
@@ -59,9 +59,9 @@ enum Event {
     Arrives(usize, Request),
     /// The master with this number has run the batch, and its reply arrives.
     Replied(u64, Vec<Reply>),
-    /// The batch with this number has waited for the patience.
+    /// The batch with this number has waited for as long as the patience allows.
     Late(u64),
-    /// The master, which did nothing for a while, runs these calls.
+    /// The master runs these calls after it did nothing for a while.
     RunsLate(u64, Vec<Arc<Request>>),
     /// The answer to this call has been written.
     Written(u64),
@@ -75,11 +75,11 @@ enum Event {
     Taken(String, u64),
     Dies,
     Revives,
-    /// Sends what a master that is still away may not have sent.
+    /// rosrescue sends the notifications that a master, which is still away, may not have sent.
     OwedInOutage,
-    /// Sends it after a recovery.
+    /// rosrescue sends, after a recovery, the notifications that the dead master may not have sent.
     Owed,
-    /// Something is due.
+    /// A deadline of the queue or of the notifications has passed.
     Tick,
 }
 
@@ -255,7 +255,7 @@ impl World {
         });
     }
 
-    /// The answer is ready; its task writes it when it runs.
+    /// Readies an answer, which its task writes as soon as the task runs.
     fn answer(&mut self, node: usize, call: Request, reply: Reply, delivery: Option<Delivery>) {
         let number = delivery.map(Delivery::into_number);
         self.answers += 1;
@@ -384,7 +384,7 @@ impl World {
         self.ledger.fall_behind(tells);
     }
 
-    /// The late master has answered, and is given what it missed.
+    /// The late master has answered, and gets the writes that it missed.
     fn catches_up(&mut self) {
         (self.in_flight, self.late) = (None, false);
         let now = self.instant();
@@ -637,7 +637,7 @@ impl World {
     }
 
     /// Plays until all is quiet. Returns the nodes' false beliefs, and how often a late master was
-    /// given what it missed and nothing more.
+    /// given only the writes that it missed.
     fn play(mut self) -> (Vec<String>, u64) {
         while let Some(Reverse((time, number))) = self.events.pop() {
             self.now = time;

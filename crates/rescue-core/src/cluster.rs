@@ -7,12 +7,14 @@
 //! off cannot commit, and a transaction that is sent twice takes effect once. The records of calls are in `journal/`,
 //! and are written in the same transaction. See decision 29.
 //!
-//! * [`displaced`]: whom the next leader tells to shut down.
+//! * [`displaced`]: nodes that the next leader must tell to shut down.
 //! * [`machine`]: who leads, and what may be acknowledged.
 //! * [`member`]: what one computer follows, answers, writes to the journal and merges, and when it runs a master.
-//! * [`outgoing`], [`cut_off`], [`sharing`], [`standing`]: parts of that.
+//! * [`standing`]: who has the master, and where calls go.
+//! * [`sharing`]: changes that the other computers must get; [`outgoing`]: those that are not in the journal yet.
+//! * [`cut_off`]: writes that were answered while this computer was cut off.
 //! * [`journal`]: records and snapshots to and from keys and values.
-//! * [`merge`]: what of the writes of a computer that was alone still holds.
+//! * [`merge`]: which writes of a computer that was cut off still hold.
 //! * [`namesake`]: another computer with this one's name.
 
 pub mod cut_off;

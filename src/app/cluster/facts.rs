@@ -85,7 +85,8 @@ impl Known {
         self.members.insert(heard.name.clone(), member);
     }
 
-    /// Checks whether the computer `name`, or any if it is empty, can take over. Returns the reason if not.
+    /// Checks whether the computer `name` can take over, or any other computer if `name` is empty. Returns the reason
+    /// if not.
     pub(super) fn successor(&self, name: &str) -> Result<(), String> {
         let others = self
             .members

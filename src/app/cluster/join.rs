@@ -1,4 +1,4 @@
-//! Creates the context of a computer among several.
+//! Creates what a computer needs as one of several.
 
 use std::{
     collections::VecDeque,
@@ -42,7 +42,7 @@ pub(in crate::app) struct ClusterSetup {
     /// Identifies this process.
     pub(in crate::app) instance: HeaderValue,
     pub(in crate::app) restore: RestorePolicy,
-    /// How long a call waits that no component can answer.
+    /// How long a call waits while nothing can answer it (`--hold`).
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
@@ -52,7 +52,7 @@ pub(in crate::app) struct ClusterSetup {
     pub(in crate::app) halt: CancellationToken,
 }
 
-/// Returns the way to the other computers, and the driver to run.
+/// Creates the handle through which calls reach the other computers, and the driver to run.
 pub(in crate::app) async fn join(
     setup: ClusterSetup,
 ) -> Result<(Others, ClusterDriver), EtcdError> {
@@ -110,7 +110,8 @@ pub(in crate::app) async fn join(
             seq: setup.restored.into(),
             ..Place::default()
         })),
-        // The next leader needs the time to live, and etcd may have to elect its own leader first.
+        // A call may have to wait for the next leader. That takes the time to live, and longer if etcd must elect its
+        // own leader first.
         hold: setup.hold.max(2 * config.ttl),
     };
     let (kept, left) = Kept::left(&context.checkpoint, setup.restored).await;

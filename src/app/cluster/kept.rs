@@ -35,8 +35,8 @@ fn path_of(checkpoint: &Path) -> PathBuf {
 }
 
 impl Kept {
-    /// Opens the file, and returns the writes that an earlier process left. If its session does not continue
-    /// (`goes_on`), the file is kept under another name.
+    /// Opens the file, and returns the writes that an earlier process left. If the session of that process does not
+    /// continue (`goes_on` is false), the file is kept under another name.
     pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
         let path = path_of(checkpoint);
         let opened = wait::within(DISK_PATIENCE, move || {
@@ -81,7 +81,7 @@ impl Kept {
         (this, left)
     }
 
-    /// Stores exactly `calls`, answered since the state was `base`.
+    /// Replaces the file's content by `calls`, which were answered since the state was `base`.
     pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
         let path = path_of(checkpoint);
         let store = match self.store.take() {
@@ -111,7 +111,7 @@ impl Kept {
         self.written = self.store.as_ref().map_or(0, Store::journal_bytes);
     }
 
-    /// Stores these calls as well.
+    /// Adds `calls` to the file.
     pub(super) async fn add(&mut self, calls: Vec<Request>) {
         if let Some(mut store) = self.store.take() {
             let entries = entries(calls);
@@ -147,7 +147,7 @@ impl Kept {
     pub(super) async fn remove(&mut self, checkpoint: &Path) {
         self.store = None;
         let path = path_of(checkpoint);
-        // It only has to be done before the next start.
+        // A hanging disk may remove the file later: it must only be gone before the next start.
         wait::within(DISK_PATIENCE, move || remove_files(path)).await;
     }
 }

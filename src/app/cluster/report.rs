@@ -1,4 +1,4 @@
-//! Logs what the member reports.
+//! Logs the events that the cluster's state machine reports.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -33,13 +33,16 @@ impl ClusterDriver {
                 tracing::warn!("this computer leads again, because etcd has answered");
             }
             News::Deposed => {
-                tracing::warn!("this computer no longer leads; another computer does, or may");
+                tracing::warn!(
+                    "this computer no longer leads, because another computer leads or may lead"
+                );
             }
             News::EtcdLost => tracing::error!(
                 "etcd has lost its data; the most recent state of a living computer will replace it"
             ),
             News::Lapsed => tracing::warn!(
-                "etcd does not answer, and another computer may lead by now; killed the master, and the mirror answers"
+                "etcd does not answer, so another computer may lead by now. This computer has killed its master, and \
+                 its mirror answers"
             ),
             News::Suspect { uri, until } => {
                 let name = &self.member.settings().name;
@@ -48,7 +51,7 @@ impl ClusterDriver {
                     name,
                     uri,
                     "the cluster knows this computer's name at another address; the start waits up to {wait:.0?} to \
-                     see whether another computer has it"
+                     see whether another living computer has the name"
                 );
             }
             News::TooLarge(error) => rarely!(
@@ -87,9 +90,9 @@ impl ClusterDriver {
             ALONE,
             why,
             serves,
-            "ALONE: this computer is cut off from the others or from etcd's majority; with --alone serve its own \
-             nodes are served and what they write is sent to the leader later, else writes wait. Repair the \
-             network, or etcd"
+            "ALONE: this computer is cut off from the others or from etcd's majority. With --alone serve, it answers \
+             its own nodes and sends their writes to the leader later. With --alone refuse, writes wait. Repair the \
+             network or etcd"
         );
     }
 }
@@ -103,8 +106,8 @@ pub(super) fn cause(of: Cause) -> &'static str {
     }
 }
 
-/// Logs the lost ones among the writes that were answered while cut off. One line per subject, because a node may
-/// have written to it a thousand times.
+/// Logs which of the writes that were answered while cut off are lost. Logs one line per subject, because a node may
+/// have written to the same subject a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
     for (call, outcome) in &outcomes {

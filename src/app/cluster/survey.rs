@@ -1,4 +1,4 @@
-//! Warns at the start about mistakes in `--cluster`, even if it works.
+//! Warns at the start about mistakes in `--cluster`, even if the cluster works.
 
 use std::time::Duration;
 
@@ -25,9 +25,9 @@ pub(super) async fn try_endpoints(replica: Replica) {
     }
 }
 
-/// Looks for a typo in the name `robot`, which etcd does not know, among the other robots' names.
+/// Warns if `robot`, a name without keys in etcd, may be a typo of another robot's name.
 pub(super) async fn look_for_typo(replica: Replica, robot: String) {
-    // This robot may have keys by now.
+    // By now etcd may have keys of this robot.
     if let Ok(mut robots) = replica.client.robots(LIMIT).await {
         robots.retain(|other| *other != robot);
         survey::typo(&robot, &robots).iter().for_each(warn);

@@ -1,4 +1,4 @@
-//! The trouble with etcd, for the status and the log.
+//! Keeps whether etcd answers, for the status and the log.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -43,7 +43,8 @@ impl Trouble {
         }
     }
 
-    /// Whether etcd has not answered for longer than `limit`. If so, reports it, because a request may take longer.
+    /// Whether etcd has not answered for longer than `limit`. If so, reports the silence, because the request under way
+    /// may fail only later.
     pub(super) fn is_silent(&self, limit: Duration) -> bool {
         let (known, heard) = self.lock().clone();
         let silent = heard.elapsed();

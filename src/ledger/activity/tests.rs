@@ -135,7 +135,7 @@ fn who_was_displaced_by_the_journal_is_told_unless_the_name_is_its_own_again() {
         at("/gone", "http://n:3/"),
     ];
     activity.restore_displaced(displaced.to_vec());
-    // Nodes are not told before the master was examined.
+    // Nodes are not told to shut down before the master was examined.
     assert_eq!(activity.take_owed(now).displaced, []);
     activity.notice_all(&master, now);
     assert_eq!(activity.take_owed(now).displaced, [taken]);

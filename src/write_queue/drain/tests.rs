@@ -30,8 +30,8 @@ fn told(ledger: &Ledger) -> Option<Value> {
     }
 }
 
-/// The master may have told the nodes what a lost call has changed. The state before that call is then an older
-/// list after a newer one.
+/// The master may have notified nodes of what a lost call changed. If rosrescue sent the state before that call, the
+/// nodes would get an older list after a newer one.
 #[tokio::test]
 async fn nodes_are_not_told_the_state_before_a_lost_call() {
     let mut mirror = Master::default();

@@ -41,9 +41,9 @@ pub(super) struct Node {
     set: BTreeSet<String>,
     /// A call of roscpp that holds the mutex which a publisherUpdate needs.
     subscribing: Option<String>,
-    /// Notifications that wait for the mutex.
+    /// Notifications that wait for the mutex of roscpp.
     blocked: Vec<Call>,
-    /// When the last value of each parameter to arrive was set, from any sender.
+    /// For each parameter, when the value that arrived last was set.
     arrived: BTreeMap<String, u64>,
     gone_back: Vec<String>,
 }

@@ -1,5 +1,5 @@
-//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; the shell also
-//! stores them beside the checkpoint.
+//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; `app/cluster`
+//! also stores them beside the checkpoint.
 
 use std::collections::VecDeque;
 
@@ -23,9 +23,9 @@ const EXPECTED_MOST: usize = 4_000;
 pub struct Time {
     /// The state when this computer was cut off.
     pub base: Master,
-    /// The writes answered since.
+    /// The writes answered since then.
     pub pending: WritesToSend,
-    /// The others' changes since.
+    /// The other computers' changes since then.
     pub changes: Changes,
     /// How many of the writes may also be in the journal.
     expected: usize,
@@ -79,7 +79,7 @@ impl CutOff {
         if is_empty && self.times.len() > 1 {
             self.times.pop_back();
         }
-        // The oldest period may be on its way.
+        // The oldest period stays, because its writes may be on their way. The next two become one.
         if self.times.len() >= TIMES_MOST
             && let Some(second) = self.times.remove(2)
             && let Some(first) = self.times.get_mut(1)
@@ -159,7 +159,7 @@ impl CutOff {
                 continue;
             };
             let call = Request::from(call.clone());
-            // Only so many can be on their way at once.
+            // No more writes than this can be on their way to etcd at once.
             if given && time.expected < EXPECTED_MOST {
                 time.expected += 1;
                 time.changes.expect_record(record.seq, call.clone());
@@ -175,7 +175,7 @@ impl CutOff {
         self.times.front().map(|time| &time.base)
     }
 
-    /// All writes, in order.
+    /// All kept writes, in the order in which they were answered.
     pub fn calls(&self) -> impl Iterator<Item = &Request> {
         self.times.iter().flat_map(|time| time.pending.calls())
     }
@@ -185,7 +185,7 @@ impl CutOff {
         self.times.iter().map(|time| time.pending.len()).sum()
     }
 
-    /// The oldest period.
+    /// The oldest period whose writes have not all reached a leader.
     pub fn first_mut(&mut self) -> Option<&mut Time> {
         self.times.front_mut()
     }
@@ -246,7 +246,7 @@ mod tests {
         cut_off.add(&[change(5, set("/a", 1))], false);
         cut_off.begin(base());
         cut_off.add(&[change(6, set("/b", 2))], false);
-        // etcd has the second after all.
+        // etcd has the second period's write after all.
         cut_off.resumed();
         assert_eq!(first(&cut_off), [set("/a", 1)]);
         cut_off.resumed();
@@ -267,7 +267,7 @@ mod tests {
             let merged = merge::merge(&time.changes, &base(), time.pending.calls());
             assert!(merged.lost.is_empty(), "{:?}", merged.lost);
         }
-        // The same by another node is a change.
+        // The same call by another node is a change.
         let of_another = Request::new(
             Method::SetParam,
             [Value::from("/m"), "/count".into(), 1.into()],
@@ -278,7 +278,7 @@ mod tests {
         assert_eq!(merged.lost.len(), 1);
     }
 
-    /// The first one's writes are on their way when the second begins.
+    /// The first period's writes are on their way when the second begins.
     #[test]
     fn the_second_of_two_periods_continues_from_the_first() {
         let others = base();
@@ -288,7 +288,7 @@ mod tests {
         assert_eq!(second.params().get("count"), Some(&1.into()));
         cut_off.begin(second);
         cut_off.add(&[change(6, set("/count", 2))], false);
-        // The others get the first.
+        // The others get the first period's write.
         let merged = |cut_off: &CutOff, others: &Master| {
             let first = cut_off.times.front().unwrap();
             merge::merge(&first.changes, others, first.pending.calls())
@@ -315,7 +315,7 @@ mod tests {
         assert!(cut_off.times.len() <= TIMES_MOST);
         let last = cut_off.times.back().unwrap();
         assert_eq!(calls_of(last), [set("/a", 49)]);
-        // What was written this time only is in the journal.
+        // The last period's write is in the journal after all.
         cut_off.resumed();
         assert_eq!(first(&cut_off), []);
         assert_eq!(calls_of(cut_off.times.back().unwrap()), [set("/a", 48)]);

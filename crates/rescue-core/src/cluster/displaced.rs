@@ -1,5 +1,5 @@
-//! Nodes whose names were taken while another computer led: the next leader tells them to shut down, because that one may
-//! have died before it could.
+//! Nodes whose names were taken while another computer led: the next leader tells them to shut down, because the
+//! previous one may have died before it did.
 
 use std::{
     collections::{BTreeMap, VecDeque},

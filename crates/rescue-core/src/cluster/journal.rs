@@ -4,7 +4,7 @@
 //! ROBOT/leader, ROBOT/alive           see `machine`
 //! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large; or
 //!                                     that of a snapshot, if the state was replaced by record N
-//! ROBOT/values/blob/N/PART            such records, in parts, written before the journal names them
+//! ROBOT/values/blob/N/PART            a blob's records, in parts, written before the journal names them
 //! ROBOT/snapshot                      the name of the snapshot that is whole, and what it stands for
 //! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
 //! ```
@@ -166,14 +166,14 @@ impl Kind {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Manifest {
     kind: Kind,
-    /// Its last record.
+    /// The last record that the value contains.
     pub seq: u64,
     bytes: usize,
     crc: u32,
 }
 
 impl Manifest {
-    /// Whether it is a whole state instead of records.
+    /// Whether the value is a whole state instead of records.
     pub fn is_state(&self) -> bool {
         self.kind == Kind::Snapshot
     }
@@ -246,7 +246,7 @@ impl Manifest {
 /// The records that one transaction adds to the journal.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct JournalBatch {
-    /// How many of the records it contains.
+    /// How many of the given records the entry contains.
     pub count: usize,
     pub entry: Option<Put>,
 }
@@ -331,7 +331,7 @@ pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
 /// How far a mirror has followed the journal, and the journal's size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
-    /// The last record.
+    /// The last record that the mirror contains.
     pub seq: u64,
     entries: usize,
     bytes: usize,
@@ -339,7 +339,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// A snapshot of the state after record `seq` was read or written.
+    /// The progress after a snapshot of `snapshot_bytes`, with the state after record `seq`, was read or written.
     pub fn after_snapshot(seq: u64, snapshot_bytes: usize) -> Self {
         Self {
             seq,
@@ -352,7 +352,7 @@ impl Progress {
     ///
     /// # Errors
     ///
-    /// [`JournalError::Gap`] if one is missing in between: a snapshot must be read.
+    /// [`JournalError::Gap`] if a record is missing before them, so that the journal must be read again.
     pub fn take(
         &mut self,
         records: Vec<Record>,
@@ -385,7 +385,7 @@ impl Progress {
         self.seq = seq;
     }
 
-    /// A snapshot of `bytes` has been written, of the state when the progress was `then`.
+    /// Notes that a snapshot was written. It is `bytes` long and holds the state at progress `then`.
     pub fn snapshot_written(&mut self, then: Self, bytes: usize) {
         self.entries = self.entries.saturating_sub(then.entries);
         self.bytes = self.bytes.saturating_sub(then.bytes);

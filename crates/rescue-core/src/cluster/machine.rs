@@ -1,8 +1,8 @@
 //! Decides who leads, what may be acknowledged, and when this computer is cut off.
 //!
-//! A state machine without IO, like [`crate::lifecycle`]: the shell passes in what happened and when, and carries out
-//! the returned actions. All deadlines are decided here. Each computer uses its own clock, and only to measure
-//! durations. Clocks may differ, and may run up to a tenth too fast or too slow.
+//! A state machine without IO, like [`crate::lifecycle`]: the [`member`](crate::cluster::member) passes in what
+//! happened and when, and carries out the returned actions. All deadlines are decided here. Each computer uses its own
+//! clock, and only to measure durations. Clocks may differ, and may run up to a tenth too fast or too slow.
 
 use std::time::{Duration, Instant};
 
@@ -25,7 +25,7 @@ pub use types::{
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 /// Pause before an unanswered request is sent again.
 const RETRY: Duration = Duration::from_millis(100);
-/// How often the leader writes `alive` per time to live.
+/// How often the leader writes the key `alive` per time to live ([`Settings::ttl`]).
 const BEATS: u32 = 4;
 /// A leader stops this part of the time to live (a fifth) before another may begin: a tenth for a slow clock, and a
 /// tenth for a fast one.
@@ -36,7 +36,7 @@ const PATIENCE: Duration = Duration::from_millis(1500);
 /// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
 const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
 
-/// The state machine.
+/// Decides who leads. See the [module](self).
 #[derive(Debug)]
 pub struct Machine {
     settings: Settings,
@@ -234,7 +234,7 @@ impl Machine {
         let view = match answer {
             EtcdAnswer::Silence => {
                 self.retry_at = Some(now + RETRY);
-                // Its effect is unknown, so it is sent again. The keys show whether a claim succeeded.
+                // The effect of a heartbeat is unknown, so it is sent again. The keys show whether a claim succeeded.
                 self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
                     silent: true,
                     ..flight
@@ -314,7 +314,7 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Does not claim leadership before `until`.
+    /// Makes this computer claim leadership no earlier than `until`.
     pub fn hold_claims(&mut self, until: Instant) {
         self.claim_not_before = Some(until);
     }
@@ -363,7 +363,7 @@ impl Machine {
         }
     }
 
-    /// Handles the success of the beat in `flight`.
+    /// Handles the success of the heartbeat in `flight`.
     fn beaten(
         &mut self,
         now: Instant,
@@ -385,7 +385,7 @@ impl Machine {
             self.committed = self.view.seq();
         }
         if released.is_some() {
-            // Another write may have come in between.
+            // After a release, another computer may lead.
             self.deposed(actions);
             actions.push(Action::Released);
             return;
@@ -403,7 +403,7 @@ impl Machine {
             match leadership.caught_up {
                 true => {
                     if self.settings.alone == WhenAlone::Refuse {
-                        // The shell has stopped recording, and starts again after the journal's last record.
+                        // The ledger has stopped recording, and starts again after the journal's last record.
                         self.hand_back(actions);
                         self.stale = false;
                     }
@@ -460,7 +460,7 @@ impl Machine {
         actions.push(Action::CatchUp(self.view.seq()));
     }
 
-    /// Has the shell keep this computer's calls that are not in the journal.
+    /// Has the member keep this computer's calls that are not in the journal.
     fn hand_back(&mut self, actions: &mut Vec<Action>) {
         let Self {
             committed,

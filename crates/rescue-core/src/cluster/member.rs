@@ -1,8 +1,8 @@
 //! Decides what one computer of several does: whom it follows, what its mirror holds, which calls it answers, what it
 //! writes to the journal and merges, and when it may run a master. Pure.
 //!
-//! [`Machine`], a part of it, decides who leads. The shell passes in what happened and when, and carries out the
-//! returned actions in order. The shell decides nothing, so the simulation in `cluster/tests` tests what production
+//! [`Machine`], a part of it, decides who leads. `app/cluster` passes in what happened and when, and carries out the
+//! returned actions in order. It decides nothing, so the simulation in `cluster/tests` tests what production
 //! decides.
 
 use std::{
@@ -88,7 +88,7 @@ struct Before {
 struct Namesake {
     /// Set if the member entry of this name belongs to another computer.
     sign: Option<Sign>,
-    /// Looks for such a computer. Set once etcd has been read.
+    /// Looks for a living computer with this one's name. Set once etcd has been read.
     watch: Option<namesake::NamesakeWatch>,
     /// Whether this process has led.
     led: bool,
@@ -99,7 +99,7 @@ struct Namesake {
 pub struct Member {
     keys: Keys,
     machine: Machine,
-    /// The role that the shell was told last.
+    /// The machine's role after the actions that were returned last.
     role: Role,
     standing: Standing,
     has_master: bool,
@@ -124,7 +124,7 @@ pub struct Member {
     queue: Queue,
 }
 
-/// Inputs for the machine and actions for the shell, in order.
+/// Inputs for the machine and actions for `app/cluster`, in order.
 #[derive(Debug, Default)]
 struct Queue {
     inputs: VecDeque<machine::Input>,
@@ -315,7 +315,7 @@ impl Member {
     /// Passes an input to the machine, and does what it decides.
     fn drive(&mut self, now: Instant, input: machine::Input) {
         let actions = self.machine.on(now, input);
-        // First, so that the next request does not send them again.
+        // Committed changes leave first, so that the next request does not send them again.
         for change in self.outgoing.committed(self.machine.committed()) {
             self.hold(now, change);
         }

@@ -1,5 +1,5 @@
-//! Decides which of a computer's writes hold that it answered while it was cut off: all, except those whose subject
-//! others have changed since, whatever its value is now.
+//! Decides which of the writes that a computer answered while it was cut off still hold: all, except those whose
+//! subject others have changed since, even if they have changed it back.
 //!
 //! The same rules apply twice: on the computer that was cut off, to the changes that it reads in the journal; and on
 //! the leader, before each portion, to later changes. See decision 42.
@@ -34,16 +34,16 @@ pub struct Merged {
 pub struct Lost {
     pub call: Request,
     pub why: Conflict,
-    /// The value that others set the parameter, or a namespace around it, to.
+    /// The parameter's value after others changed it, or a namespace around it.
     pub present: Option<Value>,
 }
 
 /// The verdict on one write.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Verdict {
-    /// Others have not changed its subject.
+    /// Others have not changed the write's subject.
     Runs,
-    /// Others have changed its subject to the same value.
+    /// Others have changed the write's subject to the same value.
     Holds,
     Lost(Lost),
 }
@@ -62,7 +62,7 @@ pub enum Conflict {
         name: String,
         node: String,
     },
-    /// The node has registered this again.
+    /// The node has registered this topic again.
     Registration {
         name: String,
         node: String,
@@ -92,7 +92,8 @@ impl fmt::Display for Conflict {
     }
 }
 
-/// Separates `pending`, in order, by the others' changes. `now` is the others' state.
+/// Separates the `pending` writes into those to send and those that are lost because of `changes` by others. `now` is
+/// the others' state.
 pub fn merge<'a>(
     changes: &Changes,
     now: &Master,
@@ -106,7 +107,7 @@ pub fn merge<'a>(
         match judge(changes, now, call) {
             Verdict::Runs => merged.send.push(call.clone()),
             Verdict::Holds => {}
-            // A value that was deleted again is not lost.
+            // A value that this computer itself deleted later does not count as lost.
             Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
             Verdict::Lost(lost) => merged.lost.push(lost),
         }
@@ -119,7 +120,7 @@ pub fn merge<'a>(
     merged
 }
 
-/// Judges `call`, which is no multicall.
+/// Decides whether `call`, which must not be a multicall, still holds.
 pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let Some(why) = conflict(changes, now, call) else {
         return Verdict::Runs;

@@ -1,8 +1,8 @@
 //! Detects another living computer with this one's name, before this one takes part. Pure.
 //!
-//! Keys in etcd may name a computer with the same name and another address. It is alive if they change: `alive`
-//! several times per time to live, the entry among the members every five seconds. If they do not change, they are
-//! from a time when this computer had another address.
+//! Keys in etcd may name a computer with the same name and another address. That computer is alive if the keys change:
+//! `alive` several times per time to live, the entry among the members every five seconds. If they do not change, they
+//! are from a time when this computer had another address.
 
 use std::time::{Duration, Instant};
 
@@ -10,13 +10,13 @@ use crate::cluster::machine::{Settings, View};
 
 /// A living computer updates its entry among the members within this time.
 pub const MEMBER_SAYS: Duration = Duration::from_secs(7);
-/// How long after the start a namesake that begins to lead counts as started first.
+/// A namesake that begins to lead within this time after this computer's start counts as started first.
 const YOUNG: Duration = Duration::from_secs(15);
 
 /// The key that shows a namesake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Key {
-    /// `leader` and `alive`.
+    /// The keys `leader` and `alive`.
     Leader,
     /// The entry among the members.
     Member,
@@ -91,7 +91,7 @@ impl NamesakeWatch {
         signs.iter().find(|sign| {
             let counts = match sign.key {
                 Key::Leader => now < self.since + YOUNG,
-                // Of two that start together, only the one that does not lead stops.
+                // Of two namesakes that start together, only the one that does not lead stops.
                 Key::Member => !self.is_over(now),
             };
             counts && !self.first.contains(sign)

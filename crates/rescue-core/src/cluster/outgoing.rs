@@ -12,9 +12,9 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// How many changes may be on their way at once.
+/// How many changes may be on their way to etcd at once.
 const FIRST: usize = journal::BATCH_RECORDS;
-/// The approximate size limit of the changes behind them while this computer is cut off, in bytes.
+/// The approximate size limit of the changes after the [`FIRST`] ones while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
 
 /// The changes, in the order of their numbers.
@@ -30,7 +30,7 @@ pub struct Outgoing {
 }
 
 impl Outgoing {
-    /// Starts over. The next change has a number after `seq`.
+    /// Drops everything. The next change has a number after `seq`.
     pub fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
@@ -131,14 +131,15 @@ impl Outgoing {
         }
     }
 
-    /// The parts of the next beat's entry that are not in etcd, because it was made while this computer was cut off.
+    /// The parts of the next beat's entry that are not in etcd, because the change was recorded while this computer was
+    /// cut off.
     pub fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
         let first = self.changes.front().filter(|of| of.seq() > self.written);
         let parts = first.map(|change| parts(keys, change));
         parts.and_then(Result::ok).unwrap_or_default()
     }
 
-    /// The journal entry of the next beat, up to `seq`.
+    /// The journal entry of the next beat, with the changes up to `seq`.
     pub fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
         if let Some(first @ Change::State { .. }) =
             self.changes.front().filter(|of| of.seq() <= seq)
@@ -181,7 +182,7 @@ fn weight_of(change: &Change) -> usize {
             RecordContent::Call { call, .. } => call.params.iter().map(Value::size).sum(),
             RecordContent::Session(_) => 0,
         },
-        // There is one.
+        // A state does not count, because replacing it by a state would save nothing.
         Change::State { .. } => 0,
     }
 }
@@ -258,11 +259,11 @@ mod tests {
         let parts = outgoing.prepare(&keys).unwrap().unwrap();
         assert_eq!((outgoing.ready(), parts.len()), (5, 1));
         outgoing.preparing = true;
-        // Once at a time.
+        // Only one change is prepared at a time.
         assert!(outgoing.prepare(&keys).unwrap().is_none());
         assert_eq!(outgoing.ready(), 5);
         outgoing.preparing = false;
-        // They were not written, and are given again.
+        // The parts were not written, so they are returned again.
         assert_eq!(outgoing.prepare(&keys).unwrap(), Some(parts));
         outgoing.prepared();
         assert_eq!(outgoing.ready(), 6);
@@ -297,7 +298,7 @@ mod tests {
         outgoing.prepared();
         outgoing.prepare(&keys).unwrap();
         assert_eq!(outgoing.ready(), 7);
-        // Calls go before it and after it.
+        // The calls before and after the state go in other beats.
         assert_eq!(added(&outgoing, &keys, 7), [5]);
         outgoing.committed(5);
         let entry = outgoing.entry(&keys, 7).unwrap().unwrap();
@@ -320,7 +321,7 @@ mod tests {
         outgoing.replace_rest(Some(state(6 + count)));
         outgoing.all_ready();
         assert_eq!((outgoing.count(), outgoing.ready()), (FIRST + 1, 6 + count));
-        // A beat that is sent again has what it had.
+        // A repeated beat has the same records.
         assert_eq!(added(&outgoing, &keys, 4 + count), before);
         outgoing.committed(4 + FIRST as u64);
         let entry = outgoing.entry(&keys, 6 + count).unwrap().unwrap();

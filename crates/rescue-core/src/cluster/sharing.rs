@@ -13,7 +13,7 @@ use crate::{
 
 /// How many changes are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
-/// The approximate limit of their size, in bytes.
+/// The approximate size limit of the remembered changes, in bytes.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
 /// The source of a recorded call.
@@ -31,7 +31,7 @@ pub enum Source {
 /// The latest changes, oldest first.
 #[derive(Debug, Default)]
 struct Recent {
-    /// The list is complete after this record.
+    /// The list holds all changes after this record.
     after: u64,
     changes: VecDeque<(u64, Source, Vec<ChangeSubject>)>,
     bytes: usize,
@@ -94,7 +94,7 @@ pub enum Change {
 }
 
 impl Change {
-    /// Its number in the journal.
+    /// The change's number in the journal.
     pub fn seq(&self) -> u64 {
         match self {
             Self::Call(record, _) => record.seq,
@@ -113,7 +113,7 @@ pub struct Sharing {
 }
 
 impl Sharing {
-    /// Creates one whose first record comes after `seq`.
+    /// Creates an empty list whose first record comes after `seq`.
     pub fn after(seq: u64) -> Self {
         Self {
             last: seq,
@@ -143,27 +143,27 @@ impl Sharing {
     /// Records that the state was replaced by `mirror`.
     pub fn record_state(&mut self, mirror: &Master) {
         self.last += 1;
-        // Anything may have changed.
+        // A new state may differ in any part, so earlier changes say nothing.
         self.recent = Recent::from(self.last);
         let (seq, state) = (self.last, Box::new(mirror.clone()));
         self.changes.push(Change::State { seq, state });
     }
 
-    /// Returns the recorded changes, each once.
+    /// Takes the changes recorded since the last call.
     pub fn take(&mut self) -> Vec<Change> {
         std::mem::take(&mut self.changes)
     }
 
-    /// Returns the recorded changes as one: their result, which is `mirror`.
+    /// Takes the recorded changes as a single one: their result, which is `mirror`.
     pub fn take_as_state(&mut self, mirror: &Master) -> Change {
         self.changes.clear();
         let (seq, state) = (self.last, Box::new(mirror.clone()));
         Change::State { seq, state }
     }
 
-    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. It sends them under the
-    /// name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the changes after that
-    /// record are no longer known.
+    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. That computer sends
+    /// them under the name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the
+    /// changes after that record are no longer known.
     pub fn judge(
         &self,
         mirror: &Master,

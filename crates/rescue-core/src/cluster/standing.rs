@@ -8,7 +8,7 @@ pub enum Pass {
     Calls,
     /// The mirror answers reads. Writes wait for the next leader.
     Reads,
-    /// Nothing. Writes answered while cut off are not merged yet, so their callers would not see them.
+    /// No call is answered: writes answered while cut off are not merged yet, so their callers would not see them.
     Nothing,
 }
 
@@ -52,7 +52,7 @@ pub struct Place {
     pub epoch: u64,
     /// The leader's term.
     pub term: u64,
-    /// The record number.
+    /// The number of a record.
     pub seq: u64,
 }
 

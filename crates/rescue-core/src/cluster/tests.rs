@@ -1,4 +1,4 @@
-//! Random schedules of failures, on a virtual clock.
+//! Plays random schedules of failures on a virtual clock, and checks what nodes have seen.
 
 mod computer;
 mod etcd;
@@ -20,13 +20,13 @@ fn schedules() -> u64 {
     number.map_or(120, |number| number.parse().unwrap())
 }
 
-/// The first seed; a failure says its own.
+/// The first seed to play. A failing schedule prints its own seed.
 fn first() -> u64 {
     let seed = std::env::var("ROSRESCUE_SEED").ok();
     seed.map_or(1, |seed| seed.parse().unwrap())
 }
 
-/// The plan of a seed: every combination of policies takes its turn.
+/// The plan of a seed. Successive seeds go through all combinations of options.
 fn plan(seed: u64) -> Plan {
     Plan {
         seed,
@@ -48,7 +48,7 @@ fn plan(seed: u64) -> Plan {
     }
 }
 
-/// Plays the schedule of a seed.
+/// Plays the schedule of `seed`.
 fn play(seed: u64) -> World {
     let mut world = World::new(plan(seed));
     world.run(Duration::from_secs(12));
@@ -73,13 +73,13 @@ fn no_schedule_of_failures_breaks_a_promise() {
     assert_eq!(broken, 0, "schedules that break a promise");
     let rate = schedules() as f64 / began.elapsed().as_secs_f64() * 60.0;
     println!("{} schedules, {rate:.0} a minute: {totals:?}", schedules());
-    // Else the schedules test nothing.
+    // With fewer events the schedules would test nothing.
     let enough = totals.reigns > schedules() && totals.alone > schedules() / 4;
     assert!(enough || schedules() < 20, "{totals:?}");
 }
 
 /// 4465: a computer that is cut off shows what it answered early as a leader. The checker took that for the journal's.
-/// 9952: a leader with `--alone refuse` that etcd answered again waited for ever for records that it had given up.
+/// 9952: a leader with `--alone refuse`, which etcd answered again, waited forever for records that it had given up.
 #[test]
 fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
     for seed in [4465, 9952] {
@@ -87,7 +87,7 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
     }
 }
 
-/// Without any other failure, and with delays of at most 20 ms between computers.
+/// A schedule without random failures, and with delays of at most 20 ms between computers.
 fn calm(seed: u64) -> World {
     let plan = Plan {
         faults: false,
@@ -144,11 +144,11 @@ fn one_failure_makes_no_call_wait_longer_than_five_quarters_of_the_time_to_live_
         let ttl = plan(seed).ttl;
         let waited = world.counts.waited.saturating_sub(ttl);
         let patience = Duration::from_millis(1500);
-        // A follower that is cut off from the leader alone notices it with its next question to the leader.
+        // A follower that is cut off only from the leader notices it with its next probe.
         let unnoticed = ttl / PROBES;
         // Clocks are up to a twentieth too slow.
         let slow = (ttl + patience) / 20;
-        // A computer looks after its calls every 40 ms; the answer's way takes 60 ms; some is on its way before.
+        // A computer retries its calls every 40 ms, an answer takes 60 ms, and messages may be on their way before.
         let rest = Duration::from_millis(250);
         let most = patience + unnoticed + slow + rest;
         assert!(waited < most, "seed {seed}: {failure}: {waited:?} more");
@@ -170,7 +170,7 @@ fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
     }
 }
 
-/// etcd loses its data in a calm moment.
+/// A schedule in which etcd loses its data while nothing else fails.
 fn lost(seed: u64) -> World {
     let mut world = calm(seed);
     world.lose_etcd();
@@ -178,7 +178,7 @@ fn lost(seed: u64) -> World {
     world
 }
 
-/// Two computers have one name.
+/// A schedule in which two computers have the same name.
 fn twins(seed: u64) -> World {
     let plan = Plan {
         faults: false,
@@ -199,7 +199,7 @@ fn of_two_computers_with_one_name_one_ends() {
     }
 }
 
-/// The first seed at which `mutant` breaks a promise, of so many.
+/// The first of `most` seeds at which `mutant` breaks a promise, and the broken promise.
 fn found(mutant: Mutant, most: u64) -> Option<(u64, String)> {
     let seeds = first()..first() + most;
     seeds.into_iter().find_map(|seed| {
@@ -220,7 +220,7 @@ fn found(mutant: Mutant, most: u64) -> Option<(u64, String)> {
     })
 }
 
-/// Each defect of the past is found when it is put back.
+/// The simulation finds each defect of the past when it is put back.
 #[test]
 fn every_defect_of_the_past_is_found_within_10_000_schedules() {
     let mutants = [

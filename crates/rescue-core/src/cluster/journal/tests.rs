@@ -1,4 +1,4 @@
-//! To etcd's limits and back.
+//! Tests that records and snapshots fit into etcd's limits and are read back as they were written.
 
 use super::*;
 use crate::{
@@ -6,7 +6,7 @@ use crate::{
     xmlrpc::Call,
 };
 
-/// What etcd takes, with room for the keys and the leader's `alive`.
+/// The largest value for one transaction, with room for the keys and the leader's `alive`.
 const REQUEST_BYTES: usize = 1_500_000;
 
 fn record(seq: u64, bytes: usize) -> Record {

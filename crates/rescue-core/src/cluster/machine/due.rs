@@ -140,11 +140,11 @@ impl Machine {
             .as_ref()
             .and_then(|alive| alive.released.as_ref());
         match released {
-            // It has just given up leadership itself.
+            // This process has just given up leadership.
             _ if leader.id == *id => *ttl,
             Some(to) if to.is_empty() || to == name => Duration::ZERO,
             Some(_) => *ttl / BEATS,
-            // An earlier process of this computer. It is dead, because only one runs at a time.
+            // The leader is an earlier process of this computer. It is dead, because only one runs at a time.
             None if own.is_of_this_computer(&leader.name, &leader.uri, &leader.boot) => {
                 Duration::ZERO
             }
@@ -163,7 +163,7 @@ impl Machine {
                 Some((false, since)) => Some(silent.min(since + patience)),
                 None => Some(silent),
             },
-            // Until then, only committed writes are acknowledged, unless no other computer can lead.
+            // Before this time, only committed writes are acknowledged, unless no other computer can lead.
             Role::Leading => Some(self.leadership?.sent? + patience),
             Role::Alone => None,
         };

@@ -13,9 +13,9 @@ pub(super) struct Leadership {
     pub(super) beat: u64,
     /// Whether the mirror had the whole journal when the term began.
     pub(super) caught_up: bool,
-    /// Whether records were left over after the last beat.
+    /// Whether records were left over after the last heartbeat.
     pub(super) full: bool,
-    /// Whether another computer may have led since the last beat.
+    /// Whether another computer may have led since the last heartbeat.
     pub(super) lapsed: bool,
 }
 
@@ -24,11 +24,11 @@ pub(super) struct Leadership {
 pub(super) struct Flight {
     pub(super) number: u64,
     pub(super) op: Op,
-    /// When it was sent for the first time.
+    /// When the request was sent for the first time.
     pub(super) first: Instant,
-    /// When it was sent for the last time.
+    /// When the request was sent for the last time.
     pub(super) sent: Instant,
-    /// Whether it got no answer and is not under way now.
+    /// Whether the request got no answer and is not under way now.
     pub(super) silent: bool,
 }
 

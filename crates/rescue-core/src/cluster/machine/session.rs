@@ -8,17 +8,17 @@ use super::types::Alive;
 /// What is known about the journal's session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum JournalSession {
-    /// Nothing: no computer was seen leading it. The next leader has to decide.
+    /// It is unknown whether the session continues. The next leader has to decide.
     #[default]
     Unknown,
-    /// It continues.
+    /// The session continues.
     GoesOn,
-    /// It ended with this record. The leader replaces the state by an empty one, as the next record.
+    /// The session ended with this record. The leader replaces the state by an empty one, as the next record.
     Over(u64),
 }
 
 impl JournalSession {
-    /// Applies the shell's decision about the journal up to record `seq`, unless another computer was faster.
+    /// Applies the decision about the journal up to record `seq`, unless another computer was faster.
     pub(super) fn decided(&mut self, seq: u64, goes_on: bool) {
         if *self == Self::Unknown {
             *self = match goes_on {

@@ -1,4 +1,4 @@
-//! One situation each. What happens when many come together is in `crate::cluster::tests`.
+//! Tests one situation at a time. `crate::cluster::tests` combines many.
 
 use super::*;
 
@@ -55,7 +55,7 @@ fn sent(actions: &[Action]) -> (u64, Op) {
         .unwrap_or_else(|| panic!("nothing is sent: {actions:?}"))
 }
 
-/// One that follows `b`, whose mirror is up to date.
+/// A machine that follows `b` and whose mirror is up to date.
 fn following(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
     let (number, op) = sent(&machine.on(now, Input::Start(0)));
@@ -68,7 +68,7 @@ fn following(alone: WhenAlone) -> (Machine, Instant) {
     (machine, now)
 }
 
-/// One that leads, and has sent nothing since `now`.
+/// A machine that leads, and has sent nothing since `now`.
 fn leading(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
@@ -113,7 +113,7 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
         },
         claim: 1,
         seq: 10,
-        // It has seen the one before lead.
+        // This computer has seen the previous leader lead.
         settled: true,
     };
     assert_eq!(op, claim);
@@ -149,7 +149,7 @@ fn a_computer_of_the_same_name_at_another_address_is_not_deposed_while_it_lives(
         let actions = machine.on(now, Input::View(namesake(6 + u64::from(beat))));
         assert_eq!(actions, []);
     }
-    // It is silent: as any other leader.
+    // A silent namesake is succeeded like any other leader.
     let (_, op) = sent(&machine.on(now + 3 * TTL, Input::Wake));
     assert!(matches!(op, Op::Claim { .. }), "{op:?}");
 }
@@ -223,19 +223,19 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
     for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
         let (mut machine, now) = leading(alone);
         sent(&machine.on(now, Input::Recorded(1)));
-        // No other computer can lead before that.
+        // No other computer can lead before the time to live has passed.
         assert!(machine.may_have_master());
         assert_eq!(machine.deadline(), Some(now + TTL));
         machine.on(now + TTL, Input::Wake);
         assert!(!machine.may_have_master());
-        // etcd may be choosing a leader of its own.
+        // The leader waits longer, because etcd may be electing its own leader.
         let lapses = now + TTL + PATIENCE;
         assert_eq!(machine.deadline(), Some(lapses));
         assert!(!machine.is_sole(now + TTL - TTL / MARGIN));
         let actions = machine.on(lapses, Input::Wake);
         assert_eq!(actions[0], Action::Become(Role::Alone));
         assert_eq!(actions.contains(&Action::Acknowledge(1)), answers);
-        // Another one leads: what was answered is handed back.
+        // Another computer leads, so this one hands back the writes that it answered.
         let actions = machine.on(lapses, Input::View(led("b", 5, 6)));
         let hands_back = Action::Yield {
             committed: 0,
@@ -259,7 +259,7 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let (revision, seq) = (2, 1);
     let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(late + RETRY, Input::Answer { number, answer });
-    // What was made is older than the time to live: only the next one tells.
+    // The successful beat was sent more than the time to live ago. Only the next one shows that this computer leads.
     let (number, _) = sent(&actions);
     assert_eq!(machine.role(), Role::Alone);
     let (revision, seq) = (3, 1);
@@ -269,7 +269,8 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     assert!(machine.may_have_master());
 }
 
-/// With `--alone refuse` it recorded nothing while it was cut off, and starts again after the journal's last record.
+/// With `--alone refuse` a leader records nothing while it is cut off, and starts again after the journal's last
+/// record.
 #[test]
 fn a_leader_that_refused_to_serve_alone_does_not_wait_for_records_that_it_gave_up() {
     let (mut machine, now) = leading(WhenAlone::Refuse);
@@ -291,7 +292,7 @@ fn a_leader_that_refused_to_serve_alone_does_not_wait_for_records_that_it_gave_u
     };
     assert_eq!(actions, [hands_back, Action::Become(Role::Leading)]);
     assert_eq!(machine.deadline(), Some(late + TTL / BEATS));
-    // It can hand over.
+    // This leader can hand over.
     let (_, op) = sent(&machine.on(late + ms(200), Input::HandOver(String::new())));
     assert!(
         matches!(
@@ -316,7 +317,7 @@ fn a_leader_that_etcd_answers_late_goes_on_as_if_nothing_had_been() {
     assert_eq!(machine.role(), Role::Leading);
 }
 
-/// It wakes whenever it wants to, until `end`.
+/// Wakes the machine at each of its deadlines until `end`.
 fn wake_until(machine: &mut Machine, end: Instant) {
     while let Some(due) = machine.deadline().filter(|due| *due < end) {
         machine.on(due, Input::Wake);
@@ -324,7 +325,7 @@ fn wake_until(machine: &mut Machine, end: Instant) {
     machine.on(end, Input::Wake);
 }
 
-/// Without a pause it is alone by then.
+/// Without a pause of its process, a leader is alone after the same time.
 #[test]
 fn a_leader_that_stood_still_asks_etcd_before_it_is_alone() {
     let long = 5 * TTL;
@@ -348,7 +349,7 @@ fn a_leader_that_stood_still_asks_etcd_before_it_is_alone() {
     assert!(actions.contains(&Action::Become(Role::Following)));
     assert_eq!(machine.lease(now + long), Some(now + long));
 
-    // If nobody answers it is alone after all.
+    // If etcd does not answer, the leader is alone after all.
     let (mut machine, now) = leading(WhenAlone::Serve);
     machine.on(now + long, Input::Wake);
     wake_until(&mut machine, now + long + PATIENCE);
@@ -384,7 +385,7 @@ fn a_follower_that_cannot_reach_a_leader_that_lives_is_alone_after_a_while() {
         machine.on(at, Input::View(led("b", 5, revision)));
     }
     assert_eq!(machine.role(), Role::Alone);
-    // It does not claim: the leader lives.
+    // This computer does not claim, because the leader lives.
     assert!(machine.deadline().is_some_and(|deadline| deadline > at));
 }
 
@@ -403,12 +404,12 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
     let actions = machine.on(now, Input::Answer { number, answer });
     assert_eq!(actions[0], Action::Become(Role::Following));
     assert_eq!(actions.last(), Some(&Action::Released));
-    // It does not take it back while another one may.
+    // This computer does not claim again while another one may.
     assert_eq!(machine.on(now + TTL - ms(1), Input::Wake), []);
 }
 
-/// One that was switched on with all others, and whose claim at revision 7 has been made: the journal is that of
-/// the session before, and the keys show it.
+/// A machine that was switched on with all others, and whose claim succeeded at revision 7. The journal and the keys
+/// are those of the previous session.
 fn claimed() -> (Machine, Instant) {
     let (mut machine, now) = machine(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
@@ -423,7 +424,7 @@ fn claimed() -> (Machine, Instant) {
     (machine, now + TTL)
 }
 
-/// The keys as a computer has written them that has not decided about the session.
+/// The keys that a leader writes before it has decided whether the session continues.
 fn undecided(name: &str, term: u64, revision: u64) -> View {
     let mut view = led(name, term, revision);
     view.alive.as_mut().unwrap().settled = false;
@@ -437,7 +438,7 @@ fn who_claims_leads_when_it_is_decided_whether_the_session_goes_on_and_not_befor
         (false, JournalSession::Over(10)),
     ] {
         let (mut machine, now) = claimed();
-        // The watch shows its own claim; and it has all that there is.
+        // The watch shows this computer's own claim, and the mirror has the whole journal.
         let mut view = undecided("a", 7, 7);
         view.alive.as_mut().unwrap().beat = 0;
         assert_eq!(machine.on(now, Input::View(view)), []);
@@ -463,7 +464,7 @@ fn a_session_that_is_over_ends_once() {
     let answer = EtcdAnswer::Applied { revision, seq };
     machine.on(now, Input::Answer { number, answer });
     assert_eq!(machine.session(), JournalSession::GoesOn);
-    // Another one leads for a while.
+    // Another computer leads for a while.
     let mut view = led("b", 9, 10);
     view.alive.as_mut().unwrap().seq = 11;
     machine.on(now, Input::View(view));
@@ -482,7 +483,7 @@ fn what_was_not_decided_before_another_one_leads_is_decided_by_that_one() {
     let (mut machine, now) = claimed();
     let (seq, goes_on) = (10, false);
     machine.on(now, Input::Decided { seq, goes_on });
-    // Deposed before the empty state was in the journal, by one that has not decided either.
+    // Before the empty state is in the journal, a computer that has not decided either deposes this one.
     machine.on(now, Input::View(undecided("b", 8, 8)));
     assert_eq!(machine.session(), JournalSession::Over(10));
     machine.on(now, Input::View(undecided("b", 8, 9)));
@@ -495,7 +496,7 @@ fn what_was_not_decided_before_another_one_leads_is_decided_by_that_one() {
 fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
     let (mut machine, now) = machine(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Start(0)));
-    // Of yesterday.
+    // The keys of the previous session.
     let answer = EtcdAnswer::Is(led("b", 5, 6));
     machine.on(now, Input::Answer { number, answer });
     machine.on(now, Input::View(undecided("c", 7, 7)));
@@ -503,7 +504,7 @@ fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
     assert_eq!(machine.session(), JournalSession::Unknown);
     machine.on(now, Input::View(led("c", 7, 9)));
     assert_eq!(machine.session(), JournalSession::GoesOn);
-    // A decision that comes late changes nothing.
+    // A late decision changes nothing.
     let (seq, goes_on) = (10, false);
     machine.on(now, Input::Decided { seq, goes_on });
     assert_eq!(machine.session(), JournalSession::GoesOn);

@@ -7,18 +7,18 @@ use serde::{Deserialize, Serialize};
 /// When a write is acknowledged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Commit {
-    /// When a majority of etcd has it.
+    /// When a majority of etcd has the write.
     Always,
-    /// At once, while no other computer can lead. It is committed within 200 ms.
+    /// At once, while no other computer can lead. The write is in etcd within 200 ms.
     Interval,
 }
 
 /// What a computer does with writes while it is cut off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WhenAlone {
-    /// It answers them, and sends them to the leader later.
+    /// The mirror answers writes, and the leader gets them later.
     Serve,
-    /// It lets them wait.
+    /// Writes wait until this computer reaches the others again, or fail after `--hold`.
     Refuse,
 }
 
@@ -68,7 +68,7 @@ pub struct Leader {
 pub struct Alive {
     /// The revision of the key.
     pub revision: u64,
-    /// The number of the leader's transaction that wrote it.
+    /// The number of the leader's transaction that wrote this key.
     pub beat: u64,
     /// The journal's last record.
     pub seq: u64,
@@ -78,7 +78,7 @@ pub struct Alive {
     pub settled: bool,
 }
 
-/// Both keys at one revision of etcd.
+/// The keys `leader` and `alive` at one revision of etcd.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct View {
     pub revision: u64,
@@ -101,7 +101,7 @@ impl View {
     }
 }
 
-/// The revisions that both keys must have for a transaction to succeed. 0 stands for a missing key.
+/// The revisions that the keys `leader` and `alive` must have for a transaction to succeed. 0 stands for a missing key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct RevisionGuard {
     pub leader: u64,
@@ -111,7 +111,7 @@ pub struct RevisionGuard {
 /// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read both keys, not from a member that may be behind.
+    /// Read both keys. The answer must not come from a member of etcd that may be behind.
     Read,
     /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
     Claim {
@@ -136,20 +136,20 @@ pub enum Op {
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The transaction failed, or it was a read. These are the keys.
+    /// The keys, as the answer to a read or to a transaction that failed.
     Is(View),
     /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,
 }
 
-/// What happened.
+/// An event that the machine must know of.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Input {
     /// The machine starts. The checkpoint contains the journal up to this record.
     Start(u64),
     /// The answer to request `number`.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch delivers the keys.
+    /// The watch on etcd has delivered the leader's keys.
     View(View),
     /// The mirror contains the journal up to this record.
     Followed(u64),
@@ -171,14 +171,15 @@ pub enum Input {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Nothing is known yet.
+    /// This computer does not know yet who leads.
     Joining,
-    /// Calls go to the leader. While there is none, the mirror answers reads and writes wait.
+    /// Calls go to the leader. While no computer leads, the mirror answers reads and writes wait.
     Following,
-    /// Its claim has succeeded. It reads the rest of the journal, and decides whether its session continues.
+    /// This computer's claim has succeeded. It reads the rest of the journal, and decides whether the session
+    /// continues.
     CatchingUp,
     Leading,
-    /// Cut off from the majority, or from the leader.
+    /// Cut off from etcd's majority, or from the leader.
     Alone,
 }
 
@@ -204,7 +205,7 @@ impl Role {
     }
 }
 
-/// An action for the shell. Actions must be carried out in order.
+/// What the member must do. Actions must be carried out in order.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Send a request. Its answer is [`Input::Answer`] with this number, within [`super::ANSWER_LIMIT`].
@@ -224,6 +225,6 @@ pub enum Action {
         committed: u64,
         acknowledged: u64,
     },
-    /// Another computer may lead now.
+    /// This computer has given up leadership, so another one may lead now.
     Released,
 }

@@ -39,7 +39,7 @@ impl Chores {
 impl Member {
     /// Starts the work that is due.
     pub(super) fn update_chores(&mut self, now: Instant) {
-        // Earlier, it would overwrite the entry of another computer with this name.
+        // Before the watch for a namesake is over, the entry could overwrite that of another computer.
         let watch = self.namesake.watch.as_ref();
         let may_say = watch.is_some_and(|of| of.is_over(now));
         if self.chores.say_at.is_none_or(|at| at <= now) {
@@ -79,7 +79,7 @@ impl Member {
         self.chores.snapshot = false;
         match written {
             Some((then, bytes)) => self.journal.progress.snapshot_written(then, bytes),
-            // An etcd that is full refuses at once.
+            // A full etcd refuses at once, so the next attempt must wait.
             None => self.chores.snapshot_at = Some(now + SNAPSHOT_PAUSE),
         }
     }

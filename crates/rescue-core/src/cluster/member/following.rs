@@ -24,7 +24,7 @@ pub(super) struct Reading {
     reported: u64,
     /// Whether a read is under way.
     loading: bool,
-    /// The newest revision that was known when that read began.
+    /// The newest revision that was known when the read under way began.
     floor: u64,
     /// When the next read is due.
     load_at: Option<Instant>,
@@ -74,7 +74,7 @@ impl Reading {
 }
 
 impl Member {
-    /// Reads the journal if it is needed further than it is known.
+    /// Reads the journal if the machine needs more of it than is known.
     pub(super) fn catch_up(&mut self, now: Instant) {
         let seq = self.journal.progress.seq;
         let wanted = self.reading.wanted;
@@ -116,7 +116,7 @@ impl Member {
 
     /// Handles keys and journal entries from the watch.
     pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
-        // First, because writes that this computer answered and lost came before the others' changes.
+        // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
         self.see(now, view);
         let progress = &mut self.journal.progress;
         // All records at once, because each new state may take long.
@@ -180,7 +180,7 @@ impl Member {
     pub(super) fn adopt(&mut self) {
         if self.follows() {
             let mut state = self.cut_off.on(&self.journal.state);
-            // The same for writes answered as a leader, as long as it is unknown whether another computer leads.
+            // Also the writes answered as a leader, as long as it is unknown whether another computer leads.
             let (held, answered) = (self.journal.progress.seq, self.acknowledged);
             self.outgoing.apply(held + 1..=answered, &mut state);
             self.act(Action::FollowState(state));
@@ -189,7 +189,7 @@ impl Member {
 
     pub(super) fn loaded(&mut self, now: Instant, read: Option<Read>) {
         self.reading.loading = false;
-        // A read that began before it was asked for does not count, whether it failed or not.
+        // A read that began before `refresh` was called does not count, whether it failed or not.
         let earlier = self.reading.fresh == Some(2);
         if earlier {
             self.reading.fresh = Some(1);
@@ -287,13 +287,14 @@ impl Member {
     /// Updates the place up to which the mirror is current.
     pub(super) fn look_at_place(&mut self) {
         let seq = self.journal.progress.seq;
-        // What only the checkpoint holds is lost if another computer leads next, and what is owed is not in it.
+        // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
+        // lacks.
         let differs = self.own.seq > seq || !self.cut_off.is_empty();
         if self.own_wins && differs && !self.records() {
             return;
         }
         let view = self.view();
-        // At least the whole journal before this leader's first record.
+        // The leader's term counts only once the mirror has the whole journal before that leader's first record.
         let whole = self.reading.loaded && seq >= view.seq();
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.place.term, |leader| leader.term);

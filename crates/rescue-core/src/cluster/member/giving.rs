@@ -57,7 +57,7 @@ impl Member {
             return self.prepare();
         }
         self.outgoing.all_ready();
-        // Without a term they never go to the journal. A later leader gets the kept writes instead.
+        // Without a term the changes never go to the journal. A later leader gets the kept writes instead.
         match leads_on {
             false => self.outgoing.forget(),
             true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),

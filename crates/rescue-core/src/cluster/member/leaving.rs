@@ -25,7 +25,7 @@ enum Why {
 #[derive(Debug, Default)]
 pub(super) struct Release {
     why: Why,
-    /// The time limit.
+    /// The time limit of the handover or the stop.
     pub(super) by: Option<Instant>,
 }
 
@@ -77,7 +77,7 @@ impl Member {
         self.tell_machine(machine::Input::HandOver(to));
     }
 
-    /// Another computer may lead now.
+    /// Ends a handover: another computer may lead now.
     pub(super) fn released(&mut self) {
         if self.release.why == Why::Asked {
             self.release = Release::default();

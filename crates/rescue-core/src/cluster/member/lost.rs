@@ -23,7 +23,7 @@ pub(super) struct Lost {
     now: Option<(Instant, Holds, u64)>,
     /// What the other computers hold, by name.
     others: BTreeMap<String, Holds>,
-    /// Whether another computer holds more.
+    /// Whether another computer is known to hold more of the lost journal.
     second: bool,
     /// How often etcd has lost its data.
     pub(super) times: u64,

@@ -24,8 +24,8 @@ use crate::{
 const AGAIN: Duration = Duration::from_millis(100);
 /// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 const TELLER: &str = "/rosrescue";
-/// How often parameters are set again that others keep changing. Each of their changes notifies the nodes as well, and
-/// calls wait for the end of the merge.
+/// How often the merge sets parameters again that others keep changing. The limit is low, because calls wait for the
+/// end of the merge, and each change by others notifies the nodes, too.
 const ROUNDS_MAX: u32 = 3;
 /// The largest number of calls in one portion. Other writes pass between portions.
 const CALLS_MOST: usize = 100;
@@ -60,7 +60,7 @@ pub(super) struct Merging {
     untold: BTreeSet<String>,
     /// Whether the portion under way sets the parameters in [`Self::untold`] again.
     telling: bool,
-    /// How often such a portion failed, because others changed a parameter meanwhile.
+    /// How often a portion that sets parameters again failed, because others changed one meanwhile.
     rounds: u32,
     /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
     unread: bool,
@@ -101,8 +101,8 @@ impl Merging {
 }
 
 impl Member {
-    /// The leader that takes such writes: its address and term, or `Some(None)` for this computer. `None` if no leader is
-    /// known.
+    /// The leader that takes writes answered while cut off: its address and term, or `Some(None)` for this computer.
+    /// `None` if no leader is known.
     fn merges_to(&self) -> Option<Option<(String, u64)>> {
         match self.machine.role() {
             Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
@@ -201,7 +201,7 @@ impl Member {
             self.merging.step = Step::Pause(now + AGAIN, Some(ask));
             return;
         };
-        // Without an answer, the journal may still contain the calls, perhaps several times.
+        // Even without an answer, the journal may contain the calls, perhaps several times.
         self.cut_off.expect_in_all(&ask.calls);
         self.merging.step = Step::Asked(ask.clone(), to.clone());
         self.merging.asked += 1;
@@ -251,7 +251,7 @@ impl Member {
         let untold = &mut self.merging.untold;
         let before = untold.len();
         for (call, outcome) in ask.calls.iter().zip(outcomes) {
-            // If it was changed meanwhile, nodes may have heard the new value before the lost one.
+            // If others changed the parameter, nodes may have heard the new value before the lost one.
             if is_last || !matches!(outcome, WriteOutcome::Lost { .. }) {
                 call.text(1).map(|key| untold.remove(key));
             }
@@ -325,7 +325,7 @@ fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
 fn portion(calls: &[Request]) -> usize {
     let (mut count, mut bytes) = (0, 0);
     for call in calls.iter().take(CALLS_MOST) {
-        // Its answer contains a value that the master may be unable to return.
+        // The answer to a `subscribeParam` contains a value that the master may be unable to return.
         let is_alone = *call.method() == Method::SubscribeParam;
         bytes += weight(call);
         if count > 0 && (is_alone || bytes > BYTES_MOST) {

@@ -13,12 +13,13 @@ use crate::{
     master::Master,
 };
 
-/// Probes of the leader's rosrescue per time to live.
+/// How often a follower asks the leader's rosrescue whether it leads, per time to live.
 pub const PROBES: u32 = 4;
-/// The same while etcd is silent. Then only the leader itself shows whether it still leads.
+/// Probes per time to live while etcd is silent, when only the leader itself shows whether it still leads.
 const PROBES_IN_SILENCE: u32 = 20;
 
-/// Whether a change is this computer's own. A forwarded call is made elsewhere if it gets no answer here.
+/// Whether a change is this computer's own. Calls that another computer forwarded are not: if they get no answer here,
+/// that computer sends them to the next leader.
 pub(super) fn is_ours(change: &Change) -> bool {
     !matches!(change, Change::Call(_, Source::Forwarded)) || Mutant::KeepsForwarded.lives()
 }
@@ -100,19 +101,19 @@ impl Member {
             true => &self.journal.state,
             false => &self.own.state,
         };
-        // The nodes continue from what they wrote while cut off before.
+        // The nodes continue from what they wrote in earlier periods of being cut off.
         let base = self.cut_off.on(base);
         self.begin_cut_off(base.clone());
         self.act(Action::ServeOwnOnly(true));
         if led {
-            // Recorded calls are answered from now on, except forwarded ones, which are made elsewhere.
+            // Recorded calls are answered from now on, except forwarded ones, which their computers send elsewhere.
             let answered = self.acknowledged;
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
             self.keep(kept);
         } else {
-            // First, so that no more calls are forwarded.
+            // The standing changes first, so that no more calls are forwarded.
             self.stand(Standing::Nobody { known: true });
             self.act(Action::AskForwarded);
             let seq = self.machine.committed();
@@ -129,7 +130,7 @@ impl Member {
     /// From now on, keeps answered writes for the leader. `base` is the present state.
     pub(super) fn begin_cut_off(&mut self, base: Master) {
         let first = self.cut_off.is_empty();
-        // Before etcd has been read, the others' state is unknown. It is compared with the first period.
+        // Before etcd has been read, the others' state is unknown. It will be compared with the first period's base.
         if first || self.reading.loaded {
             self.cut_off.begin(base);
         }

@@ -1,4 +1,4 @@
-//! One situation each. What happens when many come together is in `crate::cluster::tests`.
+//! Tests one situation at a time. `crate::cluster::tests` combines many.
 
 use super::*;
 use crate::{
@@ -11,7 +11,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Others set the parameter again in record `seq`.
+/// Record `seq`, in which others set the parameter again.
 fn record(seq: u64) -> Record {
     let value = i32::try_from(seq).unwrap();
     let entry = RecordContent::call(set(value).into());
@@ -47,7 +47,7 @@ fn led(seq: u64) -> View {
     }
 }
 
-/// A computer that has set the parameter while it was cut off, and etcd.
+/// A computer that has set the parameter while it was cut off, and a model of etcd's journal.
 struct Merges {
     member: Member,
     now: Instant,
@@ -79,7 +79,7 @@ impl Merges {
         }
     }
 
-    /// Goes on until the leader is asked to merge something. `None` once all is merged.
+    /// Runs until the member asks the leader to merge a portion. `None` once all writes are merged.
     fn next(&mut self) -> Option<(u64, Ask)> {
         let until = self.now + Duration::from_secs(5);
         let mut asked = None;
@@ -109,7 +109,7 @@ impl Merges {
         asked
     }
 
-    /// Each time that this computer reads the journal, others have set the parameter again.
+    /// Answers a read of the journal, in which others have set the parameter again.
     fn load(&mut self) {
         let seq = self.journal.seq + 1;
         let records = vec![record(seq)];
@@ -124,12 +124,12 @@ impl Merges {
     }
 }
 
-/// The calls of this computer's nodes wait for the end of the merge.
+/// A merge must end, because the calls of this computer's nodes wait for it.
 #[test]
 fn a_merge_ends_although_others_keep_changing_a_parameter_whose_value_was_lost() {
     let (mut merges, mut told) = (Merges::new(), 0);
     while let Some((number, ask)) = merges.next() {
-        // The write itself is lost; the nodes must hear the others' value.
+        // The write itself is lost, so the nodes must hear the others' value.
         let value = i32::try_from(merges.journal.seq).unwrap();
         assert_eq!(ask.calls.len(), 1);
         assert_eq!(ask.calls[0].params().get(2), Some(&value.into()));

@@ -91,14 +91,15 @@ pub enum Entry {
 pub struct Read {
     /// The leader's two keys at the same revision.
     pub view: View,
-    /// The state before the records, and who was displaced until then. `None` if the records follow the known journal.
+    /// The state before the records, and the nodes displaced until then. `None` if the records follow the known
+    /// journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
     pub heard: Vec<Heard>,
 }
 
-/// What happened.
+/// An event that the member must handle.
 #[derive(Debug)]
 #[allow(
     clippy::large_enum_variant,
@@ -202,7 +203,7 @@ pub enum News {
     },
 }
 
-/// What the shell must do, in order.
+/// What `app/cluster` must do. Actions must be carried out in order.
 #[derive(Debug)]
 #[allow(
     clippy::large_enum_variant,
@@ -246,7 +247,7 @@ pub enum Action {
     },
     /// Apply these records of another computer.
     Follow(Vec<Record>),
-    /// Take over this state of another computer.
+    /// Replace the ledger's state by this state of another computer.
     FollowState(Master),
     /// Answer the calls up to this record.
     Acknowledge(u64),
@@ -260,18 +261,18 @@ pub enum Action {
     BeginMaster(Cause),
     /// Kill the master at once.
     EndMaster,
-    /// The mirror answers, because there is no master.
+    /// Let the mirror answer, because this computer has no master.
     StandIn,
     /// Answer no call on this computer.
     TurnAway,
-    /// Whether to notify this computer's nodes only.
+    /// Notify only this computer's own nodes if true, all nodes if false.
     ServeOwnOnly(bool),
-    /// Keep exactly these writes, answered while cut off since the state was `base`.
+    /// Keep exactly these writes, which were answered while cut off. `base` is the state before them.
     KeepAll {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Keep these writes as well.
+    /// Add these writes to the kept ones.
     Keep(Vec<Request>),
     /// Delete the kept writes.
     KeepNothing,
@@ -299,9 +300,9 @@ pub enum Action {
     },
     /// Compact etcd up to this revision.
     Forget(u64),
-    /// Answer a handover request: done, or why not.
+    /// Answer a handover request with success, or with the reason why it failed.
     HandedOver(Result<(), String>),
-    /// Stop roscore's other duties while calls still pass.
+    /// Stop roscore's other duties while calls still pass to the master.
     EndRosout,
     Tell(News),
     /// Stop.

@@ -1,4 +1,4 @@
-//! Tracks changes by subject. Comparing two states would not show that a parameter was set and set back.
+//! Tracks changes by subject, because comparing two states would not show that a parameter was set and set back.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},
@@ -88,7 +88,7 @@ pub(super) fn param_of(call: &Request) -> Option<String> {
     }
 }
 
-/// The others' changes since some moment.
+/// The changes that others than the cut-off computer have made since some point of the journal.
 #[derive(Clone, Debug, Default)]
 pub struct Changes {
     params: BTreeSet<String>,
@@ -140,8 +140,8 @@ impl Changes {
         }
     }
 
-    /// Notes that the others' state changed from `was` to `is`, without the calls in between. What was changed and
-    /// changed back does not show.
+    /// Notes that the others' state changed from `was` to `is`, without the calls in between. A value that was changed
+    /// and changed back does not show.
     pub fn note_difference(&mut self, was: &Master, is: &Master) {
         let mut paths = Vec::new();
         differing("/", was.params(), is.params(), &mut paths);
@@ -206,7 +206,7 @@ impl Changes {
     }
 }
 
-/// Calls of this computer.
+/// Calls of this computer that the others may have run.
 #[derive(Clone, Debug, Default)]
 struct Own {
     /// The calls, by subject.
@@ -228,8 +228,8 @@ impl Own {
         }
     }
 
-    /// Whether `call` is one of these. It may be in the journal several times, because it is sent again after a lost
-    /// answer.
+    /// Whether `call` is one of these calls. It may be in the journal several times, because it is sent again after a
+    /// lost answer.
     fn has(&self, call: &Request) -> bool {
         if Mutant::GuessesByValues.lives() {
             let mut own = self.calls.values().flatten();

@@ -81,7 +81,7 @@ impl WritesToSend {
                 });
             } else {
                 if at.registration.as_ref().is_some_and(|(_, of)| *of != api) {
-                    // It belongs to an earlier process of the node, so the master refuses it.
+                    // The unregistration belongs to an earlier process of the node, so the master refuses it.
                     return;
                 }
                 let before = at.unregistrations.iter().position(|(_, of)| *of == api);

@@ -1,4 +1,4 @@
-//! What wins after two sides were apart.
+//! Tests which writes hold after two sides were cut off from each other.
 
 use proptest::{collection::vec, prelude::*};
 
@@ -30,7 +30,8 @@ fn state(of: &Master, calls: &[Request]) -> Master {
     master
 }
 
-/// The state after `there` was run, and what that has changed. What the master refuses is in no journal.
+/// The state after `there` was run. Adds what was changed to `changes`, without refused calls, because no journal has
+/// those.
 fn changed(base: &Master, there: &[Request], changes: &mut Changes) -> Master {
     let mut master = base.clone();
     for (seq, call) in (1..).zip(there) {
@@ -41,7 +42,7 @@ fn changed(base: &Master, there: &[Request], changes: &mut Changes) -> Master {
     master
 }
 
-/// What becomes of `here`, when both sides began with `base` and the other one has run `there`.
+/// The result of merging `here`, if both sides began with `base` and the other side has run `there`.
 fn after(base: &[Request], there: &[Request], here: &[Request]) -> Merged {
     let base = state(&Master::default(), base);
     let mut changes = Changes::default();
@@ -155,7 +156,7 @@ fn of_each_subject_only_what_makes_its_last_state_is_kept() {
         kept(&[set("/a/b", "1"), set("/c", "1"), set("/a/b", "2")]),
         [set("/c", "1"), set("/a/b", "2")]
     );
-    // It must be there to be deleted.
+    // A master deletes only a parameter that exists.
     let deleted = [set("/a/b", "2"), delete("/a")];
     let calls = [&[set("/a/c", "1"), set("/ab", "1")], &deleted[..]].concat();
     assert_eq!(kept(&calls), [&[set("/ab", "1")], &deleted[..]].concat());
@@ -168,7 +169,7 @@ fn of_each_subject_only_what_makes_its_last_state_is_kept() {
         kept(&[first.clone(), unpublish("http://n:1/"), second.clone()]),
         std::slice::from_ref(&second)
     );
-    // The first process of the node ends late.
+    // The node's first process unregisters after its second one has registered.
     assert_eq!(
         kept(&[first.clone(), second.clone(), unpublish("http://n:1/")]),
         [second]
@@ -207,7 +208,7 @@ fn a_parameter_that_was_changed_wins_with_all_below_and_above_it() {
         lost(&base, &[set("/a/b", "2")], delete.clone()),
         parameter("/a/b")
     );
-    // Beside it.
+    // A change beside the parameter is no conflict.
     assert_eq!(
         lost(&base, &[set("/a/x", "2"), set("/c", "2")], set("/a/b", "3")),
         None
@@ -227,7 +228,7 @@ fn a_name_that_another_node_has_taken_is_not_taken_back() {
     let api = "http://there:1/".to_owned();
     let name = "/n".to_owned();
     assert_eq!(taken, Some(Conflict::Node { name, api }));
-    // The health check over there has removed what could not be reached.
+    // The other side's health check has unregistered the node because it could not reach it.
     let gone = call(Method::UnregisterPublisher, &["/n", "/t", "http://old:1/"]);
     assert_eq!(
         lost(&base, &[gone], publish("/n", "/t", "http://old:1/")),
@@ -330,7 +331,7 @@ proptest! {
             after.apply_telling(call, &mut notices);
             for notice in notices {
                 if let Notice::Shutdown { to, .. } = notice {
-                    // Who registered over there, and had not before, lives.
+                    // No node that registered only on the other side is shut down.
                     prop_assert!(!to.starts_with("http://there"), "{} is shut down", to);
                 }
             }

@@ -1,4 +1,4 @@
-//! The request by which a computer that was cut off sends its writes to the leader, and its answer.
+//! The request by which a computer that was cut off sends its writes to the leader, and the leader's answer.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The method's name.
+/// The name of the XML-RPC method.
 pub const METHOD: &str = "rosrescue/merge";
 /// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
@@ -16,7 +16,7 @@ const MULTICALL: &str = "system.multicall";
 /// A portion of writes that were answered while cut off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all portions of one period are sent.
+    /// The name under which all portions of one period of being cut off are sent.
     pub id: Arc<str>,
     /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,
@@ -34,7 +34,7 @@ impl Ask {
         )
     }
 
-    /// Reads a request. `None` if it is another method.
+    /// Reads a request. `None` if it calls another method.
     pub fn read(request: &Request) -> Option<Self> {
         let is_it = matches!(request.method(), Method::Unknown(name) if **name == *METHOD);
         let calls = request.params().get(3).filter(|_| is_it)?;
@@ -50,11 +50,11 @@ impl Ask {
 /// The outcome of one write.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WriteOutcome {
-    /// It was made, or its value is already set.
+    /// The write was made, or its value is already set.
     Holds,
-    /// The master refused it.
+    /// The master refused the write.
     Refused(String),
-    /// Others have changed the same subject.
+    /// Another computer has changed the subject of the write.
     Lost { why: String, present: Option<Value> },
 }
 

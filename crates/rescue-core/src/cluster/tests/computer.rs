@@ -1,4 +1,4 @@
-//! A computer of the simulation: the member of production, and what the shell holds for it.
+//! A computer of the simulation: production's [`Member`], and the state that `app/cluster` holds for it.
 
 use std::time::{Duration, Instant};
 
@@ -16,29 +16,30 @@ use crate::{
     master::{Master, Notice, Request},
 };
 
-/// A call that was run here, and whose answer waits.
+/// A call that was run on this computer, and whose answer waits.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Unanswered {
     pub(super) seq: u64,
-    /// It has changed something.
+    /// Whether the call has changed something, so that it has a record.
     pub(super) recorded: bool,
     pub(super) call: usize,
-    /// The computer whose node made it.
+    /// The computer whose node made the call.
     pub(super) origin: usize,
 }
 
-/// A computer, its process, and the number of what it asks.
+/// A computer, the number of its process, and the number of its request.
 pub(super) type Asker = (usize, u64, u64);
 
-/// The mirror, and what of it is given to the others.
+/// The mirror, and the changes that the other computers must get.
 #[derive(Debug, Default)]
 pub(super) struct Ledger {
     pub(super) mirror: Master,
     pub(super) sharing: Option<Sharing>,
     pub(super) unanswered: Vec<Unanswered>,
-    /// Merged portions that wait for the journal up to a record: who has asked, and the answer.
+    /// Merged portions whose answers wait until the journal has a record: that record, the asking computer, and the
+    /// answer.
     pub(super) merges: Vec<(u64, Asker, wire::MergeAnswer)>,
-    /// Counts the times that calls are recorded here.
+    /// Counts the periods in which calls are recorded on this computer.
     pub(super) leadership: u64,
     pub(super) agreed: u64,
     pub(super) lease: Option<Instant>,
@@ -49,8 +50,8 @@ impl Ledger {
         self.lease.is_none_or(|until| now < until)
     }
 
-    /// Runs a call, and records it if it changes anything. Returns the number of the record that its answer waits for,
-    /// and what nodes are notified of; none if calls are recorded elsewhere.
+    /// Runs a call, and records it if it changes anything. Returns the number of the record that the answer waits for,
+    /// whether the call changed anything, and the notifications. `None` if another computer records calls.
     pub(super) fn run(
         &mut self,
         call: &Request,
@@ -66,7 +67,7 @@ impl Ledger {
         Some((sharing.last(), changes, notices))
     }
 
-    /// Nothing is recorded any more. Returns the portions that are not answered.
+    /// Stops recording. Returns the merged portions that are not answered.
     pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
         self.sharing = None;
         self.leadership += 1;
@@ -88,7 +89,7 @@ impl Ledger {
     }
 }
 
-/// What is on the disk.
+/// The content of a computer's disk.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Disk {
     pub(super) own: Own,
@@ -100,37 +101,37 @@ pub(super) struct Computer {
     pub(super) name: String,
     pub(super) member: Member,
     pub(super) up: bool,
-    /// It has ended because of another computer of its name.
+    /// Whether rosrescue has ended because another computer has the same name.
     pub(super) refused: bool,
-    /// Counts its processes.
+    /// Counts the processes of this computer.
     pub(super) life: u64,
-    /// It does nothing before this moment.
+    /// The computer hangs until this time.
     pub(super) hangs_until: u64,
-    /// It has not hung since.
+    /// The computer has not hung since this time.
     pub(super) undisturbed_since: u64,
-    /// By how much its clock is too fast, in millionths.
+    /// By how much the computer's clock is too fast, in millionths.
     drift: i64,
     clock: Instant,
-    /// The next wake-up; earlier ones are void.
+    /// When the next wake-up is due. Earlier wake-ups are ignored.
     pub(super) wake: u64,
     pub(super) ledger: Ledger,
     pub(super) disk: Disk,
-    /// As the disk was synced last.
+    /// The disk's content when it was synced last.
     pub(super) synced: Disk,
     pub(super) synced_at: u64,
-    /// The number of its master's process.
+    /// The number of the master's process. `None` without a master.
     pub(super) master: Option<u64>,
     pub(super) own_only: bool,
-    /// How often it was cut off since it owed nothing.
+    /// How often the computer was cut off since it last had no writes to send.
     pub(super) times_alone: usize,
-    /// How much of the journal it held when it was cut off, by its number and in the log.
+    /// How much of the journal the computer held when it was cut off: as a record number, and as a place in the log.
     pub(super) cut: (u64, usize),
     pub(super) standing: Standing,
-    /// Calls of its nodes that wait, and until when no answer to them is missed.
+    /// Calls of the computer's nodes that wait. Each is sent again only after the time beside it.
     pub(super) waiting: Vec<(usize, u64)>,
-    /// The furthest place that a leader's answer told of.
+    /// The furthest place in the journal that a leader's answer has shown.
     pub(super) told: Place,
-    /// Whether there is a watch, its number, and what it has shown.
+    /// Whether there is a watch. Its number, time and content follow.
     pub(super) watching: bool,
     pub(super) watch: u64,
     pub(super) watch_at: u64,
@@ -196,7 +197,7 @@ impl Computer {
         }
     }
 
-    /// Starts it anew, after its end. What was in its memory is lost.
+    /// Starts a new process. The memory of the previous one is lost.
     pub(super) fn start(&mut self, index: usize, plan: &Plan) {
         self.life += 1;
         self.up = true;
@@ -219,27 +220,27 @@ impl Computer {
         self.waiting.clear();
     }
 
-    /// An answer of a leader tells of a place.
+    /// Notes the place in the journal that a leader's answer shows.
     pub(super) fn tell_of(&mut self, place: Place) {
         let epoch = self.member.place().epoch;
         self.told = self.told.max(Place { epoch, ..place });
     }
 
-    /// Its clock at a moment of the world, in microseconds.
+    /// The computer's clock at a moment of the simulation, in microseconds.
     pub(super) fn local(&self, at: u64) -> Instant {
         let at = i128::from(at);
         let local = at + at * i128::from(self.drift) / 1_000_000;
         self.clock + Duration::from_micros(u64::try_from(local).unwrap())
     }
 
-    /// The first moment of the world at which its clock shows `local`.
+    /// The first moment of the simulation at which the computer's clock shows `local`.
     pub(super) fn moment(&self, local: Instant) -> u64 {
         let local = local.saturating_duration_since(self.clock).as_nanos() as i128;
         let at = local * 1000 / i128::from(1_000_000 + self.drift) + 1;
         u64::try_from(at).unwrap()
     }
 
-    /// What the checkpoint holds now.
+    /// Writes the ledger's present state to the disk, unsynced.
     pub(super) fn write_disk(&mut self) {
         let own = &mut self.disk.own;
         own.state = self.ledger.mirror.clone();

@@ -1,5 +1,5 @@
-//! A model of etcd: both keys, the journal, and values beside. Transactions are linearizable; what reaches it when,
-//! and what of its answers arrives, is the world's affair.
+//! A model of etcd: the leader's two keys, the journal, and large values. Transactions are linearizable. The `world`
+//! decides when requests reach the model, and which answers arrive.
 
 use std::collections::BTreeMap;
 
@@ -14,22 +14,22 @@ use crate::{
     master::{Displaced, Master, Request},
 };
 
-/// A request as it travels.
+/// A request to etcd on its way.
 #[derive(Clone, Debug)]
 pub(super) struct Sent {
     pub(super) from: usize,
-    /// The process that sent it.
+    /// The process that sent the request.
     pub(super) life: u64,
     pub(super) number: u64,
     pub(super) settings: Settings,
     pub(super) op: Op,
     pub(super) entry: Option<Put>,
     pub(super) parts: Vec<Put>,
-    /// When its sender gives up.
+    /// When the sender gives up.
     pub(super) until: u64,
 }
 
-/// What an entry of the journal holds.
+/// The content of a journal entry.
 #[derive(Clone, Debug)]
 pub(super) enum Held {
     Records(Vec<Record>),
@@ -40,19 +40,19 @@ pub(super) enum Held {
 pub(super) struct Etcd {
     pub(super) keys: Keys,
     view: View,
-    /// By the last record of each.
+    /// The journal's entries and their sizes, by the last record of each.
     entries: BTreeMap<u64, (Held, usize)>,
     snapshot: Option<(u64, Master, Vec<Displaced>)>,
-    /// What the journal leads to.
+    /// The state that the journal leads to.
     pub(super) state: Master,
     values: BTreeMap<String, Vec<u8>>,
     members: BTreeMap<String, (Said, u64)>,
-    /// The names of those who have claimed, in order.
+    /// The computers whose claims have succeeded, in order.
     pub(super) claims: Vec<usize>,
-    /// All that was ever added, and when.
+    /// Everything that was ever added to the journal, and when.
     pub(super) log: Vec<(u64, Held)>,
     pub(super) now: u64,
-    /// All data was lost once.
+    /// Whether all data was lost once.
     pub(super) lost: bool,
 }
 
@@ -84,7 +84,7 @@ impl Etcd {
         })
     }
 
-    /// The value of a parameter before this place in the log, which counts a thousand places for each entry.
+    /// The value of a parameter before `place` in the log. Each entry of the log has a thousand places.
     pub(super) fn value_at(&self, number: usize, place: usize) -> Option<i32> {
         let mut state = Master::default();
         for (index, (_, held)) in self.log.iter().enumerate() {
@@ -112,7 +112,7 @@ impl Etcd {
         self.view.seq()
     }
 
-    /// All data is lost.
+    /// Loses all data.
     pub(super) fn lose(&mut self) {
         *self = Self {
             claims: std::mem::take(&mut self.claims),
@@ -123,7 +123,7 @@ impl Etcd {
         };
     }
 
-    /// Writes the parts of something large.
+    /// Writes the parts of a large value.
     pub(super) fn put(&mut self, parts: Vec<Put>) {
         for part in parts {
             self.view.revision += 1;
@@ -131,14 +131,14 @@ impl Etcd {
         }
     }
 
-    /// A computer says how it is.
+    /// Writes a computer's member entry.
     pub(super) fn say(&mut self, name: &str, said: Said) {
         self.view.revision += 1;
         let revision = self.view.revision;
         self.members.insert(name.to_owned(), (said, revision));
     }
 
-    /// Makes the transaction, if the keys are as it expects.
+    /// Carries out the transaction if the keys have the revisions that it expects.
     pub(super) fn run(&mut self, sent: &Sent) -> EtcdAnswer {
         let expected = match &sent.op {
             Op::Read => return EtcdAnswer::Is(self.view.clone()),
@@ -199,7 +199,7 @@ impl Etcd {
         });
     }
 
-    /// Adds an entry to the journal. Returns its number.
+    /// Adds an entry to the journal. Returns the number of its last record.
     fn add(&mut self, put: &Put) -> u64 {
         let seq = self.keys.seq_of(&put.key).unwrap();
         let (held, bytes) = match Manifest::read(&put.value) {
@@ -241,7 +241,7 @@ impl Etcd {
         seq
     }
 
-    /// A snapshot replaces the journal.
+    /// Replaces the journal by a snapshot.
     pub(super) fn compact(&mut self) {
         if self.seq() > 0 {
             self.view.revision += 1;
@@ -250,7 +250,7 @@ impl Etcd {
         }
     }
 
-    /// What follows on `known`.
+    /// Reads the journal after `known`.
     pub(super) fn read(&self, known: Progress) -> Read {
         let mut read = Read {
             view: self.view.clone(),
@@ -281,7 +281,7 @@ impl Etcd {
         read
     }
 
-    /// The entries of the journal after `seq`, as a watch shows them; none if they are gone.
+    /// The entries of the journal after `seq`, as a watch shows them. `None` if a snapshot has replaced them.
     pub(super) fn entries_after(&self, seq: u64, upto: u64) -> Option<Vec<Entry>> {
         let first = self.snapshot.as_ref().map_or(0, |(seq, ..)| *seq);
         if seq < first {
@@ -298,7 +298,7 @@ impl Etcd {
         Some(entries.collect())
     }
 
-    /// What computers have said after a revision.
+    /// The member entries that were written after a revision.
     pub(super) fn heard(&self, after: u64) -> Vec<Heard> {
         let members = self.members.iter();
         let new = members.filter(|(_, (_, revision))| *revision > after);

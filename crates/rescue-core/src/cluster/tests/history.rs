@@ -1,4 +1,4 @@
-//! What nodes have done and heard, and what must be true of it.
+//! Records the calls and notifications of all nodes, and checks the promises against them.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Parameters that are written.
+/// How many parameters nodes write.
 pub(super) const KEYS: usize = 4;
 
 pub(super) fn key(number: usize) -> String {
@@ -24,7 +24,7 @@ pub(super) fn node(computer: usize) -> String {
     format!("http://node{computer}:1/")
 }
 
-/// The state in which all begins: a node of each computer subscribes to each parameter.
+/// The state at the start: a node of each computer subscribes to each parameter.
 pub(super) fn subscriptions() -> Master {
     let mut state = Master::default();
     for computer in 0..COMPUTERS {
@@ -44,29 +44,29 @@ pub(super) fn value_of(state: &Master, number: usize) -> Option<i32> {
         .and_then(Value::as_int)
 }
 
-/// A write of a node, and what becomes of it.
+/// A write of a node, and its fate.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Call {
     pub(super) computer: usize,
     pub(super) key: usize,
     pub(super) value: i32,
     pub(super) made: u64,
-    /// When it was answered, and by which computer,
+    /// When the write was answered first. The next field says by which computer.
     ran: Option<u64>,
     by: Option<usize>,
-    /// and when its node had the answer.
+    /// When the node got the answer.
     heard: Option<u64>,
-    /// It was answered alone, by a computer that held so much of the log.
+    /// Set if a computer that was cut off answered the write: how much of the log it held then.
     alone: Option<usize>,
-    /// Others have been told that it does not hold.
+    /// Whether the write was reported as lost.
     reported: bool,
-    /// It was answered alone, and the power failed before the disk had it.
+    /// Whether a computer that was cut off answered the write, and its power failed before the disk had it.
     unsynced: bool,
-    /// It is what others have set, too.
+    /// Whether the merge found that the write holds: it was made, or others had set the same value.
     held: bool,
-    /// It was run where it changed nothing, and is in no journal.
+    /// Whether the write changed nothing where it ran, so it is in no journal.
     unchanged: bool,
-    /// A leader has made it for a computer that was alone, when the log had this length.
+    /// When a leader made the write for a computer that was cut off, and the length of the log then.
     merged: Option<(u64, usize)>,
 }
 
@@ -78,7 +78,8 @@ pub(super) struct Read {
     pub(super) began: u64,
     pub(super) done: Option<u64>,
     pub(super) value: Option<i32>,
-    /// A computer that was alone has answered, or a leader whose journal lacked some of what it showed. Neither counts.
+    /// Whether the read does not count, because a computer that was cut off answered it, or a leader whose journal
+    /// lacked something that it showed.
     pub(super) alone: bool,
 }
 
@@ -100,11 +101,11 @@ pub(super) struct History {
     pub(super) calls: Vec<Call>,
     by_value: HashMap<(usize, usize, i32), usize>,
     pub(super) reads: Vec<Read>,
-    /// What the node of each computer was told last of each parameter.
+    /// The value of each parameter in the last notification to each computer's node.
     pub(super) told: [[Option<i32>; KEYS]; COMPUTERS],
-    /// Nodes of a computer have died at these moments.
+    /// When the nodes of a computer died.
     died: Vec<(usize, u64)>,
-    /// A computer did not read each change of others at these moments: it has started, or was given a whole state.
+    /// When a computer did not read each change of the others, because it started or got a whole state.
     skipped: Vec<(usize, u64)>,
     pub(super) broken: Option<String>,
 }
@@ -114,7 +115,8 @@ impl History {
         self.broken.get_or_insert_with(|| what.to_owned());
     }
 
-    /// A node writes. `again`: by which of the values that others have written, counted from the last one.
+    /// Records that a node writes. `again` chooses one of the values written before, counted from the last one, to be
+    /// written again.
     pub(super) fn write(
         &mut self,
         computer: usize,
@@ -186,11 +188,11 @@ impl History {
         self.of(call).held = true;
     }
 
-    /// A leader has made `call` for the computer `from`.
+    /// Notes that a leader has made `call` for the computer `from`.
     pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
-        // A value that is set again, so that nodes are told of it, is no call of a node.
+        // A value that the merge sets again, to notify nodes, is no call of a node.
         let call = self.find(call.params());
-        // Another computer that has led has judged by what it had answered itself.
+        // Only calls by nodes of `from` count. It answered other calls as a leader.
         if let Some(call) = call.filter(|call| self.calls[*call].computer == from) {
             self.calls[call].merged.get_or_insert((now, log));
         }
@@ -213,7 +215,7 @@ impl History {
         }
     }
 
-    /// The answer does not reach its node.
+    /// Notes that the answer does not reach its node.
     pub(super) fn unheard(&mut self, call: usize) {
         let call = &mut self.calls[call];
         if call.heard.is_none() {
@@ -231,7 +233,7 @@ impl History {
 
     pub(super) fn gives_up(&mut self, _call: usize) {}
 
-    /// The power of a computer has failed. Its disk holds what it had answered when it was `synced`.
+    /// Notes that a computer's power has failed. Its disk holds what it had answered when it was `synced`.
     pub(super) fn loses_power(&mut self, computer: usize, synced: u64, now: u64) {
         let unsynced = |call: &Call| call.alone.is_some() && call.heard >= Some(synced);
         for call in &mut self.calls {
@@ -240,24 +242,25 @@ impl History {
         self.forgets(computer, now);
     }
 
-    /// The nodes of a computer have died. What they were told counts no more.
+    /// Notes that the nodes of a computer have died, so what they were told no longer counts.
     pub(super) fn forgets(&mut self, computer: usize, now: u64) {
         self.died.push((computer, now));
     }
 
-    /// A computer has not read each change of the others.
+    /// Notes that a computer did not read each change of the others.
     pub(super) fn skips(&mut self, computer: usize, now: u64) {
         self.skipped.push((computer, now));
     }
 
-    /// Checks all, against the journal.
+    /// Checks all promises against the journal.
     pub(super) fn check(&self, etcd: &Etcd, commit: Commit) -> Result<(), String> {
         let places = Places::of(self, etcd);
         for key in 0..KEYS {
             self.check_last(key, &places, etcd, commit)?;
             let last = value_of(&etcd.state, key);
             for (computer, told) in self.told.iter().enumerate() {
-                // A write that was answered alone and changed nothing there is kept nowhere, and cannot be corrected.
+                // A write that changed nothing on a computer that was cut off is kept nowhere, so its node cannot be
+                // corrected.
                 let mut calls = self.calls.iter();
                 let in_vain = calls.any(|call| {
                     (call.computer, call.key, Some(call.value)) == (computer, key, told[key])
@@ -276,7 +279,7 @@ impl History {
         self.check_reads(&places, etcd, commit)
     }
 
-    /// The last value of a parameter is not older than a write that was answered.
+    /// Checks that the last value of a parameter is not older than a write that was answered.
     fn check_last(
         &self,
         key: usize,
@@ -301,7 +304,7 @@ impl History {
                 let own = (later.computer, later.key) == (call.computer, call.key);
                 own && of > number && later.heard.is_some()
             });
-            // Or what others have set is the same.
+            // Another write of the same value in the log is as good.
             let in_log = !places.of[number].is_empty()
                 || places.of_value(self, key, Some(call.value)).is_some();
             let may_be_lost = commit == Commit::Interval && !in_log;
@@ -325,14 +328,14 @@ impl History {
         Ok(())
     }
 
-    /// What was answered alone has replaced nothing that others have written meanwhile.
+    /// Checks that no write answered while cut off has replaced a write that others made meanwhile.
     fn check_merged(&self, places: &Places, etcd: &Etcd) -> Result<(), String> {
         for (number, call) in self.calls.iter().enumerate() {
             let (Some(cut), Some((moment, log))) = (call.alone, call.merged) else {
                 continue;
             };
-            // Where states are compared, it does not show that others have set a value and set it back, or what this
-            // computer's nodes have set as well.
+            // A comparison of states does not show that others set a value and set it back, nor that they set what this
+            // computer's nodes set, too.
             let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
             let mut skipped = self.skipped.iter();
             let compared =
@@ -351,7 +354,7 @@ impl History {
             }
             for (of, other) in self.calls.iter().enumerate() {
                 let theirs = other.computer != call.computer && other.key == call.key;
-                // What this computer itself has answered was before.
+                // Writes that this computer itself answered came before it was cut off.
                 let counts = other.heard.is_some()
                     && other.alone.is_none()
                     && other.by != Some(call.computer);
@@ -367,7 +370,7 @@ impl History {
         Ok(())
     }
 
-    /// On one computer no read goes back, and a node sees what it has written.
+    /// Checks that on one computer no read goes back in time, and that a node sees its own writes.
     fn check_reads(&self, places: &Places, etcd: &Etcd, commit: Commit) -> Result<(), String> {
         for computer in 0..COMPUTERS {
             for key in 0..KEYS {
@@ -385,20 +388,20 @@ impl History {
         etcd: &Etcd,
         commit: Commit,
     ) -> Result<(), String> {
-        // From these moments on no read is older than that.
+        // From the moment in each of these entries, no read may be older than its place in the log.
         let mut floors: Vec<(u64, usize, String)> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
-            // One that changed nothing may have been run again later.
+            // A write that changed nothing may have been run again later.
             let counts = !call.reported && !call.unchanged;
             if (call.computer, call.key) != (computer, key) || !counts {
                 continue;
             }
             let Some(heard) = call.heard else { continue };
-            // A later write may stand for it, and be lost.
+            // A later write may have taken the place of this one when the writes were kept, and may be lost.
             if call.alone.is_some() && !call.held {
                 continue;
             }
-            // In a state the value may be another call's.
+            // A value in a whole state may come from another call.
             let same = self.calls.iter();
             let same = same.filter(|of| (of.key, of.value) == (key, call.value));
             let in_state = places.of[number].first().filter(|_| same.count() == 1);
@@ -423,7 +426,8 @@ impl History {
                 floors.push((read.done.unwrap(), first, format!("{read:?}")));
             }
         }
-        // The same value may have been written in vain, or alone: it is not known which write a read shows.
+        // The same value may also come from a write that is in no journal, or was answered while cut off. Then it is
+        // unknown which write a read shows.
         let in_vain = |read: &&Read| {
             let mut calls = self.calls.iter().zip(&places.of);
             calls.any(|(call, places)| {
@@ -437,7 +441,8 @@ impl History {
                 continue;
             };
             for (moment, floor, why) in &floors {
-                // It was answered before the journal had it, or is back with a leader that has started again.
+                // The floor's write may have been shown before the journal had it, or by a leader that has started
+                // again.
                 let (added, held) = &etcd.log[floor / 1000];
                 let early = *added >= read.began || matches!(held, Held::State(_));
                 let mut restarts = self.skipped.iter();
@@ -459,10 +464,10 @@ impl History {
     }
 }
 
-/// Where each write is in the log.
+/// The places of each write in the log.
 struct Places {
     of: Vec<Vec<usize>>,
-    /// The same without states, which hold what was written before.
+    /// The places without those in whole states, which hold earlier writes.
     changed: Vec<Vec<usize>>,
 }
 
@@ -496,7 +501,7 @@ impl Places {
         Self { of, changed }
     }
 
-    /// The first and the last place of any write of this value; none if it is nowhere.
+    /// The first and the last place of any write of this value. `None` if the log has no such write.
     fn of_value(
         &self,
         history: &History,

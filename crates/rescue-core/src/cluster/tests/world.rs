@@ -1,5 +1,5 @@
-//! Computers, the network between them, and what befalls them, in microseconds. The shell around the members is here:
-//! it carries out their actions, as `app::cluster` does.
+//! The simulated computers, the network between them, and their failures. Times are in microseconds. The code here
+//! carries out the members' actions, as `app::cluster` does.
 
 use std::{
     cmp::Reverse,
@@ -34,9 +34,9 @@ use faults::{Fault, Network};
 
 pub(super) const COMPUTERS: usize = 3;
 pub(super) const MS: u64 = 1000;
-/// How often a computer looks after what waits.
+/// How often a computer retries calls that wait.
 const POLL: u64 = 40 * MS;
-/// A master takes so long to start.
+/// How long a master takes to start.
 const MASTER_STARTS: u64 = 120 * MS;
 
 #[derive(Debug)]
@@ -45,26 +45,26 @@ enum Event {
     Wake(usize),
     Poll(usize),
     Input(usize, u64, Input),
-    /// A request reaches etcd. Nobody waits for its answer if it is late.
+    /// A request reaches etcd. The flag is false if its sender no longer waits for the answer.
     Request(Box<Sent>, bool),
     Watch(usize, u64, View),
     Load(usize, u64, Progress, u64),
-    /// A node of this computer does something.
+    /// A node of this computer makes a call.
     Client(usize),
-    /// A call of the first reaches the second, as the leader of a term.
+    /// A call forwarded by the first computer reaches the second as the leader of a term.
     Forward(usize, usize, u64, usize),
     /// The answer to a call reaches the computer of its node.
     Done(usize, u64, usize, Place),
-    /// A read of the first reaches the second.
+    /// A read forwarded by the first computer reaches the second.
     Ask(usize, u64, usize, u64, usize),
-    /// The value, and whether the journal may lack it.
+    /// The answer to a read arrives: the value, and whether the journal may lack it.
     Told(usize, u64, usize, (Option<i32>, bool), Place),
     /// The leader has not answered a read in time.
     Late(usize, u64, usize),
     Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
     Probe(usize, u64, usize, u64, u64),
     Put(usize, u64, u64, Vec<crate::cluster::journal::Put>),
-    /// A node is told a parameter's value, by a computer or by its master.
+    /// A node is notified of a parameter's value, by a computer or by its master.
     Notify {
         from: usize,
         master: Option<u64>,
@@ -72,9 +72,9 @@ enum Event {
         key: usize,
         value: Option<i32>,
     },
-    /// A master tries again to tell a node there what it could not.
+    /// A master tries again to notify a node that it could not reach.
     Retry(usize, u64, usize),
-    /// All nodes are told the state, by a computer in this time that it records calls.
+    /// A computer notifies all nodes of the state, if it still records calls in the same period.
     TellAll(usize, u64, Option<u64>),
     Sync(usize),
     Fault,
@@ -96,11 +96,11 @@ pub(super) struct World {
     pub(super) computers: Vec<Computer>,
     pub(super) history: History,
     masters: u64,
-    /// What a master has not been able to tell a node, in order: it tells each node one thing at a time.
+    /// Notifications that a master could not deliver to a node, in order. A master sends each node one at a time.
     stuck: HashMap<(usize, u64, usize), Told>,
-    /// When the last notification from one to another arrives.
+    /// When the last notification from one computer to another arrives.
     channels: [[u64; COMPUTERS]; COMPUTERS],
-    /// A node there must be told the state when it answers again.
+    /// Whether a computer must notify another one's node of the state when that node answers again.
     owed: [[bool; COMPUTERS]; COMPUTERS],
     /// The highest term in which a call was answered.
     term: u64,
@@ -140,7 +140,7 @@ impl World {
             world.computers[index].start(index, &plan);
             let mut start = world.dice.below(30) * MS;
             if world.plan.twins && index == 1 {
-                // Two that start together notice each other only when one of them leads.
+                // Two namesakes that start together notice each other only when one of them leads.
                 start += (1 + world.dice.below(5)) * 1000 * MS;
             }
             let life = world.computers[index].life;
@@ -206,7 +206,7 @@ impl World {
         };
         match at.map(|at| self.computers[at].hangs_until) {
             Some(until) if until > self.now => {
-                // In their order.
+                // Events of a hanging computer keep their order.
                 self.events.push(Reverse((until, order)));
                 self.what.insert(order, event);
             }
@@ -239,7 +239,7 @@ impl World {
             Event::Client(at) => self.client(at),
             Event::Forward(from, to, term, call) => {
                 let computer = &self.computers[to];
-                // Who has the answer to an earlier try has closed the connection of a later one.
+                // A caller that has the answer to an earlier attempt has closed the connection of a later one.
                 if computer.up
                     && !self.history.is_heard(call)
                     && self.network.joins(from, to)
@@ -336,7 +336,7 @@ impl World {
         self.computers[at].up && self.computers[at].life == life
     }
 
-    /// A request reaches etcd, or does not.
+    /// Handles a request that may reach etcd.
     fn request(&mut self, sent: Box<Sent>, awaited: bool) {
         let (at, life, number) = (sent.from, sent.life, sent.number);
         let silence = |number| {
@@ -365,7 +365,7 @@ impl World {
             return;
         }
         if self.plan.faults && self.dice.one_in(60) {
-            // The answer is lost. Now and then nobody notices.
+            // The answer is lost. Sometimes the sender is not told.
             if !self.dice.one_in(10) {
                 self.after(50 * MS, silence(number));
             }
@@ -376,7 +376,7 @@ impl World {
         self.after(delay, Event::Input(at, life, answer));
     }
 
-    /// Each watch will show the present state.
+    /// Has each watch show the present state.
     fn show_watches(&mut self) {
         for at in 0..COMPUTERS {
             if self.computers[at].watching {
@@ -405,7 +405,7 @@ impl World {
         }
         let (seq, revision) = computer.watched;
         if self.etcd.view().revision < revision || view.revision > self.etcd.view().revision {
-            // It waits for a revision that is to come.
+            // The watch waits for a later revision.
             return;
         }
         let entries = self.etcd.entries_after(seq, view.seq());
@@ -444,7 +444,7 @@ impl World {
         self.after(delay, Event::Input(at, life, Input::Loaded(read)));
     }
 
-    /// The ledger has changed.
+    /// Passes new changes of the ledger to the member.
     fn input_changes(&mut self, at: usize) {
         let changes = match &mut self.computers[at].ledger.sharing {
             Some(sharing) => sharing.take(),
@@ -664,7 +664,7 @@ impl World {
                     self.computers[at].times_alone += 1;
                 }
                 News::Leads { .. } => self.counts.reigns += 1,
-                // What was read of what etcd has lost may be lost.
+                // Reads may have shown data that etcd has lost.
                 News::EtcdLost => self.history.forgets(at, self.now),
                 _ => {}
             },
@@ -698,11 +698,11 @@ impl World {
     fn send(&mut self, sent: Box<Sent>) {
         let well = self.etcd.log.is_empty() || self.network.healed_for(self.now, 0);
         if self.plan.faults && !well && self.dice.one_in(400) {
-            // Who was to send it is gone, and nobody says so.
+            // The request is lost, and its sender gets no error.
             return;
         }
         if self.plan.faults && self.dice.one_in(40) {
-            // It arrives late, or twice.
+            // The request arrives late, or twice.
             let late = self.dice.below(3000) * MS;
             self.after(late, Event::Request(sent.clone(), false));
             if self.dice.one_in(2) {
@@ -733,7 +733,7 @@ impl World {
         (0..COMPUTERS).filter(leads).collect()
     }
 
-    /// How long it takes until another one than `before` leads.
+    /// How long it takes until a computer other than `before` leads.
     pub(super) fn until_another_leads(&mut self, before: usize) -> Duration {
         let start = self.now;
         while self.leaders().iter().all(|leader| *leader == before) {
@@ -743,7 +743,7 @@ impl World {
         Duration::from_micros(self.now - start)
     }
 
-    /// What must be so some time after the last failure; if it is not, what is wrong.
+    /// Checks what must be true some time after the last failure. Returns what is wrong if it is not.
     pub(super) fn verdict(&self) -> Result<(), String> {
         if let Some(why) = &self.history.broken {
             return Err(why.clone());

@@ -1,4 +1,4 @@
-//! Random periods of being cut off, with a leader that continues, is replaced, forgets, and whose answers get lost.
+//! Merges the writes of random periods of being cut off. Leaders are replaced, forget changes, and lose answers.
 
 use super::super::{
     Changes, Verdict, WritesToSend,
@@ -13,7 +13,7 @@ use crate::{
 
 const KEYS: [&str; 7] = ["/a", "/a/b", "/a/b/c", "/a/d", "/e", "/e/f", "/g"];
 
-/// xorshift64*.
+/// A random number generator (xorshift64*).
 struct Dice(u64);
 
 impl Dice {
@@ -35,7 +35,7 @@ impl Dice {
             return Request::new(Method::DeleteParam, [caller, key]);
         }
         *number += 1;
-        // Small ones meet by chance.
+        // Small numbers make both sides write the same value by chance.
         let value = match self.below(6) {
             0 => Value::Struct(Struct::from([("b".to_owned(), (*number).into())])),
             1 => Value::Int(1),
@@ -51,7 +51,7 @@ enum By {
     Lonely,
 }
 
-/// The others: their journal, and the state.
+/// The other computers: their journal and their state.
 #[derive(Default)]
 struct There {
     state: Master,
@@ -69,7 +69,7 @@ impl There {
         reply
     }
 
-    /// Makes a portion as the write queue does.
+    /// Makes a portion of writes as the write queue does.
     fn merge(&mut self, seq: usize, calls: &[Request]) -> MergeAnswer {
         if seq < self.known {
             return MergeAnswer::Again;
@@ -143,7 +143,7 @@ fn play(seed: u64, counts: &mut Counts) {
     let mut here = there.state.clone();
     let (mut changes, mut pending, mut written) =
         (Changes::default(), WritesToSend::default(), vec![]);
-    // One was on its way when the cable was cut.
+    // One write was on its way when the connection was cut.
     let first = dice.write("/here", &mut ours);
     if dice.one_in(2) {
         changes.expect([first.clone()]);
@@ -167,7 +167,7 @@ fn play(seed: u64, counts: &mut Counts) {
         there.run(By::Others, &write);
     }
     assert!(pending.len() <= 2 * KEYS.len(), "seed {seed}");
-    // The network is mended.
+    // The network works again.
     let all: Vec<Request> = pending.calls().cloned().collect();
     let (mut left, mut read) = (all.clone(), base);
     let (mut present, mut reported, mut held) = (Master::default(), vec![], vec![]);
@@ -189,7 +189,7 @@ fn play(seed: u64, counts: &mut Counts) {
                 there.run(By::Others, &write);
             }
             if dice.one_in(8) {
-                // Another leader, or so much that this one has forgotten.
+                // Another computer leads now, or the leader has forgotten older changes.
                 there.known = there.journal.len();
             }
             let count = (1 + dice.below(3)).min(left.len());
@@ -224,11 +224,11 @@ fn play(seed: u64, counts: &mut Counts) {
         part.filter(|(by, _)| *by == By::Others)
             .map(|(_, call)| call)
     };
-    // What others have written is not overwritten by who has not seen it.
+    // No write of this computer replaces a change by others that this computer had not seen.
     for (at, (_, call)) in there.journal.iter().enumerate().skip(base) {
         if all.contains(call) && there.journal[at].0 == By::Lonely {
             let unseen = others(base, at).find(|of| related(of, call));
-            // The one that was on its way had run before others knew.
+            // The write that was on its way ran before all of the others' changes.
             let was_first = at == base;
             assert!(
                 unseen.is_none() || was_first,
@@ -245,7 +245,8 @@ fn play(seed: u64, counts: &mut Counts) {
         if is_deleted {
             continue;
         }
-        // Each is there, or is reported, unless others have made it so or have deleted it as well.
+        // Each write is in the journal or is reported, unless others have set the same value or have deleted the
+        // parameter, too.
         let contested = others(base, end).any(|of| related(of, call));
         let is_reported = reported.contains(call);
         assert!(contested || !is_reported, "seed {seed}: {call:?} is lost");
@@ -264,7 +265,7 @@ fn play(seed: u64, counts: &mut Counts) {
             assert!(was_so, "seed {seed}: {call:?} was lost without a word");
         }
     }
-    // Where no other computer has written, all is as it was here.
+    // Parameters that no other computer has written have this computer's values.
     for key in KEYS {
         let this = Request::new(Method::DeleteParam, ["/here", key]);
         let about = written.iter().filter(|call| related(call, &this));
@@ -293,7 +294,7 @@ fn others_win_each_loss_is_reported_and_the_rest_holds() {
         play(seed, &mut counts);
     }
     println!("{counts:?}");
-    // Else the schedules test nothing.
+    // With fewer events the schedules would test nothing.
     let Counts {
         held,
         lost,

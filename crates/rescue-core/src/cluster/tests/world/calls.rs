@@ -1,4 +1,4 @@
-//! What nodes call and hear: writes, reads, merges and notifications.
+//! The simulated nodes' writes, reads and notifications, and the merges of their writes.
 
 use super::*;
 
@@ -9,7 +9,7 @@ impl World {
             && computer.watch_at < self.now
             && computer.watched.1 != self.etcd.view().revision;
         if behind && self.network.reaches_etcd(at) {
-            // The watch is made anew.
+            // A new watch replaces the silent one.
             self.computers[at].watch += 1;
             self.show_watch(at);
         }
@@ -21,7 +21,8 @@ impl World {
         }
         self.flush(at);
         let computer = &self.computers[at];
-        // Besides its times alone, the writes that it answered as a leader before it was deposed.
+        // One more period holds the writes that the computer answered as a leader before it was
+        // deposed.
         let times = computer.times_alone + 1;
         if computer.standing == Standing::Alone && computer.member.uncommitted() > KEYS * times {
             self.history.breaks("what is kept grows with each write");
@@ -31,7 +32,7 @@ impl World {
         }
     }
 
-    /// Does what can be done about the calls that wait.
+    /// Runs or forwards the calls that wait, as far as possible.
     pub(super) fn flush(&mut self, at: usize) {
         let waiting = self.computers[at].waiting.clone();
         for (call, missed) in waiting {
@@ -55,7 +56,7 @@ impl World {
         self.input_changes(at);
     }
 
-    /// Runs a call where it is recorded.
+    /// Runs a call on the computer that records it.
     pub(super) fn run_call(&mut self, at: usize, call: usize, origin: usize) {
         let source = match origin == at {
             true => Source::Here,
@@ -109,7 +110,7 @@ impl World {
             let alone = self.computers[at].member.role() == Role::Alone;
             let term = self.computers[at].member.machine().term();
             if let Some(term) = term.filter(|_| !alone) {
-                // What is in the journal is safe, whoever says so.
+                // A call in the journal is safe, whichever computer answers it.
                 let committed = self.etcd.holds(&self.history.request(call));
                 if recorded && !committed && term < self.term {
                     self.history.breaks("two leaders answer");
@@ -137,7 +138,7 @@ impl World {
         }
     }
 
-    /// A call of this computer's nodes was answered.
+    /// Notes that a call of this computer's nodes was answered.
     pub(super) fn done(&mut self, at: usize, call: usize) {
         let computer = &mut self.computers[at];
         let waits = computer.waiting.iter().any(|(of, _)| *of == call);
@@ -152,7 +153,7 @@ impl World {
         }
     }
 
-    /// The leader makes writes that were answered alone.
+    /// Makes writes on the leader that a computer answered while it was cut off.
     pub(super) fn merge(&mut self, asker: Asker, to: Option<usize>, term: u64, ask: Ask) {
         let (from, ..) = asker;
         let at = to.unwrap_or(from);
@@ -196,7 +197,7 @@ impl World {
         let Some(answer) = answer else {
             return self.merge_answered(asker, at, None);
         };
-        // It waits until the journal has them.
+        // The answer waits until the journal has the writes.
         let ledger = &mut self.computers[at].ledger;
         let seq = ledger.sharing.as_ref().map_or(0, |of| of.last());
         let agreed = ledger.agreed;
@@ -233,7 +234,7 @@ impl World {
         self.flush(at);
     }
 
-    /// Whether a leader, or one that was cut off, shows what the journal may lack.
+    /// Whether the mirror of a leader, or of one that was cut off, may show changes that the journal lacks.
     pub(super) fn is_early(&self, at: usize) -> bool {
         let computer = &self.computers[at];
         let sharing = computer.ledger.sharing.as_ref();
@@ -263,7 +264,7 @@ impl World {
         }
     }
 
-    /// The mirror answers, if it may.
+    /// Answers a read from the mirror, if the mirror may answer.
     pub(super) fn read_late(&mut self, at: usize, life: u64, read: usize) {
         let key = self.history.reads[read].key;
         let computer = &self.computers[at];
@@ -292,7 +293,7 @@ impl World {
         self.counts.reads += 1;
     }
 
-    /// The master, or the mirror in its place, notifies nodes.
+    /// Has the master notify nodes, or the mirror in the master's place.
     pub(super) fn tell_notices(&mut self, at: usize, notices: Vec<Notice>) {
         for notice in notices {
             if let Notice::ParamUpdate {
@@ -351,7 +352,7 @@ impl World {
         value: Option<i32>,
     ) {
         if master.is_some_and(|of| self.computers[from].master != Some(of)) {
-            // It has ended.
+            // The master has ended.
             return;
         }
         if let Some(master) = master
@@ -373,7 +374,7 @@ impl World {
         }
     }
 
-    /// rosmaster tries again and again.
+    /// Repeats a notification that a master could not deliver, as rosmaster does.
     pub(super) fn retry(&mut self, from: usize, master: u64, to: usize) {
         let lives = self.computers[from].master == Some(master);
         if lives && !self.network.joins(from, to) {
@@ -390,7 +391,7 @@ impl World {
         self.history.told[to][key] = value;
     }
 
-    /// The one delay of the network.
+    /// A random delay of one message in the network.
     pub(super) fn delay(&mut self) -> u64 {
         let slow = self.network.slow(self.now);
         MS / 2 + self.dice.below(20 * MS) + slow

@@ -1,4 +1,4 @@
-//! What befalls computers, the network and etcd.
+//! Failures of computers, of the network and of etcd.
 
 use std::time::Duration;
 
@@ -14,10 +14,10 @@ pub(in super::super) struct Plan {
     pub(in super::super) commit: Commit,
     pub(in super::super) alone: WhenAlone,
     pub(in super::super) faults: bool,
-    /// Two computers have one name.
+    /// Whether two computers have the same name.
     pub(in super::super) twins: bool,
     pub(in super::super) ttl: Duration,
-    /// Whether it is printed what happens.
+    /// Whether to print all events.
     pub(in super::super) traced: bool,
 }
 
@@ -29,7 +29,7 @@ pub(in super::super) struct Counts {
     pub(in super::super) reads: u64,
     pub(in super::super) merged: u64,
     pub(in super::super) reported: u64,
-    /// The longest time that a call waited where nothing hung, while computers that are alone serve.
+    /// The longest time that a call waited on a computer that did not hang, with `--alone serve`.
     pub(in super::super) waited: Duration,
 }
 
@@ -48,23 +48,23 @@ impl Counts {
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Fault {
     Kill(usize),
-    /// Its disk goes back to what was synced last.
+    /// The computer's power fails, so its disk goes back to the last sync.
     PowerCut(usize),
     AllPowerCut,
     CutFromEtcd(usize),
     CutPair(usize, usize),
-    /// Nothing of the first reaches the second.
+    /// No message from the first computer reaches the second.
     CutOneWay(usize, usize),
-    /// From the other computers and from etcd.
+    /// The computer is cut off from the other computers and from etcd.
     CutOff(usize),
     EtcdAway,
 }
 
 #[derive(Debug, Default)]
 pub(super) struct Network {
-    /// How many failures keep a computer from etcd,
+    /// How many failures cut each computer off from etcd.
     from_etcd: [u32; COMPUTERS],
-    /// and one from another one.
+    /// How many failures cut the way from one computer to another.
     ways: [[u32; COMPUTERS]; COMPUTERS],
     etcd_away: u32,
     slow_until: u64,
@@ -97,7 +97,7 @@ impl Network {
         }
     }
 
-    /// Whether all has been well for that long.
+    /// Whether the last failure ended more than `time` ago.
     pub(super) fn healed_for(&self, now: u64, time: u64) -> bool {
         self.healed.is_some_and(|at| now > at + time)
     }
@@ -125,7 +125,7 @@ impl Network {
 }
 
 impl World {
-    /// Something breaks, for a while.
+    /// Begins a random failure that ends after a while.
     pub(super) fn fault(&mut self) {
         if !self.plan.faults || self.network.healed.is_some() {
             return;
@@ -133,11 +133,11 @@ impl World {
         let pause = (100 + self.dice.below(1500)) * MS;
         self.after(pause, Event::Fault);
         if self.etcd.log.is_empty() {
-            // The first leader alone has the state in which all begins.
+            // As long as the journal is empty, only the first leader has the initial state.
             return;
         }
         let at = self.dice.below(COMPUTERS as u64) as usize;
-        // Who leads is hit more often.
+        // The leader fails more often than others.
         let leader = self.leaders().first().copied();
         let at = leader.filter(|_| self.dice.one_in(2)).unwrap_or(at);
         let other = (at + 1 + self.dice.below(COMPUTERS as u64 - 1) as usize) % COMPUTERS;
@@ -196,11 +196,11 @@ impl World {
         self.kill(at);
         let computer = &mut self.computers[at];
         computer.disk = computer.synced.clone();
-        // Its nodes have died, too.
+        // The computer's nodes have died, too.
         self.history.loses_power(at, computer.synced_at, self.now);
     }
 
-    /// One failure of some seconds.
+    /// Begins one failure that lasts some seconds.
     pub(in super::super) fn fail_once(&mut self) -> String {
         let leader = self.leaders()[0];
         let follower = (leader + 1) % COMPUTERS;
@@ -220,7 +220,7 @@ impl World {
         format!("{fault:?} for {} ms", time / MS)
     }
 
-    /// etcd is stopped, and comes back without its data.
+    /// Stops etcd, which comes back without its data.
     pub(in super::super) fn lose_etcd(&mut self) {
         let time = (20 + self.dice.below(6000)) * MS;
         self.strike(Fault::EtcdAway, time);
@@ -239,7 +239,7 @@ impl World {
         let computer = &mut self.computers[at];
         computer.up = false;
         computer.master = None;
-        // Nobody waits any more for calls that were made there.
+        // The calls' connections end with the process, so their callers no longer wait.
         for (call, _) in std::mem::take(&mut computer.waiting) {
             self.history.gives_up(call);
         }
@@ -262,7 +262,7 @@ impl World {
         }
     }
 
-    /// All failures end, and no more follow.
+    /// Ends all failures and allows no new ones.
     pub(in super::super) fn heal(&mut self) {
         self.network.healed = Some(self.now);
         (self.network.slow_until, self.network.etcd_slow_until) = (0, 0);
