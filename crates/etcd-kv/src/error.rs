@@ -1,4 +1,4 @@
-//! Errors of etcd, in words for its operator.
+//! Errors of etcd, in words for the person who runs etcd.
 
 use std::time::Duration;
 
@@ -61,7 +61,7 @@ pub enum EtcdError {
 }
 
 impl EtcdError {
-    /// Reads an answer with an HTTP error status.
+    /// The error in an answer with an HTTP error status.
     pub(super) fn refused(endpoint: &str, status: StatusCode, body: &[u8]) -> Self {
         if let Ok(answer) = serde_json::from_slice::<ErrorAnswer>(body)
             && answer.code != 0
@@ -77,7 +77,7 @@ impl EtcdError {
         Self::NotEtcd { endpoint, why }
     }
 
-    /// Reads an answer that contains an error.
+    /// The error with this gRPC status code and message.
     pub(super) fn answered(endpoint: &str, code: i64, message: &str) -> Self {
         let endpoint = endpoint.to_owned();
         let why = message.to_owned();
@@ -107,7 +107,7 @@ impl EtcdError {
         )
     }
 
-    /// Whether every other member would give the same answer.
+    /// Whether every other member of etcd would answer with the same error, so that asking them is useless.
     pub(super) fn is_final(&self) -> bool {
         matches!(
             self,

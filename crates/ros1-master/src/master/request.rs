@@ -147,9 +147,9 @@ impl Request {
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror can answer this call without a master, because only one answer is possible. It cannot answer
-    /// `shutdown`, errors whose text depends on the Python version, or a method that rosmaster exports by accident and
-    /// that has an effect.
+    /// Whether [`Master`](super::Master) can answer this call in place of rosmaster, because only one answer is
+    /// possible. It cannot answer `shutdown`, or a call whose error text depends on the Python version, or
+    /// `param_update_task`, which rosmaster exports by accident and which has an effect.
     pub fn is_answerable(&self) -> bool {
         match &self.method {
             Method::Multicall => self.entries.iter().all(|entry| match entry {
@@ -157,7 +157,8 @@ impl Request {
                 Entry::Refused(_) => false,
                 Entry::Malformed(text) => text.starts_with('<'),
             }),
-            // Without its two parameters it is refused.
+            // rosmaster refuses a `shutdown` that does not have exactly two parameters, or whose caller id is not a
+            // string.
             Method::Shutdown => self.params.len() != 2 || self.caller().is_none(),
             Method::Unknown(name) => **name != *"param_update_task",
             _ => true,
@@ -186,7 +187,7 @@ impl From<Call> for Request {
     }
 }
 
-/// Converts a call. A malformed entry of a multicall becomes nil.
+/// Converts a call. An entry of a multicall that cannot be run becomes nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
         let mut params = request.params;

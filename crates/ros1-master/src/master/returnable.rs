@@ -1,4 +1,5 @@
-//! Finds out which parameter values a master can return. It accepts values that `xmlrpc.client.dumps` cannot encode.
+//! Finds out which parameter values a master can return. A master also accepts values that Python's
+//! `xmlrpc.client.dumps` cannot encode, so it can never return them.
 
 use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
 
