@@ -5,8 +5,8 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Parameters that belong to the present session. roslaunch compares `/run_id` with its own, and stores its
-/// addresses below `/roslaunch`.
+/// Parameters that belong to the present session, so their values in a checkpoint are not used. roslaunch compares
+/// `/run_id` with its own, and stores its addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 
 /// A parameter of the checkpoint that is left out, and the reason.

@@ -23,9 +23,9 @@ pub enum RestorePolicy {
 /// What is known about the session in a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionEvidence {
-    /// Whether the computer has not rebooted since.
+    /// Whether the computer has not rebooted since the session began.
     pub same_boot: bool,
-    /// Whether rosrescue was stopped cleanly.
+    /// Whether rosrescue ended the session with a clean stop.
     pub closed: bool,
     /// Whether a registered node answers. After a reboot only nodes on other computers count.
     pub node_alive: bool,
@@ -53,8 +53,8 @@ pub fn depends_on_nodes(policy: RestorePolicy, evidence: SessionEvidence) -> boo
     with(true) != with(false)
 }
 
-/// Decides whether the session in a checkpoint continues. It does after a kill. After a clean stop or a
-/// reboot it does only if one of its nodes is alive.
+/// Decides whether the session in a checkpoint continues. A session continues after a kill. After a clean stop or a
+/// reboot it continues only if one of its nodes is alive.
 pub fn decide(policy: RestorePolicy, evidence: SessionEvidence) -> Decision {
     let SessionEvidence {
         same_boot,
@@ -87,7 +87,7 @@ pub struct Rebuilt {
     /// Nodes whose names were taken in the records or shortly before the snapshot, ordered by address. It is unknown
     /// which of them were told to shut down.
     pub displaced: Vec<Displaced>,
-    /// Why the snapshot was not used: its state is impossible for a master.
+    /// Why the snapshot was not used, if no master can be in its state.
     pub trouble: Option<String>,
 }
 

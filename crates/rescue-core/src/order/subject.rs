@@ -10,7 +10,8 @@ use crate::{
 pub enum Subject {
     /// The publishers of a topic, given by its resolved name.
     Topic(String),
-    /// A parameter, by its resolved key, which ends in a slash. News about it also concerns the keys above and below.
+    /// A parameter, by its resolved key, which ends in a slash. News about a parameter also concerns the keys above and
+    /// below.
     Param(String),
     /// A node's own name. A node is shut down when another node takes its name.
     Name(String),
@@ -108,7 +109,8 @@ impl Concern {
         self.anything
     }
 
-    /// For a subject that is a name, the caller's port: a call never shuts its own node down.
+    /// If `subject` is a name, the port of the caller, which need not wait because a call never shuts its own node
+    /// down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),
