@@ -44,7 +44,7 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// The operating system's error without advice.
+    /// The text of this error. Leaves out the advice if the operating system reported the error.
     pub fn without_advice(&self) -> String {
         match self {
             Self::Io {

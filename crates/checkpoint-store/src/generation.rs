@@ -20,7 +20,7 @@ pub(super) struct PendingGeneration {
     /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// Says whether this generation is still wanted. The `Arc` is gone if the job or its result was dropped.
+    /// The ticket of this generation's job. It is gone if the job or its result was dropped.
     ticket: Weak<Ticket>,
 }
 
@@ -72,8 +72,8 @@ struct Written<S: Storage> {
     crc: u32,
     /// The file that has become the previous generation.
     previous: Option<FileId>,
-    /// Whether the previous generation is the present file under a second name. Then it also receives the records that
-    /// are appended before the new generation replaces it.
+    /// Whether the previous generation is the present file under a second name. If so, it also receives the records
+    /// that are appended before the new generation replaces the present file.
     linked: bool,
 }
 
@@ -322,7 +322,7 @@ impl<S: Storage> Store<S> {
             .status(&written.file)
             .map_err(failed("check", &fresh))?;
         if let Err(source) = self.take_path(&fresh, written.previous) {
-            // It is unknown which file is at the path now.
+            // It is unknown which file is at the path now, so recording stops.
             return Err(self.latch(failed("replace", &self.names.path)(source)));
         }
         self.active = Some(Active {

@@ -47,7 +47,7 @@ pub(super) struct LoadedStore {
     pub(super) loaded: Loaded,
     /// The highest record number known.
     pub(super) seq: u64,
-    /// The highest generation known.
+    /// The highest number of a generation known.
     pub(super) generation: u64,
     /// Whether the present file can become the previous generation.
     usable: bool,

@@ -1,9 +1,9 @@
 //! The lock of a checkpoint on this computer's disk.
 //!
 //! A lock file alone is not enough. It can be deleted, or renamed together with its folder, and then the next rosrescue
-//! would create a new one. So there are three locks. The lock file works for every process that sees the folder,
-//! including processes in other containers. A socket in the abstract namespace, named after the checkpoint, cannot be
-//! removed while rosrescue lives. The checkpoint itself is locked too; see [`claim`].
+//! would create a new one. So there are three locks. First, the lock file works for every process that sees the folder,
+//! including processes in other containers. Second, a socket in the abstract namespace, named after the checkpoint,
+//! cannot be removed while rosrescue lives. Third, the checkpoint itself is locked; see [`claim`].
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -93,7 +93,7 @@ fn is_claimed(checkpoint: &Path) -> bool {
 /// The rosrescue that uses a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LockHolder {
-    /// Its process id, if known.
+    /// The process id of this rosrescue, if known.
     pub pid: Option<u32>,
 }
 

@@ -30,9 +30,9 @@ struct Inode {
     writes: Vec<Vec<u8>>,
     /// Stands for the modification time: the number of writes so far.
     modified: i128,
-    /// Whether the disk fails to read it.
+    /// Whether the disk fails to read this file.
     unreadable: bool,
-    /// Whether a sync of it failed. Using the file again is an error, because its unwritten pages may be lost.
+    /// Whether a sync of this file failed. Using the file again is an error, because its unwritten pages may be lost.
     poisoned: bool,
 }
 

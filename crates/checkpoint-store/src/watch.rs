@@ -163,8 +163,8 @@ impl<S: Storage> Store<S> {
             // the lock cannot be taken, the next generation reports it.
             let _ = self.hold_lock();
         } else {
-            // Another process's file may be at the path now. Without `present`, it is kept under another name when it
-            // is replaced.
+            // Another process's file may be at the path now. Without `present`, that file is kept under another name
+            // when it is replaced.
             self.present = None;
         }
         let path = self.names.path.clone();

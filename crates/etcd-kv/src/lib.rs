@@ -29,8 +29,8 @@ pub use tls::Tls;
 pub use watch::{KeyChange, Watch, WatchEnd};
 pub use wire::{Kv, Txn, TxnOp, TxnResult};
 
-/// Time without an answer after which the next endpoint is asked as well. This is long, because a transaction takes
-/// only 1 to 20 ms.
+/// Time without an answer after which the next endpoint is asked as well. For comparison, a transaction takes 1 to 20
+/// ms.
 const NEXT_AFTER: Duration = Duration::from_millis(250);
 /// Pause after all endpoints have failed. It counts as part of the request's time limit.
 const ROUND_PAUSE: Duration = Duration::from_millis(100);
@@ -201,7 +201,7 @@ impl Client {
         Ok(())
     }
 
-    /// Makes etcd discard all revisions before `revision`, because etcd's database would keep growing.
+    /// Makes etcd discard all revisions before `revision`. Without this, etcd's database keeps growing.
     ///
     /// # Errors
     ///

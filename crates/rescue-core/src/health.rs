@@ -285,8 +285,8 @@ impl Reconciliation {
                     topic: topic.clone(),
                     topic_type: topic_type.clone(),
                 }));
-            // A malformed topic cannot be compared. It exists if the node's own name is malformed, because the master
-            // resolves topics with that name.
+            // A malformed topic cannot be compared. Such a topic exists if the node's own name is malformed, because
+            // the master resolves topics with that name.
             let extra = held.iter().filter(|topic| {
                 !said.is_empty() && master::is_plain_topic(topic) && !said.contains_key(**topic)
             });

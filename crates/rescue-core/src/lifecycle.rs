@@ -37,7 +37,7 @@ const CALM: Duration = Duration::from_secs(10);
 const STARTS_AT_MOST: u32 = 10;
 /// Pause between two samples of a master that starts slowly.
 const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
-/// Pause before the next attempt if the server is not a master.
+/// Pause before the next connection attempt if the server at the master's address is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,8 +88,8 @@ pub struct Lifecycle {
     serving_since: Option<Instant>,
     /// Whether an external master, which another program starts, has closed its connection and may have died.
     lost: bool,
-    /// Whether an external master was counted as dead, and since then its port has not refused and no master was
-    /// examined there.
+    /// Whether an external master was counted as dead, and since then its port has not refused a connection and no
+    /// master was examined there.
     dying: bool,
     missed: u32,
     patience: Patience,

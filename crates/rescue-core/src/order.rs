@@ -80,7 +80,7 @@ struct InFlight {
     answers: Vec<u64>,
 }
 
-/// A call, or a notification, has to wait.
+/// Says that a call or a notification has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MustWait {
     /// When to ask again at the latest. `None` if a change will be reported.
@@ -106,7 +106,7 @@ impl Order {
         )
     }
 
-    /// Notes that the answer is ready. From now on it delays others only for a limited time.
+    /// Notes that the answer is ready. From now on, it delays calls and notifications for at most [`ANSWER_LIMIT`].
     pub fn ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
@@ -161,7 +161,7 @@ impl Order {
         !in_flight.tells.is_empty() && std::mem::take(&mut self.awaited)
     }
 
-    /// Notes that the master notifies this many nodes of `subject`.
+    /// Notes that the master notifies `nodes` nodes of `subject`.
     pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
         let until = self.told.add(now, subject, nodes);
         self.outbox.renew_all(subject);

@@ -23,8 +23,8 @@ const LATEST: Duration = Duration::from_millis(600);
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Longest pause between two repeats. Pauses double up to this length.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after the last change its notification is repeated: the time of two connection attempts of rosmaster
-/// without an answer.
+/// How long after a subject's last change its notification is repeated. Two connection attempts of rosmaster that get
+/// no answer take about this time.
 const LIFE: Duration = Duration::from_secs(300);
 
 /// The changed subjects, each with the time of its next notification.
@@ -65,8 +65,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. If there are none, the
-    /// master notifies nodes in time, and nothing is due.
+    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. A subject is dropped if
+    /// there have been none since its change, because the master then notifies nodes in time.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {

@@ -20,7 +20,7 @@ pub struct Probing {
     pub count: u32,
     /// How long a write waits for the master before the mirror answers it.
     pub patience: Duration,
-    /// How long a new master may take to listen without making progress.
+    /// How long a new master that makes no progress may take until it listens.
     pub start_limit: Duration,
 }
 

@@ -16,7 +16,7 @@ const QUEUE_MAX: usize = 256;
 /// What to do next for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NextNotification {
-    /// Send `call`, then report it by [`taken`](super::Order::taken).
+    /// Send `call`, then pass `number` to [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
     /// Ask again when something has changed, or at `until` at the latest.
     Wait { until: Option<Instant> },
@@ -116,7 +116,8 @@ impl Outbox {
         if let Payload::Call(call) = content {
             return Some(call);
         }
-        // Waiting notifications about the same subject are older than the present state, so they are dropped.
+        // Waiting notifications about the same subject are older than the present state, so they are dropped. Those
+        // about keys above or below a parameter get the present state.
         let queue = self.ports.get_mut(port)?;
         renew(queue, |other| other.concerns(&subject));
         queue.retain(|other| other.subject != subject);

@@ -11,7 +11,7 @@ pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<St
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
-/// Like [`arrange`], including nested structs, also those in lists.
+/// Like [`arrange`], but also orders the structs inside `found`, including those in lists.
 pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;

@@ -23,12 +23,12 @@ const MISMATCHES_MAX: usize = 20;
 ///    would put too late in `getTopicTypes`. The plan sets no more types in this way than the order requires.
 /// 3. Services, each after the nodes that provided it before.
 /// 4. Subscribers, then subscribers of parameters.
-/// 5. Reads of everything, for [`Plan::verify`]. Addresses are read back only where the master had one
-///    before: a successful registration has the address of its call, and reading all addresses would take a
-///    tenth of the injection's time.
-/// 6. The token: a master that bears it has been brought to the whole state.
+/// 5. Reads of everything, for [`Plan::verify`]. Addresses are read back only where the master had one before. The
+///    other addresses are certain, because a successful registration has the address of its call. Reading all addresses
+///    would take a tenth of the injection's time.
+/// 6. The token: a master that has it has been brought to the whole state.
 ///
-/// An empty master sends no callback because of this call, and afterwards answers every read as before.
+/// An empty master sends no callback because of this call, and afterwards answers every read as the old master did.
 ///
 /// # A master that is not empty
 ///

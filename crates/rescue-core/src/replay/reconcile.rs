@@ -39,7 +39,7 @@ pub fn reconcile(
 }
 
 /// What a master of the present incarnation may hold although no read shows it: the parameter subscriptions in
-/// `mirror`, and those that a pending write removes. Returns `mirror` with both.
+/// `mirror`, and those that a pending write removes. Returns `mirror` with the removed ones added again.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {

@@ -7,7 +7,7 @@ use super::{Authority, Bears};
 pub enum KnownMaster {
     /// Nothing is known.
     Nothing,
-    /// If the master has the token of the latest incarnation, this rosrescue has already let calls pass to it.
+    /// If the master has the token of the latest incarnation, this rosrescue has already let calls pass to the master.
     ServedIfPresent,
     /// If the master has the token of the latest incarnation, rosrescue has injected the state, but got no
     /// confirmation.

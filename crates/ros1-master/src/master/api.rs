@@ -229,7 +229,7 @@ impl Master {
         (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
-    /// Answers any method except a multicall. The error is the text of a fault.
+    /// Answers any call except a multicall. The error is the text of a fault.
     pub(crate) fn dispatch(
         &mut self,
         request: &Request,

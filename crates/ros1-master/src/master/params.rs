@@ -83,8 +83,8 @@ impl Params {
         Some(found)
     }
 
-    /// rosmaster's `set_param`, for a key with a trailing slash. The tree changes even if the updates cannot be
-    /// computed. The node `ignored` gets no updates.
+    /// rosmaster's `set_param`, for a key with a trailing slash. Returns the `paramUpdate`s to send. The tree changes
+    /// even if they cannot be computed. The node `ignored` gets none for `key` itself.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,

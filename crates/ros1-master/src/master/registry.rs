@@ -18,13 +18,13 @@ pub(crate) enum SharedRegistration {
 /// A reference to a node. rosmaster drops it when the node has no registration left.
 #[derive(Clone, Default, PartialEq)]
 pub struct Node {
-    /// The address of its slave API.
+    /// The address of the node's slave API.
     pub api: String,
-    /// The topics that it publishes.
+    /// The topics that the node publishes.
     pub publications: IndexSet<String>,
-    /// The topics to which it subscribes.
+    /// The topics to which the node subscribes.
     pub subscriptions: IndexSet<String>,
-    /// The keys of the parameters to which it subscribes.
+    /// The keys of the parameters to which the node subscribes.
     pub param_subscriptions: IndexSet<String>,
     /// Services that this node has registered, including those that another node has taken over since.
     pub services: IndexSet<String>,

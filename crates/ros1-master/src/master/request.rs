@@ -42,7 +42,7 @@ pub enum Entry {
     /// An entry that is answered with a fault. This is the fault's text.
     Refused(&'static str),
     /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is always the
-    /// last one. The text is rosmaster's only if it starts with `<`.
+    /// last entry of its multicall. The text is rosmaster's only if it starts with `<`.
     Malformed(Cow<'static, str>),
 }
 
@@ -116,7 +116,8 @@ impl Request {
         self.params.get(index)?.as_str()
     }
 
-    /// This call; for a multicall all calls in it, in order, including those of nested multicalls.
+    /// Only this call if it is no multicall. For a multicall, all calls in it, in order, including those of nested
+    /// multicalls.
     pub fn calls(&self) -> Vec<&Self> {
         fn collect<'a>(request: &'a Request, found: &mut Vec<&'a Request>) {
             if request.method != Method::Multicall {
@@ -140,7 +141,7 @@ impl Request {
         let kinds = self.entries.iter().enumerate();
         let kinds = kinds.map(|(index, entry)| match entry {
             Entry::Request(request) => request.kind(),
-            // The previous entries have run, and the reply does not show their results.
+            // The entries before a malformed one have run, and the reply does not show their results.
             Entry::Malformed(_) if index > 0 => Kind::Mutate,
             Entry::Refused(_) | Entry::Malformed(_) => Kind::Unknown,
         });
@@ -226,7 +227,7 @@ impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
         let mut members = match element {
             Value::Struct(members) => members,
-            // rosmaster's error depends on the Python version.
+            // For a string, rosmaster's error depends on the Python version.
             Value::String(_) => {
                 return Self::Malformed("an entry of a multicall is a string".into());
             }

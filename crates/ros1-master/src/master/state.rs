@@ -24,8 +24,8 @@ pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
-    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends such
-    /// values.
+    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends a
+    /// value that causes this.
     pub(crate) inexact: bool,
     /// Whether the modelled master has unordered dictionaries, as on Python 2.
     pub(crate) unordered: bool,
@@ -113,7 +113,7 @@ pub enum InvalidSnapshot {
 }
 
 impl Master {
-    /// Publishers, subscribers, services and the references of nodes.
+    /// Publishers, subscribers, services and the references to nodes.
     pub fn registry(&self) -> &Registry {
         &self.registry
     }
@@ -335,7 +335,7 @@ impl Master {
         }
     }
 
-    /// Services that the node `caller_id` has registered and that another node provides now.
+    /// Services that the node `caller_id` has registered and no longer provides.
     pub fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,

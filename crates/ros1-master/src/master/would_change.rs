@@ -14,7 +14,7 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state already is as `call` would make it. `None` if unknown.
+    /// Whether the state is already the one that `call` would lead to. `None` if unknown.
     fn is_settled(&self, call: &Request) -> Option<bool> {
         let text = |index| call.text(index);
         let caller_id = call.caller()?;
