@@ -36,12 +36,12 @@ pub enum EtcdError {
     Full,
     #[error("etcd refuses a request of this size; its --max-request-bytes is below 1.5 MiB")]
     TooLarge,
-    #[error("etcd has compacted revision {revision:?}: the state must be read again")]
+    #[error("etcd has discarded a revision that is still needed: the state must be read again")]
     Compacted { revision: Option<u64> },
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },
     #[error(
-        "etcd at {endpoint} has users, and then its gateway refuses every certificate with a CommonName: \
+        "etcd at {endpoint} has users. Its gateway then refuses every client certificate with a CommonName: \
          give this computer one without (openssl: -subj /O=NAME)"
     )]
     CommonName { endpoint: String },

@@ -48,7 +48,10 @@ impl ParamChanges {
                 (value, Some(there)) if value == there => {}
                 // Setting an empty namespace would delete everything in it.
                 (Value::Struct(none), Some(Value::Struct(_))) if none.is_empty() && !exact => {}
-                _ if !is_plain(key) => self.leave(name, "no call can name it alone"),
+                _ if !is_plain(key) => self.leave(
+                    name,
+                    "its name is empty or has a slash, so no call can set it alone",
+                ),
                 (Value::Struct(members), there) if is_namespace(members) => {
                     let none = Struct::new();
                     let there = there.and_then(Value::as_struct).unwrap_or(&none);

@@ -1,7 +1,7 @@
 //! Decides whether a checkpoint's session continues, or whether the robot was switched on again.
 //!
-//! A *session* begins when rosrescue starts without a state, and survives crashes. A robot that is switched on in the
-//! morning needs a new session, because it must not start with yesterday's parameters.
+//! A *session* begins when rosrescue starts and restores no state. It survives crashes. A robot that is switched on in
+//! the morning needs a new session, because it must not start with yesterday's parameters.
 
 use std::collections::BTreeMap;
 
