@@ -1,11 +1,12 @@
 //! Stores a checkpoint on disk.
 //!
-//! A checkpoint file holds a snapshot and behind it the journal, to which records are appended. A [`Store`] owns one
-//! file and its companions. It takes the lock, loads the file ([`Loaded`]), and appends records. When the journal is
-//! too large or the disk has failed, it replaces the file by a new *generation*: a file with a new snapshot. The old
-//! file stays beside it as the *previous generation*. All this is synchronous, and the caller decides when to do it.
-//! Slow work is returned as a job ([`SyncJob`], [`CompactionJob`]) for a blocking thread. While a job runs, the store
-//! can append records. `docs/checkpoint.md` describes the commit procedure and the assumptions about the disk.
+//! A checkpoint file holds a snapshot and after it the journal, to which records are appended. A [`Store`] owns one
+//! such file and the files beside it, such as the lock file. It takes the lock, loads the file ([`Loaded`]), and
+//! appends records. When the journal is too large or the disk has failed, it replaces the file by a new *generation*: a
+//! file with a new snapshot. The old file stays beside it as the *previous generation*. All this is synchronous, and
+//! the caller decides when to do it. Slow work is returned as a job ([`SyncJob`], [`CompactionJob`]) for a blocking
+//! thread. While a job runs, the store can append records. `docs/checkpoint.md` describes the commit procedure and the
+//! assumptions about the disk.
 //!
 //! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only once that
 //! data was lost. The store is then [unprotected](Store::unprotected), which means that it records nothing, until

@@ -8,7 +8,7 @@ use super::{Storage, StoreError};
 /// Number of files of one kind to keep. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
 
-/// The paths of a checkpoint and of its companions, all in one folder.
+/// The paths of a checkpoint and of the files beside it, such as the lock file. All are in one folder.
 #[derive(Clone, Debug)]
 pub(super) struct Names {
     pub(super) path: PathBuf,

@@ -177,7 +177,7 @@ impl Lifecycle {
             }
     }
 
-    /// Takes a sample of the child.
+    /// Adds a sample of the child to the evidence of a hang.
     pub fn observe(&mut self, sample: Sample) {
         self.evidence.add(sample);
     }

@@ -29,7 +29,7 @@ pub struct Probing {
 pub enum Input {
     /// rosrescue starts.
     Start {
-        /// Whether a master of an earlier rosrescue still runs. Its end is reported as [`Self::Exited`], as if this
+        /// Whether a master of an earlier rosrescue still runs. Its end is reported as [`Input::Exited`], as if this
         /// rosrescue had started it.
         left: bool,
         /// Whether the mirror comes from a checkpoint whose session continues.
@@ -121,8 +121,8 @@ impl Cause {
 }
 
 /// An action that the caller of [`Lifecycle::on`](super::Lifecycle::on) must carry out. Actions are carried out in
-/// order. A new `Connect`, `Examine` or `CatchUp` cancels the one of these that is still running. A `Probe` cancels
-/// nothing.
+/// order. A new `Connect`, `Examine` or `CatchUp` cancels the one of these that is still running, or a running `Probe`.
+/// A `Probe` cancels nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or `Unreachable`.

@@ -107,7 +107,7 @@ fn place<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
     })
 }
 
-/// A fault, as an entry of a multicall's result.
+/// Converts a fault to an entry of a multicall's result.
 fn fault_entry(text: String) -> Value {
     Value::Struct(Struct::from([
         ("faultCode".to_owned(), 1.into()),
@@ -115,7 +115,7 @@ fn fault_entry(text: String) -> Value {
     ]))
 }
 
-/// A reply, as an entry of a multicall's result.
+/// Converts a reply to an entry of a multicall's result.
 pub fn reply_entry(reply: Reply) -> Value {
     match reply {
         Reply::Value(value) => Value::Array(vec![value]),

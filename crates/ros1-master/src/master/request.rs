@@ -9,7 +9,7 @@ use crate::xmlrpc::{self, Call, DecodeError, Value};
 /// three of its levels.
 const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 
-/// One more parameter than any method takes.
+/// A number of parameters that is too many for every method: one more than any method takes.
 const TOO_MANY: usize = 5;
 
 /// A call to a master, parsed once.

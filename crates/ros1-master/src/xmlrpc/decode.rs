@@ -19,7 +19,7 @@ use super::value::{Call, Reply, Struct, Value};
 pub const MAX_DEPTH: usize = 512;
 
 /// Maximum number of open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`, `data`).
-/// The others are for the envelope and for clients that nest a little more.
+/// The remaining elements are for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Decodes a request.
