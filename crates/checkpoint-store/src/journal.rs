@@ -168,8 +168,8 @@ impl<S: Storage> Store<S> {
                 Ok(())
             }
             (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
-            // The sync was of a file that has been replaced since. The new file has the same records and is not synced
-            // yet.
+            // This sync belongs to a file that has been replaced since. The new file has the same records and is not
+            // synced yet.
             (Err(_), None) => Ok(()),
         }
     }

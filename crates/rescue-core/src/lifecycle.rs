@@ -1,6 +1,6 @@
-//! Decides when to connect to, examine, probe, spawn and kill a master, and when calls may pass to it, which means that
-//! the *gate* is open. Only during an injection, which restores the state in a master, `recovery::examine` shuts the
-//! gate to writes by itself.
+//! Decides when to connect to, examine, probe, spawn and kill a master, and when the *gate* is open, which means that
+//! calls pass to the master. Only during an injection, which restores the state in a master, `recovery::examine` shuts
+//! the gate to writes by itself.
 //!
 //! This is a state machine without IO: the caller, `recovery`, passes in what happened and when, and carries out the
 //! returned actions. The machine owns every deadline, so that each can be tested without waiting.
@@ -243,7 +243,8 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
-            // The master died during the examination, or closes every connection. Either way, wait before connecting.
+            // The master died during the examination, or closes every connection. In both cases, wait before the next
+            // connection.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
                 let again = std::mem::replace(&mut self.dying, true);

@@ -39,8 +39,8 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long a notification of rosrescue waits after an answer about the same subject was written. rosmaster takes at
-/// least 0.3 ms, because its notifications go through another thread and a new connection.
+/// How long a notification of rosrescue waits after an answer about the same subject was written. A notification of
+/// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
 /// A notification that follows an answer within this time may be read before it. With thirty runnable processes on two
 /// cores, a node took 42 ms to switch threads.

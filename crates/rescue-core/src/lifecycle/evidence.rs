@@ -56,7 +56,7 @@ pub struct Sample {
 pub enum SilenceVerdict {
     /// The master hangs, or the system does not show what it does.
     Hung,
-    /// There is no proof that the master hangs, for this reason.
+    /// There is no proof that the master hangs. The text says why.
     Unproved(&'static str),
     /// The master has not been watched for long enough.
     Unknown,
@@ -185,7 +185,7 @@ mod tests {
     fn idle(at: u64) -> (Effort, Duration) {
         let effort = Effort {
             ran: Duration::from_secs(1) + ms(at) / 200,
-            // It wakes a hundred times a second.
+            // An idle rosmaster wakes a hundred times a second.
             turns: at / 10,
             waited: Duration::from_secs(1) + ms(at) / 20,
             ..Effort::default()
@@ -224,7 +224,7 @@ mod tests {
             effort.ran = ms(7);
         };
         assert_eq!(verdict(|_, effort, _| stop(effort)), SilenceVerdict::Hung);
-        // This holds however much processor time rosrescue gets.
+        // A stopped master hangs, however little processor time rosrescue gets.
         let starved = |at: u64, effort: &mut Effort, own: &mut Duration| {
             stop(effort);
             *own = ms(at);

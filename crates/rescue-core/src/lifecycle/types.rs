@@ -59,7 +59,7 @@ pub enum Input {
     Late,
     /// The master has answered the calls that were outstanding when it was [late](Self::Late).
     LateAnswered,
-    /// The late master has got the writes that the mirror answered meanwhile.
+    /// The late master has got the writes that the mirror answered in its place.
     CaughtUp,
     /// The late master could not get the writes that it missed.
     NotCaughtUp,
@@ -134,7 +134,7 @@ pub enum Action {
     ShutGate(Cause),
     /// Let the mirror answer until the master has answered its outstanding calls. Result: `LateAnswered`.
     StandIn,
-    /// Send the late master the writes that the mirror has answered meanwhile. Results: `CaughtUp` or `NotCaughtUp`.
+    /// Send the late master the writes that the mirror has answered in its place. Results: `CaughtUp` or `NotCaughtUp`.
     CatchUp,
     /// Open the gate: let calls pass.
     OpenGate,

@@ -131,7 +131,7 @@ impl Outbox {
         }
     }
 
-    /// Like [`Self::renew`], for all ports.
+    /// Replaces, for each port, the notifications about `subject` by one with the state at the time of sending.
     pub(super) fn renew_all(&mut self, subject: &Subject) {
         for queue in self.ports.values_mut() {
             renew(queue, |other| other.concerns(subject));

@@ -37,7 +37,7 @@ pub struct Heard {
     pub subject: Subject,
 }
 
-/// The subjects of a write, and what it may tell nodes about them.
+/// The subjects of a write: those about which nodes may be notified, and those about which its answer tells the caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
     /// The subjects about which the master may notify nodes because of the write.

@@ -264,7 +264,8 @@ impl Plan {
         self.verify_by(reply, true)
     }
 
-    /// Like [`Self::verify`], for a master with unordered dictionaries.
+    /// Like [`Self::verify`], but also accepts answers that differ only in the order of names and struct members. A
+    /// master with unordered dictionaries gives such answers.
     ///
     /// # Errors
     ///

@@ -306,8 +306,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Like [`Self::lose`], for a service that has no provider now. After the losers, a helper (a caller id that no
-    /// node has) takes the service and unregisters it.
+    /// Registers `service`, which has no provider now, for `losers`, the nodes that have lost it. Then a helper, a
+    /// caller id that no node has, takes the service over and unregisters it.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {

@@ -186,7 +186,7 @@ impl Registry {
         (unregistered(caller_id, key), true)
     }
 
-    /// Like [`Registry::unregister`], for a service.
+    /// Unregisters a service of a node. Returns the message, and whether there was anything to unregister.
     pub(crate) fn unregister_service(
         &mut self,
         service: &str,

@@ -8,7 +8,8 @@ pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
     error_within(reply, 0)
 }
 
-/// Like [`reply_error`], for the value of a parameter, which is returned as `[code, message, value]`.
+/// The text of the fault that rosmaster answers when it cannot encode this value of a parameter in a reply `[code,
+/// message, value]`. `None` if it can.
 pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
     error_within(value, 1)
 }

@@ -234,7 +234,8 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// Whether a node publishes a topic, or if `publishes` is false, whether it subscribes to it.
+    /// Whether the node publishes `topic`, if `publishes` is true. If it is false, whether the node subscribes to
+    /// `topic`.
     pub fn has_topic(&self, caller_id: &str, publishes: bool, topic: &str) -> bool {
         let node = self.registry.nodes.get(caller_id);
         node.is_some_and(|node| match publishes {
