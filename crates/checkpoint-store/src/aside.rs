@@ -9,9 +9,9 @@ use super::storage::FileId;
 use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
-    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes its
-    /// previous generation, or renames that too if the file may lack records. Afterwards nothing can be recorded before
-    /// the next [`begin`](Self::begin). Returns the new path, if there was a file.
+    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes the
+    /// previous generation, or renames it too if the present file may lack records. Afterwards nothing can be recorded
+    /// before the next [`begin`](Self::begin). Returns the new path, if there was a file.
     ///
     /// # Errors
     ///
@@ -49,8 +49,8 @@ impl<S: Storage> Store<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Moves the file at `fresh` to the checkpoint's path. Keeps a file that is there under another name, unless it is
-    /// already kept as the `previous` generation, or is an unusable file of this store.
+    /// Moves the file at `fresh` to the checkpoint's path. If a file is already at that path, renames it first. Does
+    /// not rename it if it is the `previous` generation, which is kept already, or an unusable file of this store.
     pub(super) fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
         let (storage, path) = (&self.storage, &self.names.path);
         let there = storage.id_at(path)?;
@@ -67,7 +67,8 @@ impl<S: Storage> Store<S> {
     }
 }
 
-/// Keeps a copy of a damaged file and of an incomplete append, and adds their names to the report.
+/// Keeps a copy of a damaged file and of an incomplete append, and adds the names of the copies to the texts in
+/// `loaded`.
 pub(super) fn keep_aside(
     storage: &impl Storage,
     names: &Names,

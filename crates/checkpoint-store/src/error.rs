@@ -44,7 +44,7 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// The operating system's error without advice.
+    /// The text of this error. Leaves out the advice if the operating system reported the error.
     pub fn without_advice(&self) -> String {
         match self {
             Self::Io {
@@ -57,7 +57,7 @@ impl OpenError {
     }
 }
 
-/// Why a call was not recorded. Calls are forwarded nevertheless.
+/// Why the store could not do what it was asked to do, such as record a call. rosrescue forwards the call nevertheless.
 #[derive(Debug, Error)]
 pub enum StoreError {
     /// An earlier operation failed, or [`begin`](super::Store::begin) was not called yet.
@@ -89,7 +89,7 @@ pub enum StoreError {
     },
     /// The snapshot is older than the journal.
     #[error(
-        "a snapshot as of record {snapshot} cannot replace a journal that has reached {journal}; take a new one"
+        "a snapshot as of record {snapshot} cannot replace a journal that has reached record {journal}; take a new snapshot"
     )]
     Stale {
         /// The number of the last record in the snapshot.
@@ -100,8 +100,8 @@ pub enum StoreError {
     /// A new generation is already being written.
     #[error("another generation of the checkpoint is being written; finish that one first")]
     Busy,
-    /// The new generation is obsolete. A later one was begun, the file was set aside, or too much was recorded
-    /// meanwhile.
+    /// The new generation is obsolete, because a later one was begun, the file was set aside, or too much was recorded
+    /// while it was written.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken { path: PathBuf },
     /// The state or the record cannot be encoded.

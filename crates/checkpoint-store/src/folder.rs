@@ -27,7 +27,7 @@ impl Access {
         })
     }
 
-    /// Which other users than `own` may create files in the folder. `None` if none may.
+    /// Why users other than `own` may create files in the folder. `None` if they may not.
     fn other_writers(self, own: u32) -> Option<&'static str> {
         // Many distributions give each user a group with the same number and no other members.
         let is_private = self.group == self.user || self.group == 0;
@@ -59,7 +59,8 @@ pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
     folders
         .flatten()
         .enumerate()
-        // In a sticky folder other users may create a file beside the checkpoint, but not replace a folder below it.
+        // A sticky folder matters only if it holds the checkpoint: other users may create files in it, but cannot
+        // replace a folder in it.
         .filter(|(level, (_, access))| *level == 0 || access.mode & STICKY == 0)
         .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.other_writers(own)?)))
 }

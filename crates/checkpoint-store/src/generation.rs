@@ -20,7 +20,7 @@ pub(super) struct PendingGeneration {
     /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// Whether this generation is still wanted. The `Arc` is gone if the job or its result was dropped.
+    /// The ticket of this generation's job. It is gone if the job or its result was dropped.
     ticket: Weak<Ticket>,
 }
 
@@ -50,8 +50,8 @@ struct Plan<S: Storage> {
     generation: u64,
     /// The present file, if it is to become the previous generation.
     keep_present: Option<FileId>,
-    /// A sync that runs first if the present file is kept. Some of its records may be durable only in the older
-    /// generation, which is about to be replaced.
+    /// A sync of the present file, which runs first. It is needed if some of that file's records may be durable only in
+    /// the previous generation, because that is about to be replaced.
     settle: Option<SyncJob<S>>,
     ticket: Arc<Ticket>,
 }
@@ -72,13 +72,13 @@ struct Written<S: Storage> {
     crc: u32,
     /// The file that has become the previous generation.
     previous: Option<FileId>,
-    /// Whether the previous generation is the present file under a second name. Then it also receives the records that
-    /// are appended before the new generation replaces it.
+    /// Whether the previous generation is the present file under a second name. If so, it also receives the records
+    /// that are appended before the new generation replaces the present file.
     linked: bool,
 }
 
 impl<S: Storage> CompactionJob<S> {
-    /// Encodes, writes and syncs. Blocks as long as the disk does.
+    /// Encodes, writes and syncs the new generation. Blocks as long as the disk does.
     pub fn run(self) -> Compacted<S> {
         self.plan.run(&self.checkpoint)
     }
@@ -126,8 +126,8 @@ impl<S: Storage> Plan<S> {
                 .map_err(failed("keep", &path))?;
             previous = self.keep_present;
         }
-        // Both names are durable before the new generation takes the path. So all records are in one of the two files,
-        // whatever a loss of power undoes.
+        // The names of the previous and of the new generation are durable before the new one takes the path. So after a
+        // loss of power, all records are in one of these two files.
         storage
             .sync_dir(names.folder())
             .map_err(failed("sync the folder of", &path))?;
@@ -158,8 +158,8 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the previous generation, which would be replaced anyway. Never removes the present file, which is the
-    /// only copy until the new one is complete.
+    /// Removes the previous generation, which would be replaced anyway. Never removes the present file, because it is
+    /// the only copy until the new generation is complete.
     fn make_room(&self) -> bool {
         let wanted = self.ticket.lock();
         *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
@@ -172,8 +172,9 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If it cannot be written. An unprotected store then stays unprotected; any other continues to use the
-    /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
+    /// If the generation cannot be written. If the store was [unprotected](Self::unprotected), it stays so; if not, it
+    /// continues to use the present file. It is also an error if [`Checkpoint::seq`] is behind [`seq`](Self::seq); then
+    /// nothing is written.
     pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         if checkpoint.seq >= self.seq {
             self.overtake();
@@ -196,7 +197,8 @@ impl<S: Storage> Store<S> {
 
     /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] equals
     /// [`seq`](Self::seq). Run the job in any thread, continue to append, then pass the result to
-    /// [`finish_compaction`](Self::finish_compaction). This also ends the unprotected state while calls continue.
+    /// [`finish_compaction`](Self::finish_compaction). This also ends the [unprotected](Self::unprotected) state while
+    /// calls continue.
     ///
     /// # Errors
     ///
@@ -249,7 +251,7 @@ impl<S: Storage> Store<S> {
         ticket.is_some_and(|ticket| ticket.strong_count() > 0)
     }
 
-    /// Makes the generation being written obsolete: from now on its job touches only its own file.
+    /// Makes the generation that is being written obsolete: from now on its job touches only its own temporary file.
     pub(super) fn overtake(&mut self) {
         if let Some(ticket) = self
             .pending
@@ -260,13 +262,15 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Appends the records made meanwhile to the new generation, and moves it to the path. This is quick: it waits for
-    /// the disk only if the file system has no hard links.
+    /// Appends the records that came since [`begin_compaction`](Self::begin_compaction) to the new generation, and
+    /// moves its file to the checkpoint's path. This is quick, because it waits for the disk only if the file system
+    /// has no hard links.
     ///
     /// # Errors
     ///
-    /// If there is no new generation. The present file stays in use, and the next compaction is due when it has doubled
-    /// in size.
+    /// If the new generation cannot be written or is obsolete. The present file then stays in use, and the next
+    /// compaction is due when its journal has doubled in size. If the new file could not be moved to the path, the
+    /// store is [unprotected](Self::unprotected).
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
@@ -275,7 +279,7 @@ impl<S: Storage> Store<S> {
         let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
         let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
-            // The file may not exist. If removing it fails, the next start does it.
+            // The new file may not exist. If it cannot be removed, the next start removes it.
             let _ = self.storage.remove(&fresh);
             let journal = self
                 .active
@@ -318,7 +322,7 @@ impl<S: Storage> Store<S> {
             .status(&written.file)
             .map_err(failed("check", &fresh))?;
         if let Err(source) = self.take_path(&fresh, written.previous) {
-            // It is unknown which file is at the path now.
+            // It is unknown which file is at the path now, so recording stops.
             return Err(self.latch(failed("replace", &self.names.path)(source)));
         }
         self.active = Some(Active {
@@ -343,7 +347,8 @@ impl<S: Storage> Store<S> {
         Ok(())
     }
 
-    /// Ends the unprotected state, in the same way as [`begin`](Self::begin).
+    /// Ends the [unprotected](Self::unprotected) state: writes `checkpoint` as a new generation, like
+    /// [`begin`](Self::begin).
     ///
     /// # Errors
     ///

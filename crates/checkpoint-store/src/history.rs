@@ -16,7 +16,7 @@ const SESSIONS_MAX: usize = 5;
 /// Maximum number of rescues that are kept.
 const RESCUES_MAX: usize = 20;
 
-/// The names of nodes and parameters of `rosrescue drill` start with this. The process id follows.
+/// The start of the names of all nodes and parameters of `rosrescue drill`. The process id of the drill follows.
 pub const DRILLS: &str = "/rosrescue_drill_";
 
 /// Why a checkpoint is kept.
@@ -24,12 +24,12 @@ pub const DRILLS: &str = "/rosrescue_drill_";
 pub enum KeepReason {
     /// The session's last checkpoint, kept when the next session began.
     Session,
-    /// The state that a new master got in a rescue.
+    /// Kept at a rescue: the state that the new master got.
     Rescue,
 }
 
 impl KeepReason {
-    /// The name of the kind, as in file names.
+    /// The name of the reason, as in file names.
     pub fn name(self) -> &'static str {
         match self {
             Self::Session => "session",
@@ -50,7 +50,8 @@ pub struct Kept {
     pub written: i64,
 }
 
-/// Lists the checkpoints kept beside the one at `path`: sessions first, newest first. Links in `path` must be resolved.
+/// Lists the checkpoints kept beside the one at `path`: those of earlier sessions, then those of rescues, each from new
+/// to old. Links in `path` must be resolved.
 ///
 /// # Errors
 ///
@@ -92,7 +93,7 @@ pub fn last_rescue(path: &Path) -> u64 {
 ///
 /// # Errors
 ///
-/// If it cannot be written. Then no file remains.
+/// If the file cannot be written. Then no part of it remains.
 pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
     checkpoint.snapshot.remove_named(DRILLS);
     checkpoint.pending.retain(|call| {
@@ -114,8 +115,8 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
     written.map(|()| kept)
 }
 
-/// Removes surplus files: first all but the last sessions and rescues, then the oldest until the rest takes
-/// `bytes_most` or less. The last session always stays.
+/// Removes surplus kept checkpoints: all but the last 5 sessions and 20 rescues, and of these the oldest until the
+/// others take `bytes_most` or less. The last session always stays.
 ///
 /// # Errors
 ///

@@ -23,7 +23,7 @@ pub(super) struct Active<S: Storage> {
     pub(super) crc: u32,
     /// Modification time of the file after this store's last write.
     pub(super) modified: i128,
-    /// Whether another process may have written to the file. Then its content must be read.
+    /// Whether another process may have written to the file. If so, the next check must read the content.
     pub(super) suspect: bool,
     /// Whether everything that was appended has been synced.
     pub(super) clean: bool,
@@ -38,7 +38,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the entries were not recorded. The store is then unprotected, unless the reason is an
+    /// If the entries were not recorded. The store is then [unprotected](Self::unprotected), unless the reason is an
     /// [`EncodeError`](rescue_core::checkpoint::format::EncodeError).
     pub fn append(&mut self, entries: &[RecordContent]) -> Result<u64, StoreError> {
         let first = self.seq.saturating_add(1);
@@ -81,13 +81,13 @@ impl<S: Storage> Store<S> {
         active.clean &= self.buffer.is_empty();
         let length = active.length() + self.buffer.len() as u64;
         let appended = match length > self.file_bytes_max {
-            // A start could not read a larger file.
+            // The next start could not read a larger file.
             true => Err(io::ErrorKind::FileTooLarge.into()),
             false => self.storage.append(&active.file, &self.buffer),
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
-            // The rest is not retried: that write would fail too, with a clearer error.
+            // The missing bytes are not written again: that write would fail too, only with a clearer error.
             Ok(taken) => Err(io::Error::new(
                 io::ErrorKind::StorageFull,
                 format!("only {taken} of {} bytes were written", self.buffer.len()),
@@ -111,8 +111,8 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Stops recording to the present file for good. The disk did not answer, so the file lacks records. `reason` is
-    /// shown to the user.
+    /// Stops recording to the present file for good, because the disk did not answer and the file lacks records.
+    /// `reason` is shown to the user.
     pub fn give_up(&mut self, reason: &str) {
         self.latch(failed("write", &self.names.path)(io::Error::new(
             io::ErrorKind::TimedOut,
@@ -126,13 +126,14 @@ impl<S: Storage> Store<S> {
         if self.active.take().is_some_and(|active| !active.named)
             && let Some(present) = &mut self.present
         {
-            // It is unknown how much of the file is durable. The previous generation is durable.
+            // It is unknown how much of the file is durable. The previous generation is durable, so this file must not
+            // replace it.
             present.usable = false;
         }
         error
     }
 
-    /// The sync that is due. `None` if none is.
+    /// A job for the sync that is due. `None` if no sync is due.
     pub fn sync_job(&self) -> Option<SyncJob<S>> {
         let active = self
             .active
@@ -151,7 +152,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the sync failed. The store is now unprotected.
+    /// If the sync of the present file failed. The store is now [unprotected](Self::unprotected).
     pub fn synced(&mut self, done: Synced) -> Result<(), StoreError> {
         let active = self
             .active
@@ -167,8 +168,8 @@ impl<S: Storage> Store<S> {
                 Ok(())
             }
             (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
-            // The sync was of a file that has been replaced since. The new file has the same records and is not synced
-            // yet.
+            // This sync belongs to a file that has been replaced since. The new file has the same records and is not
+            // synced yet.
             (Err(_), None) => Ok(()),
         }
     }
@@ -195,7 +196,7 @@ pub struct Synced {
 }
 
 impl<S: Storage> SyncJob<S> {
-    /// Syncs. Blocks as long as the disk does.
+    /// Runs the sync. Blocks as long as the disk does.
     pub fn run(self) -> Synced {
         let mut result = self.storage.sync(&self.file);
         if let (Ok(()), Some(names)) = (&result, &self.names) {

@@ -1,15 +1,17 @@
 //! Stores a checkpoint on disk.
 //!
-//! A [`Store`] owns one file and its companions. It takes the lock, loads the file ([`Loaded`]), appends records, and
-//! replaces the file by a new generation when the journal is too large or the disk has failed. It is synchronous, and
-//! its caller decides when to do all that. Slow work is returned as a job ([`SyncJob`], [`CompactionJob`]) for a
-//! blocking thread. Meanwhile the store can append records. `docs/checkpoint.md` describes the commit procedure and the
+//! A checkpoint file holds a snapshot and after it the journal, to which records are appended. A [`Store`] owns one
+//! such file and the files beside it, such as the lock file. It takes the lock, loads the file ([`Loaded`]), and
+//! appends records. When the journal is too large or the disk has failed, it replaces the file by a new *generation*: a
+//! file with a new snapshot. The old file stays beside it as the *previous generation*. All this is synchronous, and
+//! the caller decides when to do it. Slow work is returned as a job ([`SyncJob`], [`CompactionJob`]) for a blocking
+//! thread. While a job runs, the store can append records. `docs/checkpoint.md` describes the commit procedure and the
 //! assumptions about the disk.
 //!
 //! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only once that
-//! data was lost. The store is then [unprotected](Store::unprotected) until [`Store::rearm`] has written a new file. If
-//! another process changes the file, its folder or its lock, writes still succeed. A [`CheckJob`] notices such a
-//! change, which latches as well.
+//! data was lost. The store is then [unprotected](Store::unprotected), which means that it records nothing, until
+//! [`Store::rearm`] has written a new file. If another process changes the file, its folder or its lock, writes still
+//! succeed. A [`CheckJob`] notices the change, which latches as well.
 
 mod aside;
 mod error;
@@ -68,7 +70,7 @@ pub struct Store<S: Storage = Disk> {
     /// Number of the last entry, recorded or not. No number is used twice.
     seq: u64,
     synced_seq: u64,
-    /// The highest generation that was begun.
+    /// The number of the last generation that was begun.
     generation: u64,
     /// The known file at the path. Any other file there is kept under another name before it is replaced.
     present: Option<Present>,
@@ -131,14 +133,14 @@ fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) 
 }
 
 impl<S: Storage> Store<S> {
-    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. Copies a damaged file and
-    /// an incomplete append to other names. Keeps an unreadable file under another name when it is replaced. Nothing
-    /// can be recorded before [`begin`](Self::begin).
+    /// Takes the lock of the checkpoint at `path` and loads the checkpoint. Creates its folder if needed. Copies a
+    /// damaged file and an incomplete append to other names. Keeps an unreadable file under another name when it is
+    /// replaced. Nothing can be recorded before [`begin`](Self::begin).
     ///
     /// # Errors
     ///
     /// If the folder or the file cannot be used, if another rosrescue uses it, if the file is not a checkpoint, or if a
-    /// newer version wrote it. Then the file is unchanged.
+    /// newer version wrote it. In all these cases the file is unchanged.
     pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
@@ -169,7 +171,7 @@ impl<S: Storage> Store<S> {
             loaded.damage.push(format!(
                 "the damaged part of `{path}` could not be kept: {error}"
             ));
-            // Then it is kept when it is replaced.
+            // Without `present`, the damaged file is kept under another name when it is replaced.
             store.present = store.present.filter(|present| present.usable);
         }
         store.set_counts(found.seq, found.generation);
@@ -181,7 +183,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// The errors of [`open_on`](Self::open_on). Other files and folders are not renamed.
+    /// The errors of [`open_on`](Self::open_on). In all these cases no file is renamed.
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
@@ -251,7 +253,7 @@ impl<S: Storage> Store<S> {
         self.synced_seq
     }
 
-    /// How often the file has been rewritten.
+    /// The number of the last generation that was begun: how often the file has been rewritten.
     pub fn generation(&self) -> u64 {
         self.generation
     }

@@ -12,16 +12,16 @@ use rescue_core::checkpoint::format::{
 /// Maximum size of a file that is read. No checkpoint is larger.
 pub(super) const FILE_BYTES_MAX: u64 = 1 << 30;
 
-/// Everything found on disk.
+/// The content of a checkpoint, as it was found on disk.
 #[derive(Debug, Default)]
 pub struct Loaded {
     /// The newest complete snapshot. Without one, only `records` is left of the state.
     pub checkpoint: Option<Checkpoint>,
     /// The undamaged records after the snapshot, in order.
     pub records: Vec<Record>,
-    /// Whether this is exactly the recorded state. Otherwise a part is missing.
+    /// Whether snapshot and records together are exactly the recorded state. If not, a part is missing.
     pub exact: bool,
-    /// Describes an append that a crash cut short. It was never acknowledged.
+    /// Describes an append that a crash cut short. No caller was told that this append had succeeded.
     pub torn: Option<String>,
     /// Describes any other damage, one sentence each, to be logged as errors.
     pub damage: Vec<String>,
@@ -47,7 +47,7 @@ pub(super) struct LoadedStore {
     pub(super) loaded: Loaded,
     /// The highest record number known.
     pub(super) seq: u64,
-    /// The highest generation known.
+    /// The highest number of a generation known.
     pub(super) generation: u64,
     /// Whether the present file can become the previous generation.
     usable: bool,
@@ -65,7 +65,8 @@ pub(super) fn load(
     names: &Names,
 ) -> Result<Option<LoadedStore>, OpenError> {
     let path = &names.path;
-    // Taken before reading. A file that replaces this one later has another id, and is kept under another name.
+    // The id is taken before reading. So a file that replaces this one later has another id, and is kept under another
+    // name.
     let id = storage.id_at(path).ok().flatten();
     let bytes = match read(storage, path) {
         Ok(None) => return Ok(None),
@@ -100,7 +101,7 @@ pub(super) fn load(
             );
             let nothing = Framed::unreadable(&[]);
             let mut found = join(names, &nothing, Err(why), Some(&previous), &[]);
-            // The next generation must not reuse the unreadable one's number.
+            // The next generation must not reuse the number of the unreadable file's generation.
             found.generation += 1;
             found
         }
@@ -171,7 +172,8 @@ fn join(
     // a compaction.
     let mut records = present.records(base, &mut damaged);
     let own = records.len();
-    // A present file that was copied back from elsewhere does not follow the previous generation.
+    // The records of the previous generation are used only if its number is lower. If somebody has copied an old file
+    // to the path, that file's number can be the lower one.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {
         generation(present).is_none_or(|present| generation(previous).is_some_and(|g| g < present))
@@ -206,8 +208,8 @@ fn join(
         expected = begun.saturating_add(1);
     }
     let torn = present.torn.clone();
-    // Higher than every number in either file, usable or not. Parts of a file may remain beside later generations, and
-    // must not be taken for their records.
+    // No new record may get a number that a record in one of the two files has, usable or not. Parts of these files may
+    // remain beside later generations, and must not be taken for records of those.
     let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
     let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
     LoadedStore {
@@ -216,7 +218,7 @@ fn join(
             .and_then(generation)
             .max(generation(present))
             .unwrap_or(0),
-        // The file must not lack records that the previous generation has.
+        // A file that lacks records of the previous generation must not replace it.
         usable: whole && records.len() == own,
         present: None,
         bad_previous: None,
@@ -254,13 +256,16 @@ fn fall_back(
     match previous.checkpoint() {
         Ok(checkpoint) => {
             damage.push(format!(
-                "its previous generation `{}` is used",
+                "the snapshot of the previous generation `{}` is used instead",
                 path.display()
             ));
             Some(checkpoint)
         }
         Err(why) => {
-            damage.push(format!("nor can that of `{}`: {why}", path.display()));
+            damage.push(format!(
+                "the snapshot of the previous generation `{}` cannot be used: {why}",
+                path.display()
+            ));
             None
         }
     }

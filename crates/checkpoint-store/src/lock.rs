@@ -1,9 +1,9 @@
 //! The lock of a checkpoint on this computer's disk.
 //!
 //! A lock file alone is not enough. It can be deleted, or renamed together with its folder, and then the next rosrescue
-//! would create a new one. So there are three locks. The lock file works for every process that sees the folder,
-//! including processes in other containers. A socket in the abstract namespace, named after the checkpoint, cannot be
-//! removed while rosrescue lives. The checkpoint itself is locked too; see [`claim`].
+//! would create a new one. So there are three locks. First, the lock file works for every process that sees the folder,
+//! including processes in other containers. Second, a socket in the abstract namespace, named after the checkpoint,
+//! cannot be removed while rosrescue lives. Third, the checkpoint itself is locked; see [`claim`].
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -19,14 +19,15 @@ use rustix::fs::FlockOperation;
 use super::storage::FileId;
 use crate::regular_file;
 
-/// How long to wait for the locks of a killed process. If it was starting a child process when it was killed, its locks
-/// last until the child has closed the inherited descriptors. Then a rosrescue that starts must not be refused.
+/// How long to wait for the locks of a killed process. If a process was starting a child process when it was killed,
+/// its locks last until the child has closed the inherited descriptors. A rosrescue that starts in that time must not
+/// be refused.
 const LINGER: Duration = Duration::from_millis(500);
 
 #[derive(Debug)]
 pub struct DiskLock {
     file: File,
-    /// `None` if the kernel does not support such sockets.
+    /// The bound socket. `None` if the kernel does not support sockets in the abstract namespace.
     _name: Option<UnixDatagram>,
 }
 
@@ -58,7 +59,8 @@ impl DiskLock {
         Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
     }
 
-    /// Makes a new lock file, and its folder if needed, if another file is at `path` than the one that is locked.
+    /// Makes a new lock file at `path` and locks it, unless the locked file is still there. Creates the folder if
+    /// needed.
     pub(super) fn renew(&mut self, path: &Path) -> io::Result<Result<(), Refused>> {
         if FileId::at(path)? == Some(self.id()?) {
             return Ok(Ok(()));
@@ -91,7 +93,7 @@ fn is_claimed(checkpoint: &Path) -> bool {
 /// The rosrescue that uses a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LockHolder {
-    /// Its process id, if known.
+    /// The process id of this rosrescue, if known.
     pub pid: Option<u32>,
 }
 
@@ -134,8 +136,8 @@ fn holder(file: File) -> Option<u32> {
 /// could fill.
 fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     let root = FileId::of(&fs::metadata("/")?);
-    // Within one mount namespace a path stands for one file. Containers that share a network namespace each have their
-    // own mount namespace.
+    // In two containers, one path can stand for two files. Containers that share a network namespace share the names of
+    // sockets too, so the name must depend on the container: on its mount namespace and its root folder.
     let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();
     let folder = checkpoint.parent().unwrap_or_else(|| Path::new("/"));
     let path = fs::canonicalize(folder)?.join(checkpoint.file_name().unwrap_or_default());
@@ -145,8 +147,8 @@ fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
-/// Computes a 64-bit FNV-1a hash. A path can be longer than a socket's name. All versions of rosrescue must compute the
-/// same name.
+/// Computes a 64-bit FNV-1a hash, because a path can be longer than a socket's name. Must not change, because all
+/// versions of rosrescue must compute the same name.
 fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
         (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)

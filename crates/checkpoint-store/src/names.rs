@@ -8,7 +8,7 @@ use super::{Storage, StoreError};
 /// Number of files of one kind to keep. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
 
-/// The paths of a checkpoint and of its companions, all in one folder.
+/// The paths of a checkpoint and of the files beside it, such as the lock file. All are in one folder.
 #[derive(Clone, Debug)]
 pub(super) struct Names {
     pub(super) path: PathBuf,
@@ -40,7 +40,7 @@ impl Names {
         self.path.parent().unwrap_or_else(|| Path::new("/"))
     }
 
-    /// What follows the checkpoint's name and a dot, for each such name in the folder.
+    /// For each name in the folder that starts with the checkpoint's name and a dot: the rest of the name.
     fn endings(&self, storage: &impl Storage) -> io::Result<Vec<String>> {
         let stem = self.path.file_name().unwrap_or_default().to_string_lossy() + ".";
         let names = storage.list(self.folder())?.into_iter();
@@ -67,8 +67,8 @@ impl Names {
         self.with(&format!(".{kind}-{number}"))
     }
 
-    /// A new name for a file of this kind. Removes surplus old files. Names contain numbers and not dates, because the
-    /// clock may be wrong.
+    /// A new name `PATH.KIND-NUMBER` for a file. Removes surplus old files of this kind. Names contain numbers and not
+    /// dates, because the clock may be wrong.
     pub(super) fn aside(&self, storage: &impl Storage, kind: &str) -> io::Result<PathBuf> {
         let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);

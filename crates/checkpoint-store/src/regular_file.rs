@@ -1,5 +1,5 @@
-//! Opens regular files safely in folders that other users may write to. It never follows a symbolic link to another
-//! file, waits for the other end of a pipe, or changes a file that is hard-linked elsewhere.
+//! Opens regular files safely in folders that other users may write to. No function waits for the other end of a pipe.
+//! A file for writing is never opened through a symbolic link, and never has a second hard link.
 
 use std::{
     fs::{self, File, OpenOptions},

@@ -28,11 +28,11 @@ pub(super) enum Fault {
 struct Inode {
     durable: Vec<u8>,
     writes: Vec<Vec<u8>>,
-    /// Number of writes so far.
+    /// Stands for the modification time: the number of writes so far.
     modified: i128,
-    /// Whether the disk fails to read it.
+    /// Whether the disk fails to read this file.
     unreadable: bool,
-    /// Whether a sync of it failed. Using the file again is an error, because its unwritten pages may be lost.
+    /// Whether a sync of this file failed. Using the file again is an error, because its unwritten pages may be lost.
     poisoned: bool,
 }
 
@@ -138,7 +138,7 @@ impl World {
         }
     }
 
-    /// Like [`step`](Self::step), for an atomic operation.
+    /// Counts an operation that happens as a whole or not at all, and fails if it may not proceed.
     fn whole_step(&mut self) -> io::Result<()> {
         match self.step() {
             Step::Go => Ok(()),
@@ -239,7 +239,8 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// The disk that the next process finds after a kill: all writes are there, but no more of them are durable.
+    /// The disk that the next process finds after a kill: all writes are there, and the kill has made none of them
+    /// durable.
     pub(super) fn after_kill(&self) -> Self {
         let mut world = self.0.lock().unwrap().clone();
         (world.fault, world.dead, world.ops) = (None, false, 0);

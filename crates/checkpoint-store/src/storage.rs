@@ -60,16 +60,16 @@ pub trait Storage: Clone + Send + Sync + 'static {
 
     /// Creates the folder of `path` if needed, and returns the file's real path.
     fn locate(&self, path: &Path) -> io::Result<PathBuf>;
-    /// Takes the lock of `checkpoint`, and writes this process's id to the lock file at `path`. If the lock is taken,
-    /// returns its holder.
+    /// Takes the lock of `checkpoint`, and writes this process's id to the lock file at `path`. If another process has
+    /// the lock, returns the id of that process as an inner error, if known.
     fn lock(&self, checkpoint: &Path, path: &Path) -> io::Result<Result<Self::Lock, Option<u32>>>;
-    /// Makes a new lock file at `path`, and its folder, if another file is there than the one that is locked. If the
-    /// lock is taken, returns its holder.
+    /// Makes a new lock file at `path` and locks it, unless the locked file is still there. Creates the folder if
+    /// needed. If another process has the lock, returns the id of that process as an inner error, if known.
     fn renew_lock(&self, lock: &mut Self::Lock, path: &Path)
     -> io::Result<Result<(), Option<u32>>>;
     /// The id of the lock file.
     fn lock_id(&self, lock: &Self::Lock) -> io::Result<FileId>;
-    /// Reads the whole content, up to `limit` + 1 bytes.
+    /// Reads the whole content of the file at `path`. A file of more than `limit` bytes is an error.
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
     /// Creates an empty file, readable and writable for its owner only. Replaces an existing one.
     fn create(&self, path: &Path) -> io::Result<Self::File>;
@@ -92,7 +92,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Waits until the names in `folder` are durable.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;
-    /// The names in `folder` that are valid text.
+    /// The names of all files in `folder`. Bytes that are not UTF-8 are replaced.
     fn list(&self, folder: &Path) -> io::Result<Vec<String>>;
 }
 
@@ -164,10 +164,11 @@ impl Storage for Disk {
     }
 
     fn create(&self, path: &Path) -> io::Result<File> {
-        // Removed first, so that a file with another name is never written to.
+        // An existing file is removed and not emptied, because it may have a second name, under which its content must
+        // stay.
         remove_if_there(path)?;
         let file = Self::private().append(true).create_new(true).open(path)?;
-        // The umask can only have removed permissions.
+        // Sets the mode again, because the umask may have removed permissions.
         file.set_permissions(fs::Permissions::from_mode(0o600))?;
         lock::claim(&file);
         Ok(file)
@@ -203,13 +204,14 @@ impl Storage for Disk {
             copy.sync_data()?;
         }
         fs::rename(&aside, to)?;
-        // The rename has no effect if both are names of the same file.
+        // If `aside` and `to` are names of the same file, the rename does nothing and `aside` remains.
         remove_if_there(&aside)?;
         Ok(linked)
     }
 
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
-        // The file goes through `aside`. If a crash happens in between, it is there, and nothing is lost.
+        // The new file goes through `aside`. If a crash happens in between, the file is at `aside`, and nothing is
+        // lost.
         fs::rename(from, aside)?;
         let exchanged = rustix::fs::renameat_with(CWD, aside, CWD, path, RenameFlags::EXCHANGE);
         let Err(error) = exchanged else {

@@ -1,8 +1,8 @@
 //! Checks whether the file at the path is unchanged and still the one that this store writes.
 //!
 //! Writes still succeed after the folder was renamed, the file system unmounted, or the file truncated or overwritten.
-//! But nobody can find the written file any more. So path, open file and lock are compared with what is known, and a
-//! difference latches like a failed write.
+//! But the next start would not find the written records. So the path, the open file and the lock are compared with
+//! what the store knows. A difference *latches*, as a failed write does: the store records nothing more to this file.
 
 use std::io;
 use std::path::PathBuf;
@@ -66,7 +66,7 @@ pub struct Checked {
 }
 
 impl<S: Storage> CheckJob<S> {
-    /// Makes a few system calls. Reads the file only if it may have been overwritten.
+    /// Runs the check with a few system calls. Reads the file only if it may have been overwritten.
     pub fn run(self) -> Checked {
         Checked {
             generation: self.generation,
@@ -98,8 +98,8 @@ impl<S: Storage> Active<S> {
         self.snapshot_bytes + self.journal_bytes
     }
 
-    /// Compares the file's status with that after this store's last write. If only the modification time differs, the
-    /// content is read: `touch` changes that time too, and some file systems update it late.
+    /// Compares the file's status with its status after this store's last write. If only the modification time differs,
+    /// the next check reads the content, because `touch` changes that time too, and some file systems update it late.
     pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), ForeignChange> {
         let expected = self.length();
         if status.length != expected {
@@ -115,8 +115,8 @@ impl<S: Storage> Active<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// A check that the file at the path and the lock are those of this store, and unchanged. `None` if nothing is
-    /// being recorded, or if recording stops now because the length differs.
+    /// A job that checks whether the file at the path and the lock are those of this store, and unchanged. `None` if
+    /// nothing is being recorded, or if the status of the open file is already wrong, which stops recording.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
         let active = self.active.as_mut()?;
         let status = self.storage.status(&active.file);
@@ -145,7 +145,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the check found a difference. The store is now unprotected.
+    /// If the check found a difference. The store is now [unprotected](Self::unprotected).
     pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
         let active = self.active.as_ref();
         let current = active.is_some_and(|active| active.generation == done.generation);
@@ -156,14 +156,15 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Like [`latch`](Self::latch), after a change by another process.
+    /// Stops recording to the present file for good, because another process has made `change`.
     pub(super) fn changed(&mut self, change: ForeignChange) -> StoreError {
         if matches!(change, ForeignChange::Lock) {
             // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
-            // this fails, the next generation reports it.
+            // the lock cannot be taken, the next generation reports it.
             let _ = self.hold_lock();
         } else {
-            // Another process's file may be at the path now. It is kept when it is replaced.
+            // Another process's file may be at the path now. Without `present`, that file is kept under another name
+            // when it is replaced.
             self.present = None;
         }
         let path = self.names.path.clone();
@@ -196,7 +197,7 @@ impl<S: Storage> Store<S> {
         Err(self.latch(error))
     }
 
-    /// Takes the name under which a foreign file at the checkpoint's path was kept.
+    /// Returns the name under which another process's file at the checkpoint's path was kept. Returns each name once.
     pub fn take_kept(&mut self) -> Option<PathBuf> {
         self.kept.take()
     }

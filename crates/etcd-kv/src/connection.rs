@@ -25,9 +25,9 @@ use super::{
     wire,
 };
 
-/// Longest time to connect to one address. In a local network it takes a millisecond.
+/// Longest time to connect to one address. In a local network, connecting takes about a millisecond.
 const CONNECT_LIMIT: Duration = Duration::from_secs(1);
-/// Largest answer, in bytes: a page of a range.
+/// Maximum size of an answer, in bytes. The largest answers are the pages of a range.
 const ANSWER_BYTES_MAX: usize = 64 << 20;
 /// Maximum number of idle connections that are kept.
 const IDLE_MOST: usize = 4;
@@ -75,7 +75,7 @@ impl Endpoint {
         config: Option<&TlsSettings>,
     ) -> Result<Self, EtcdError> {
         let refused =
-            |why: &str| EtcdError::Options(format!("`{url}` is no endpoint of etcd: {why}"));
+            |why: &str| EtcdError::Options(format!("`{url}` is not an endpoint of etcd: {why}"));
         let uri: hyper::Uri = url.parse().map_err(|_| refused("it is not a URL"))?;
         let host = uri.host().ok_or_else(|| refused("it has no host"))?;
         let host = host
@@ -134,7 +134,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether this is etcd's port for other members. Only that port lists them at `/members`.
+    /// Whether this endpoint is etcd's port for other members. Only that port lists the members at `/members`.
     async fn is_for_peers(&self) -> bool {
         let ask = async {
             let mut connection = self.connect().await.ok()?;
@@ -157,7 +157,7 @@ impl Endpoint {
         self.exchange(path, body, token.as_deref()).await
     }
 
-    /// The token of this session. `None` if there is no user.
+    /// The token of this session at etcd. `None` if no user is configured.
     async fn token(&self) -> Result<Option<String>, EtcdError> {
         let Some((name, password)) = &self.access.user else {
             return Ok(None);
@@ -183,7 +183,7 @@ impl Endpoint {
         body: Bytes,
         token: Option<&str>,
     ) -> Result<Bytes, EtcdError> {
-        // An idle connection may have been closed meanwhile.
+        // etcd may have closed an idle connection. If the request fails there, a new connection gets it.
         let idle = lock(&self.idle)
             .pop()
             .filter(|connection| !connection.is_closed());
@@ -315,7 +315,7 @@ impl Endpoint {
     ) -> Result<Connection, EtcdError> {
         let opened = http1::handshake(TokioIo::new(stream)).await;
         let (connection, driver) = opened.map_err(|error| self.lost(&error))?;
-        // The task ends with the connection's handle.
+        // The task ends when the returned connection is dropped.
         tokio::spawn(driver);
         Ok(connection)
     }

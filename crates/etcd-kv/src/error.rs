@@ -1,4 +1,4 @@
-//! Errors of etcd, in words for its operator.
+//! Errors of etcd, in words for the person who runs etcd.
 
 use std::time::Duration;
 
@@ -36,12 +36,12 @@ pub enum EtcdError {
     Full,
     #[error("etcd refuses a request of this size; its --max-request-bytes is below 1.5 MiB")]
     TooLarge,
-    #[error("etcd has compacted revision {revision:?}: the state must be read again")]
+    #[error("etcd has discarded a revision that is still needed: the state must be read again")]
     Compacted { revision: Option<u64> },
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },
     #[error(
-        "etcd at {endpoint} has users, and then its gateway refuses every certificate with a CommonName: \
+        "etcd at {endpoint} has users. Its gateway then refuses every client certificate with a CommonName: \
          give this computer one without (openssl: -subj /O=NAME)"
     )]
     CommonName { endpoint: String },
@@ -61,7 +61,7 @@ pub enum EtcdError {
 }
 
 impl EtcdError {
-    /// Reads an answer with an HTTP error status.
+    /// The error in an answer with an HTTP error status.
     pub(super) fn refused(endpoint: &str, status: StatusCode, body: &[u8]) -> Self {
         if let Ok(answer) = serde_json::from_slice::<ErrorAnswer>(body)
             && answer.code != 0
@@ -77,7 +77,7 @@ impl EtcdError {
         Self::NotEtcd { endpoint, why }
     }
 
-    /// Reads an answer that contains an error.
+    /// The error with this gRPC status code and message.
     pub(super) fn answered(endpoint: &str, code: i64, message: &str) -> Self {
         let endpoint = endpoint.to_owned();
         let why = message.to_owned();
@@ -107,7 +107,7 @@ impl EtcdError {
         )
     }
 
-    /// Whether every other member would give the same answer.
+    /// Whether every other member of etcd would answer with the same error, so that asking them is useless.
     pub(super) fn is_final(&self) -> bool {
         matches!(
             self,

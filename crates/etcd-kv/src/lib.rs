@@ -1,7 +1,7 @@
 //! A client for etcd's JSON gateway: transactions, ranges, leases and watches over HTTP/1, with TLS.
 //!
-//! A request goes to the endpoint that answered last. If that one does not answer soon, the next one gets the request
-//! as well. So requests may run twice, and must have the same effect then.
+//! A request goes to the endpoint that answered last. If that endpoint does not answer soon, the next one gets the
+//! request as well. So a request may run twice, and two runs must have the same effect as one.
 
 mod connection;
 mod error;
@@ -29,11 +29,12 @@ pub use tls::Tls;
 pub use watch::{KeyChange, Watch, WatchEnd};
 pub use wire::{Kv, Txn, TxnOp, TxnResult};
 
-/// Time without an answer after which the next endpoint is asked as well. A transaction takes 1 to 20 ms.
+/// Time without an answer after which the next endpoint is asked as well. For comparison, a transaction takes 1 to 20
+/// ms.
 const NEXT_AFTER: Duration = Duration::from_millis(250);
 /// Pause after all endpoints have failed. It counts as part of the request's time limit.
 const ROUND_PAUSE: Duration = Duration::from_millis(100);
-/// Maximum number of keys in one page of a range. Their values take 16 MiB at most.
+/// Maximum number of keys in one page of an answer to a range request. The values of a page take 16 MiB at most.
 const PAGE: usize = 32;
 
 /// Settings of a client.
@@ -101,11 +102,11 @@ impl Client {
         })
     }
 
-    /// Carries out a transaction, perhaps several times.
+    /// Carries out a transaction. etcd may run it more than once.
     ///
     /// # Errors
     ///
-    /// Why it is unknown whether the transaction was carried out.
+    /// If etcd gave no result. It is then unknown whether the transaction was carried out.
     pub async fn txn(&self, txn: &Txn, limit: Duration) -> Result<TxnResult, EtcdError> {
         let answer: wire::TxnAnswer = self.ask("kv/txn", &txn.request(), limit).await?;
         answer.read()
@@ -115,7 +116,7 @@ impl Client {
     ///
     /// # Errors
     ///
-    /// Why the key could not be read.
+    /// If the key could not be read.
     pub async fn first_key(
         &self,
         range: &Range<String>,
@@ -131,8 +132,8 @@ impl Client {
     ///
     /// # Errors
     ///
-    /// [`EtcdError::Compacted`] if etcd has compacted that moment before all keys were read. Otherwise why they could
-    /// not be read.
+    /// [`EtcdError::Compacted`] if etcd has discarded the revision before all keys were read. Another error if they
+    /// could not be read for another reason.
     pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
         self.ranges(std::slice::from_ref(range), None, limit).await
     }
@@ -142,7 +143,7 @@ impl Client {
     ///
     /// # Errors
     ///
-    /// As [`Self::range`].
+    /// The errors of [`Self::range`].
     pub async fn ranges(
         &self,
         ranges: &[Range<String>],
@@ -170,12 +171,12 @@ impl Client {
         Ok(Found { revision, kvs })
     }
 
-    /// Creates a lease that ends by itself after about `ttl`, but after 2 s at the earliest. etcd then deletes the keys
-    /// written with it.
+    /// Creates a lease that ends by itself after about `ttl`, but after 2 s at the earliest. When the lease ends, etcd
+    /// deletes the keys that were written with it.
     ///
     /// # Errors
     ///
-    /// Why there is no lease.
+    /// If etcd created no lease.
     pub async fn grant(&self, ttl: Duration, limit: Duration) -> Result<i64, EtcdError> {
         let request = json!({ "TTL": ttl.as_secs().max(1) });
         let lease: wire::LeaseAnswer = self.ask("lease/grant", &request, limit).await?;
@@ -186,7 +187,7 @@ impl Client {
     ///
     /// # Errors
     ///
-    /// Why it is unknown whether the key was written.
+    /// If etcd gave no result. It is then unknown whether the key was written.
     pub async fn put_with_lease(
         &self,
         key: &str,
@@ -200,11 +201,11 @@ impl Client {
         Ok(())
     }
 
-    /// Makes etcd discard everything before `revision`. Without this etcd keeps growing.
+    /// Makes etcd discard all revisions before `revision`. Without this, etcd's database keeps growing.
     ///
     /// # Errors
     ///
-    /// Why etcd did not do so.
+    /// If etcd gave no result, or refused.
     pub async fn compact(&self, revision: u64, limit: Duration) -> Result<(), EtcdError> {
         let request = json!({ "revision": revision.to_string() });
         match self
@@ -238,7 +239,7 @@ impl Client {
         wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
     }
 
-    /// Tries each endpoint on its own: reads `key` from each. Needs no majority.
+    /// Tries each endpoint on its own, by asking it whether `key` exists. etcd needs no majority for the answer.
     pub async fn try_each(&self, key: &str, limit: Duration) -> Vec<Tried> {
         let mut asked = JoinSet::new();
         for index in 0..self.endpoints.len() {
@@ -312,7 +313,7 @@ impl Client {
                         let round = next % self.endpoints.len() == self.preferred();
                         let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
                         ask_at = ask_at.min(tokio::time::Instant::now() + pause);
-                        // The error of an endpoint that answers tells more than that of one that does not.
+                        // The error of an endpoint that answered says more than the error of one that did not.
                         if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
                             failure = Some(error);
                         }

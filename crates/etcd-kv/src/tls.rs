@@ -48,16 +48,16 @@ mod with {
         read: Arc<Mutex<Read>>,
     }
 
-    /// The certificates that were read, and their files.
+    /// The certificates that were read, and the versions of their files.
     #[derive(Debug)]
     struct Read {
         config: Arc<ClientConfig>,
         stamps: Vec<Option<Stamp>>,
-        /// The files that could not be used, so that this is logged only once.
+        /// The versions of the files that could not be used, so that the problem is logged only once.
         refused: Vec<Option<Stamp>>,
     }
 
-    /// Tells a file from its predecessor at the same path.
+    /// Identifies a version of a file: inode, and modification time in seconds and nanoseconds.
     type Stamp = (u64, i64, i64);
 
     impl Read {
@@ -148,7 +148,7 @@ mod with {
                 match self.files.read() {
                     Ok(Some(config)) => *read = Read::new(config, stamps),
                     Ok(None) => {}
-                    // A file may be half written.
+                    // A file may be half written at this moment. The next connection reads it again.
                     Err(error) if stamps != read.refused => {
                         tracing::warn!(%error, "cannot use the new certificates for etcd; the old ones stay in use");
                         read.refused = stamps;

@@ -33,7 +33,7 @@ pub struct KeyChange {
 pub enum WatchEnd {
     /// etcd has compacted the next revision, so the state must be read again.
     Compacted,
-    /// Asking again would not help.
+    /// The watch has failed, and opening it again would not help.
     Failed(EtcdError),
 }
 
@@ -55,8 +55,8 @@ pub struct Watch {
     next: u64,
     quiet: Duration,
     open: Option<Open>,
-    /// The endpoint that is being opened. Kept in this struct, like [`Open::until`]: `next` may be cancelled and called
-    /// again at any time, and a silent member must be noticed all the same.
+    /// The stream that is being opened, and the index of its endpoint. It is kept here, like [`Open::until`], because
+    /// [`Self::next`] may be cancelled and called again at any time. A silent member must be noticed even then.
     opening: Option<(usize, Opening)>,
     failures: usize,
 }
@@ -78,7 +78,7 @@ impl Watch {
     ///
     /// # Errors
     ///
-    /// Why no more changes will come.
+    /// [`WatchEnd`] if no more changes will come.
     pub async fn next(&mut self) -> Result<Vec<KeyChange>, WatchEnd> {
         loop {
             let read = match &mut self.open {
@@ -202,7 +202,8 @@ impl Watch {
         let mut changes = Vec::with_capacity(answer.events.len());
         for event in &answer.events {
             let kv = event.kv.read()?;
-            // The rest of this revision may be in the next message.
+            // The next message of a fragmented answer has the rest of this revision, so the watch still needs this
+            // revision.
             self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
             changes.push(KeyChange {
                 key: kv.key.clone(),
@@ -215,7 +216,7 @@ impl Watch {
 }
 
 impl Open {
-    /// Reads the next line.
+    /// Reads the next message, which is one line.
     async fn message(&mut self) -> Result<Option<Bytes>, String> {
         loop {
             if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {

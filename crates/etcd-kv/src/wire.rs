@@ -1,4 +1,4 @@
-//! Requests and answers in the gateway's form: bytes as base64, and most integers as text.
+//! Requests and answers in the form of etcd's JSON gateway: bytes as base64, and most integers as text.
 
 use std::ops::Range;
 
@@ -45,7 +45,7 @@ pub enum TxnOp {
 pub struct TxnResult {
     /// Whether the condition held.
     pub succeeded: bool,
-    /// etcd's revision afterwards.
+    /// etcd's revision after the transaction.
     pub revision: u64,
     /// The results of the [`TxnOp::Get`]s. `None` for a key that does not exist.
     pub gets: Vec<Option<Kv>>,

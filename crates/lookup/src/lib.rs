@@ -1,5 +1,5 @@
-//! Resolves host names. Concurrent lookups of one name share a lookup. Each lookup runs in a thread of its own, so
-//! neither the runtime nor the end of the process waits for a dead name server.
+//! Resolves host names. Callers that ask for the same name at the same time share one lookup. Each lookup runs in a
+//! thread of its own, so a dead name server delays neither the tokio runtime nor the end of the process.
 
 use std::{
     collections::BTreeMap,
@@ -10,7 +10,8 @@ use std::{
 
 use tokio::sync::{Semaphore, watch};
 
-/// Maximum number of lookups at the same time. A dead name server blocks a thread for some ten seconds.
+/// Maximum number of lookups at the same time. There is a limit because a dead name server blocks each thread for about
+/// ten seconds.
 const LOOKUPS: usize = 64;
 
 /// The addresses of a name without a port, or why there are none.
@@ -54,7 +55,8 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     }
 }
 
-/// Whether an address belongs to this computer: then the kernel routes to it from that same address. Nothing is sent.
+/// Whether `address` belongs to this computer. If it does, the kernel chooses `address` itself as the source address of
+/// packets to `address`. Sends no packet.
 pub fn is_own(address: IpAddr) -> bool {
     let any = match address {
         IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),

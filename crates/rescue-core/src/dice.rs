@@ -1,4 +1,4 @@
-//! Random numbers for simulations. A failure prints their seed.
+//! Random numbers for simulations. A simulation that fails prints the seed, so that it can be repeated.
 
 /// The SplitMix64 generator.
 #[derive(Debug)]

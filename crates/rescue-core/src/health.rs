@@ -1,7 +1,8 @@
-//! Judges a node's answers: whether it is the node that has registered, and where the mirror differs from its report.
+//! Judges a node's answers: whether the answering node is the one that has registered, and where the mirror,
+//! rosrescue's model of the master, differs from what the node reports.
 //!
-//! Without evidence against it, a node counts as the one that has registered: losing a healthy node is worse than
-//! keeping a dead one.
+//! The answering node counts as the one that has registered unless there is evidence against that, because losing a
+//! healthy node is worse than keeping a dead one.
 
 mod backoff;
 mod liveness;
@@ -47,8 +48,7 @@ pub enum Reaction {
 /// Types by topic, as a node reports them.
 type Topics = BTreeMap<String, String>;
 
-/// The part of a node's address up to the port. Nodes whose addresses differ only behind the port share it and are
-/// asked together.
+/// The part of a node's address up to the port. Nodes whose addresses differ only behind the port are asked together.
 pub fn port_of(api: &str) -> &str {
     let api = api.trim();
     let host = api.find("//").map_or(0, |at| at + 2);
@@ -65,7 +65,7 @@ pub struct Claims {
 
 impl Claims {
     /// Reads the results of `getPublications` and `getSubscriptions`, which are lists of topic and type. `None` if any
-    /// entry could not be registered as it is: then the whole answer is doubtful.
+    /// entry could not be registered as it is, because the whole answer is doubtful in that case.
     pub fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
         Some(Self {
             publications: topics(publications)?,
@@ -73,7 +73,7 @@ impl Claims {
         })
     }
 
-    /// Whether the node reports one of these topics. Common ones do not count.
+    /// Whether the node reports one of `topics`. Topics that most nodes have, such as `/rosout`, do not count.
     pub fn shares(&self, topics: &[String]) -> bool {
         let mut own = self.all().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
@@ -114,12 +114,12 @@ pub enum IdentityVerdict {
 pub struct RegisteredName {
     /// The caller id.
     pub node: String,
-    /// The process id that the port gave last time.
+    /// The process id that the port answered when it was last asked.
     pub known_pid: Option<i32>,
-    /// Whether the name has registered anything since then. If so, another process may have taken the port under the
-    /// same name.
+    /// Whether the name has registered anything since the answer with [`Self::known_pid`]. If so, another process may
+    /// have taken the port under the same name.
     pub registered_since: bool,
-    /// A number that grows with each registration; 0 if unknown.
+    /// The number of the name's latest registration, which grows with each registration of any node. 0 if unknown.
     pub registered: u64,
 }
 
@@ -133,7 +133,7 @@ pub fn judge(
 ) -> Vec<IdentityVerdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
-    // Whether the node's topics are reported, and whether all of them are.
+    // How many of the node's topics the answer reports, and whether it reports all of them.
     let match_of = |node: &str| {
         let held = mirror.publications(node).chain(mirror.subscriptions(node));
         let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
@@ -148,11 +148,12 @@ pub fn judge(
     let by_topics = |name: &RegisteredName, found: &Option<(usize, bool)>| match found {
         None => IdentityVerdict::Unknown,
         Some((0, _)) => IdentityVerdict::Another,
-        // The answer only has topics in common with a later node.
+        // All topics of a node that registered later are reported, so the answer is that node's.
         Some((_, false)) if last_fitting > Some(name.registered) => IdentityVerdict::Another,
         Some(_) => IdentityVerdict::Itself,
     };
-    // If only the previous node's name was known then, the process id may be that of a newer node.
+    // The known process id of an older name can be that of a newer node, if the port was asked when only the older name
+    // was known there.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
     let last_of_pid = of_pid.map(|name| name.registered).max();
     let last = names.iter().map(|name| name.registered).max();
@@ -164,8 +165,8 @@ pub fn judge(
             }
             _ => IdentityVerdict::Itself,
         },
-        // All its topics are reported, and no later node registered. Nevertheless the process id can differ, with some
-        // client libraries or after a restart at the same port.
+        // All topics of this name are reported, and no node registered here later. The process id can differ
+        // nevertheless, with some client libraries or after a restart at the same port.
         (Some(_), Some(_)) if matches!(found, Some((_, true))) && last == Some(name.registered) => {
             IdentityVerdict::Itself
         }
@@ -173,7 +174,7 @@ pub fn judge(
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
-    // A port belongs to one process, so nodes that registered earlier are gone.
+    // A port belongs to one process, so nodes that registered before the present one are gone.
     let present = names.iter().zip(&verdicts);
     let present = present.filter(|(_, verdict)| **verdict == IdentityVerdict::Itself);
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
@@ -197,11 +198,12 @@ pub enum Refusal {
     Dead,
 }
 
-/// Judges a port that refuses connections. `calls` are the last calls of its nodes. `before` are their last calls when
-/// the port refused for the first time. A node may close its port before it unregisters, as roslisp does.
+/// Judges a port that refuses connections. `calls` are the last calls of its nodes, and `before` are their last calls
+/// when the port refused for the first time. The nodes are dead only if the two are equal, because a node may close its
+/// port before it unregisters, as roslisp does.
 pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, calls: &C) -> Refusal {
     match before {
-        // A real master would not have noticed. The health check after the recovery decides.
+        // While the master is gone, no node is declared dead. The health check after the recovery decides.
         _ if !master_serves => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
@@ -211,14 +213,14 @@ pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, call
 /// A topic that a node publishes or subscribes to.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Registration {
-    /// Whether the node publishes the topic. Otherwise it subscribes to it.
+    /// True if the node publishes the topic, false if it subscribes to the topic.
     pub publishes: bool,
     pub topic: String,
     topic_type: String,
 }
 
 impl Registration {
-    /// The call by which the node itself would register this.
+    /// The call by which the node itself would register for the topic.
     pub fn register(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::RegisterPublisher,
@@ -227,7 +229,7 @@ impl Registration {
         Request::new(method, [node, &self.topic, &self.topic_type, api])
     }
 
-    /// The call by which the node itself would unregister this.
+    /// The call by which the node itself would unregister from the topic.
     pub fn unregister(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::UnregisterPublisher,
@@ -254,11 +256,12 @@ impl Registration {
 /// The differences between the mirror and a node's report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reconciliation {
-    /// Topics that the node reports and the mirror lacks. They must not be registered for it. The node may have another
-    /// master, and be known here only because a program synchronises the two masters.
+    /// Topics that the node reports and the mirror lacks. rosrescue must not register these topics, because the node
+    /// may have another master. It may be known here only because a program synchronises the two masters.
     pub missing: Vec<Registration>,
-    /// Topics that the mirror has and the node does not report. They must be confirmed, because a node may register a
-    /// topic before it reports it. Empty if the node reports no topic at all: such a node may be unable to tell.
+    /// Topics that the mirror has and the node does not report. The caller must ask the node again before it believes
+    /// this, because a node may register a topic before it reports the topic. Empty if the node reports no topic at
+    /// all, because some nodes cannot report topics.
     pub extra: Vec<Registration>,
 }
 
@@ -282,7 +285,8 @@ impl Reconciliation {
                     topic: topic.clone(),
                     topic_type: topic_type.clone(),
                 }));
-            // A topic that a node with a malformed name has changed cannot be compared.
+            // A malformed topic cannot be compared. Such a topic exists if the node's own name is malformed, because
+            // the master resolves topics with that name.
             let extra = held.iter().filter(|topic| {
                 !said.is_empty() && master::is_plain_topic(topic) && !said.contains_key(**topic)
             });

@@ -32,16 +32,16 @@ impl FromStr for Hide {
 }
 
 impl Hide {
-    /// Whether the value of the parameter `name`, such as `/robot/wifi/password`, is hidden. It is if its own name or
-    /// the name of a namespace above it matches.
+    /// Whether the value of the parameter `name`, such as `/robot/wifi/password`, is hidden. The value is hidden if the
+    /// regular expression matches `name` or the name of a namespace above it.
     pub fn hides(&self, name: &str) -> bool {
         let above = name.match_indices('/').map(|(end, _)| end).skip(1);
         let mut names = above.filter_map(|end| name.get(..end)).chain([name]);
         names.any(|name| self.matches(name))
     }
 
-    /// The `value` of the parameter `name`, with [`HIDDEN`] in place of everything hidden. That may be a part of the
-    /// value: members of structs have their own names, also inside lists. The root's name is the empty string.
+    /// The `value` of the parameter `name`, with [`HIDDEN`] in place of each hidden part. Each member of a struct has
+    /// its own name and is judged by it, also inside lists. The name of the whole tree is the empty string.
     pub fn mask(&self, name: &str, value: &Value) -> Value {
         self.mask_below(name, value, self.hides(name))
     }
@@ -55,7 +55,7 @@ impl Hide {
         members.collect()
     }
 
-    /// Like [`mask`](Self::mask), if it is already known whether `name` is hidden.
+    /// Does the same as [`mask`](Self::mask) for a caller that already knows whether `name` is hidden.
     fn mask_below(&self, name: &str, value: &Value, hidden: bool) -> Value {
         match value {
             Value::Struct(members) if !members.is_empty() => {

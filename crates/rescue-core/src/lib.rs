@@ -2,12 +2,12 @@
 //! returned as values.
 //!
 //! * [`hide`]: which values of parameters are not shown.
-//! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
-//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
+//! * [`replay`]: recognising a master, reading its state, and the one call that restores a state in it.
+//! * [`lifecycle`]: when a master is started, examined, probed and killed, and when calls pass to it.
 //! * [`health`]: judging what a node reports; which nodes are unreachable.
-//! * [`order`]: the order in which a node hears of a topic, a parameter or its own name.
+//! * [`order`]: in which order a node gets the news about a topic, a parameter or its own name.
 //! * [`checkpoint`]: the checkpoint's text, whether its session continues, and how two states differ.
-//! * [`cluster`]: several computers: who leads, and whose writes hold.
+//! * [`cluster`]: with several computers, which one leads, and whose writes count.
 
 #![cfg_attr(
     test,

@@ -1,9 +1,9 @@
-//! Decides when to connect to, examine, probe, spawn and kill a master, and when calls may pass to
-//! it. In between, `recovery::examine` shuts the gate to writes during an injection.
+//! Decides when to connect to, examine, probe, spawn and kill a master, and when the *gate* is open, which means that
+//! calls pass to the master. Only during an injection, which restores the state in a master, `recovery::examine` shuts
+//! the gate to writes by itself.
 //!
-//! This is a state machine without IO: the shell passes in what happened and when, and carries out
-//! the returned actions. The machine owns every deadline, so that each can be tested without
-//! waiting.
+//! This is a state machine without IO: the caller, `recovery`, passes in what happened and when, and carries out the
+//! returned actions. The machine owns every deadline, so that each can be tested without waiting.
 
 use std::{
     collections::VecDeque,
@@ -29,14 +29,15 @@ const DEATHS_AT_ONCE: usize = 5;
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause in a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that serves for this time ends the crash loop. The pauses continue while more than [`DEATHS_AT_ONCE`]
-/// deaths are within [`DEATH_MEMORY`].
+/// A master that serves for this time ends the crash loop. The pauses before new masters continue while more than
+/// [`DEATHS_AT_ONCE`] deaths are within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// A new master that has used this many times [`Probing::start_limit`] of processor time will never listen.
+/// A new master that has used this many times [`Probing::start_limit`] of processor time and does not listen counts as
+/// hung.
 const STARTS_AT_MOST: u32 = 10;
 /// Pause between two samples of a master that starts slowly.
 const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
-/// Pause before the next attempt if the server is not a master.
+/// Pause before the next connection attempt if the server at the master's address is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,9 +71,10 @@ pub struct Lifecycle {
     served: bool,
     /// Whether the mirror comes from a checkpoint whose session continues.
     restored: bool,
-    /// Whether the mirror is known to be a master's state.
+    /// Whether the mirror is known to equal the state of a master.
     known: bool,
-    /// When the child was started; for an orphan, when rosrescue started. `None` if there is no child.
+    /// When the child, a master that rosrescue has started, began. For an orphan, a master left by an earlier
+    /// rosrescue, when this rosrescue began. `None` if there is no child and no orphan.
     child: Option<Instant>,
     /// Since when no master has been connected.
     seeking_since: Option<Instant>,
@@ -84,10 +86,10 @@ pub struct Lifecycle {
     crash_loop: bool,
     /// When the gate was opened. `None` while it is shut.
     serving_since: Option<Instant>,
-    /// Whether an external master has closed its connection and may have died.
+    /// Whether an external master, which another program starts, has closed its connection and may have died.
     lost: bool,
-    /// Whether an external master was counted as dead, and since then its port has not refused and no master was
-    /// examined there.
+    /// Whether an external master was counted as dead, and since then its port has not refused a connection and no
+    /// master was examined there.
     dying: bool,
     missed: u32,
     patience: Patience,
@@ -130,7 +132,7 @@ impl Lifecycle {
         }
     }
 
-    /// When to pass in [`Input::Wake`]. It may change with every input.
+    /// When to pass in [`Input::Wake`]. This time may change with every input.
     pub fn deadline(&self) -> Option<Instant> {
         let timer = self.timer.map(|(at, _)| at);
         timer.into_iter().chain(self.calm_at()).min()
@@ -147,7 +149,7 @@ impl Lifecycle {
         self.total_deaths
     }
 
-    /// Whether the mirror may stand in while the gate is shut: it is known to be a master's state.
+    /// Whether the mirror may answer while the gate is shut, because it is known to equal the state of a master.
     pub fn may_stand_in(&self) -> bool {
         self.known
     }
@@ -175,12 +177,12 @@ impl Lifecycle {
             }
     }
 
-    /// Takes a sample of the child.
+    /// Adds a sample of the child to the evidence of a hang.
     pub fn observe(&mut self, sample: Sample) {
         self.evidence.add(sample);
     }
 
-    /// Whether this is a new session that no master has served yet.
+    /// Whether this is a new session in which no master has served yet.
     pub fn begins(&self) -> bool {
         !self.served && !self.restored
     }
@@ -231,8 +233,8 @@ impl Lifecycle {
             Input::NotAMaster if self.phase == Phase::Examining && self.is_hopeless(now) => {
                 self.give_up(now)
             }
-            // rosmaster closes connections that carry nothing for a few seconds, so those of a
-            // starved rosmaster or rosrescue end, too.
+            // rosmaster closes connections that carry nothing for a few seconds, so a connection also ends if rosmaster
+            // or rosrescue gets too little processor time.
             Input::ConnectionLost if self.phase == Phase::Examining && self.is_hopeless(now) => {
                 self.give_up_if_hung(now, BUSY_LIMIT, true)
             }
@@ -241,7 +243,8 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
-            // The master died during the examination, or closes every connection. Either way, wait before connecting.
+            // The master died during the examination, or closes every connection. In both cases, wait before the next
+            // connection.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
                 let again = std::mem::replace(&mut self.dying, true);
@@ -272,8 +275,8 @@ impl Lifecycle {
             Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
             Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
             Input::Slow => self.probe_now().into_iter().collect(),
-            // If the master was killed, the rest of its end follows within milliseconds. Otherwise the next connection
-            // shows that it lives.
+            // If the master was killed, the other signs of its end follow within milliseconds. If it lives, the next
+            // connection shows that.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
@@ -345,7 +348,7 @@ impl Lifecycle {
     fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
         self.restored = restored;
-        // A new child is empty, so the mirror is right. An orphan's state must be read first.
+        // A new master has no state, so the mirror is right. The state of an orphan must be read first.
         self.known = restored || (self.supervision == Supervision::Ours && !left);
         if self.supervision == Supervision::Ours && !left {
             return vec![Action::Spawn];
@@ -385,7 +388,7 @@ impl Lifecycle {
         let was_serving = self.is_serving();
         self.seek(now);
         if cause == Cause::Exited {
-            // `spawn` has set this timer, which stays.
+            // `spawn` has already set a timer for the next master, which stays.
             self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
         }
         let shut = was_serving.then_some(Action::ShutGate(cause));
@@ -406,7 +409,7 @@ impl Lifecycle {
         actions
     }
 
-    /// Whether the child has had enough time to start listening, without having been busy. A rosmaster whose port was
+    /// Whether the child has had more than [`Probing::start_limit`] to start listening. A rosmaster whose port was
     /// taken never listens and does not end.
     fn is_slow_to_start(&self, now: Instant) -> bool {
         let limit = self.probing.start_limit;
@@ -414,13 +417,13 @@ impl Lifecycle {
             .is_some_and(|since| now.duration_since(since) > limit)
     }
 
-    /// Whether the child has had enough time, and still no master answers at its port.
+    /// Whether the child has had more than [`Probing::start_limit`], and still no master answers at its port.
     fn is_hopeless(&self, now: Instant) -> bool {
         let since = self.seeking_since.filter(|_| self.child.is_some());
         since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
     }
 
-    /// Kills the silent child if it [hangs](Evidence::judge). Otherwise connects again.
+    /// Kills the silent child if it [hangs](Evidence::judge). Connects again if it does not.
     fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
         match self.evidence.judge(busy_limit) {
             SilenceVerdict::Hung => self.give_up(now),
@@ -431,7 +434,7 @@ impl Lifecycle {
         }
     }
 
-    /// Kills the useless child. Its end arrives as `Exited`, which starts the next one.
+    /// Kills the useless child. Its end arrives as [`Input::Exited`], which starts the next master.
     fn give_up(&mut self, now: Instant) -> Vec<Action> {
         self.seek(now);
         vec![Action::Kill]
@@ -474,7 +477,7 @@ impl Lifecycle {
             Supervision::Theirs => Vec::new(),
         };
         let actions = self.lost(now, Cause::Hung, then);
-        // The end of the killed master arrives as `Exited`.
+        // The end of a killed master arrives as [`Input::Exited`].
         self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
         actions
     }
@@ -502,7 +505,8 @@ impl Lifecycle {
         }
     }
 
-    /// Counts the death of an external master. rosrescue cannot slow down its restarts, but reports a crash loop once.
+    /// Counts the death of a master that another program starts. rosrescue cannot slow down that program's restarts,
+    /// but reports a crash loop once.
     fn their_death(&mut self, now: Instant) -> Option<Action> {
         self.lost = false;
         let said = self.crash_loop;

@@ -1,19 +1,19 @@
-//! Decides the order in which a node hears about a topic, a parameter or its own name: the order of the
-//! state.
+//! Makes sure that a node gets the news about a *subject* (a topic, a parameter or the node's own name) in the order in
+//! which the state changed.
 //!
-//! A node hears about one subject in two ways, in the answers to its own calls and in notifications, and it
-//! reads these in different threads. rospy believes whatever comes last. roscpp drops every link that is
-//! missing in the last list of publishers. So a node must have the answer to its own call before it is
-//! notified of anything later about the same subject, and of two notifications the newer one must come last:
+//! A node hears about one subject in two ways, in the answers to its own calls and in notifications, and it reads these
+//! in different threads. rospy believes whatever comes last. roscpp drops every connection to a publisher that is
+//! missing in the last list. So a node must have the answer to its own call before it is notified of anything later
+//! about the same subject, and of two notifications the newer one must come last:
 //!
 //! * While the master serves, a write that can notify a node does not go to the master while an answer to
 //!   that node about the same subject is under way ([`Order::must_wait`]).
-//! * A notification that rosrescue sends waits for such an answer, and for [`LEAD`] after it. Where the
-//!   master may be notifying the node of the same subject, ours is put off ([`Order::next`]).
-//! * A node that is notified shortly after such an answer, or by two senders in a row, is told the state once
-//!   more ([`REPEAT_AFTER`]), because it may have read the two in the wrong order. If the master notifies it
-//!   of something newer meanwhile, that is enough: a notification of ours could then be overtaken by the
-//!   master's backlog on a busy computer.
+//! * A notification that rosrescue sends waits for such an answer, and for [`LEAD`] after it. While the master may be
+//!   notifying the node of the same subject, rosrescue's notification is put off ([`Order::next`]).
+//! * A node that is notified shortly after such an answer, or by two senders in a row, is told the state once more
+//!   ([`REPEAT_AFTER`]), because it may have read the two in the wrong order. If the master notifies the node of
+//!   something newer in the meantime, rosrescue does not tell the state again: on a busy computer, older notifications
+//!   in the master's backlog could arrive after it.
 //!
 //! This module is pure: the time and the mirror are arguments.
 
@@ -39,14 +39,14 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long a notification of rosrescue waits after an answer about the same subject was written. rosmaster takes at
-/// least 0.3 ms, because its notifications go through another thread and a new connection.
+/// How long a notification of rosrescue waits after an answer about the same subject was written. A notification of
+/// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
 /// A notification that follows an answer within this time may be read before it. With thirty runnable processes on two
 /// cores, a node took 42 ms to switch threads.
 pub const RECENT: Duration = Duration::from_millis(500);
-/// How long after such a notification the node is told the state again. Idle threads of rosmaster look for work every
-/// 100 ms, so by then a master without a backlog has sent everything.
+/// How long after a notification that may have been read in the wrong order the node is told the state again. Idle
+/// threads of rosmaster look for work every 100 ms, so by then a master without a backlog has sent everything.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
 /// Longest time that a master with enough CPU time takes for one notification while many wait. A Python thread gives up
 /// its lock every 5 ms.
@@ -56,7 +56,7 @@ const BACKLOG_MAX: Duration = Duration::from_secs(10);
 /// How long a client that does not read its answer can delay other nodes' writes.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(1);
 /// How long a node that does not take a notification can delay writes about its subject. With thirty runnable processes
-/// on two cores, a node took more than 100 ms, and the master's newer value came first.
+/// on two cores, a node took more than 100 ms for that, and a newer value from the master came first.
 pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
 
 /// Answers and notifications on their way to nodes, and the notifications and calls that wait for them.
@@ -64,12 +64,12 @@ pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
 pub struct Order {
     under_way: UnderWay,
     outbox: Outbox,
-    /// The calls that the master has not answered yet. It may be notifying nodes because of them.
+    /// The calls that the master has not answered yet. The master may be notifying nodes because of them.
     in_flight: InFlight,
     /// The subjects about which the master has recently notified nodes.
     told: Told,
     repeats: Repeats,
-    /// Whether a call or a notification waits for any of the above to change.
+    /// Whether a call or a notification waits for a change of the other fields.
     awaited: bool,
 }
 
@@ -80,7 +80,7 @@ struct InFlight {
     answers: Vec<u64>,
 }
 
-/// A call, or a notification, has to wait.
+/// Says that a call or a notification has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MustWait {
     /// When to ask again at the latest. `None` if a change will be reported.
@@ -88,15 +88,16 @@ pub struct MustWait {
 }
 
 impl Order {
-    /// Adds an answer about `heard` that is on its way. Returns its number, for [`Self::written`]. `None` if nodes are
-    /// never notified of its subjects.
+    /// Adds an answer about `heard` that is on its way. Returns its number, for [`Self::written`]. `None` if `heard` is
+    /// empty, because such an answer delays nothing.
     pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
         self.under_way.forget(now);
         if heard.is_empty() {
             return None;
         }
         for Heard { port, subject } in &heard {
-            // Notifications that wait there are older than the answer.
+            // Notifications that already wait for this node are older than the answer, so the node gets the present
+            // state instead.
             self.outbox.renew(port, subject);
         }
         Some(
@@ -105,7 +106,7 @@ impl Order {
         )
     }
 
-    /// Notes that the answer is ready. From now on it delays others only for a limited time.
+    /// Notes that the answer is ready. From now on, it delays calls and notifications for at most [`ANSWER_LIMIT`].
     pub fn ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
@@ -117,8 +118,8 @@ impl Order {
         std::mem::take(&mut self.awaited)
     }
 
-    /// Whether a call must wait before it goes to the master. It must if it may notify a node while an answer to that
-    /// node about the same subject is on its way.
+    /// Whether a call must wait before it goes to the master. It must wait if it may notify a node while an answer to
+    /// that node about the same subject is on its way.
     pub fn must_wait(&mut self, now: Instant, concern: &Concern) -> Option<MustWait> {
         let wait = match concern.is_anything() {
             true => self.under_way.must_wait(now),
@@ -131,8 +132,8 @@ impl Order {
         wait
     }
 
-    /// Whether a read must wait until the master has answered a call. Otherwise the read's answer could be older than a
-    /// notification that the master sends to the reader.
+    /// Whether a read must wait until the master has answered a call. If the read did not wait, its answer could be
+    /// older than a notification that the master sends to the reader.
     pub fn read_must_wait(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
         let waits = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
@@ -160,7 +161,7 @@ impl Order {
         !in_flight.tells.is_empty() && std::mem::take(&mut self.awaited)
     }
 
-    /// Notes that the master notifies this many nodes of `subject`.
+    /// Notes that the master notifies `nodes` nodes of `subject`.
     pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
         let until = self.told.add(now, subject, nodes);
         self.outbox.renew_all(subject);
@@ -175,8 +176,8 @@ impl Order {
         }
     }
 
-    /// Notes that the master answered a batch of `calls` after `took`. A busy computer that delays its answers delays its
-    /// notifications as well.
+    /// Notes that the master answered a batch of `calls` after `took`. A busy computer delays the master's
+    /// notifications as much as its answers.
     pub fn master_answered(&mut self, took: Duration, calls: usize) {
         let per_call = took / u32::try_from(calls.max(1)).unwrap_or(u32::MAX);
         self.told.pace = per_call.max(self.told.pace * 7 / 8);
@@ -187,8 +188,9 @@ impl Order {
         self.told = Told::default();
     }
 
-    /// Queues `call`, which a master would send now, for the node at `port`. If an absent master may have run the write
-    /// already, `call` may be older than what that master has sent. Then the node is told the state instead.
+    /// Queues `call`, which a master would send now, for the node at `port`. If a master that is gone may already have
+    /// run a write about `subject`, it may have sent something newer than `call`. In that case, the node is told the
+    /// present state instead.
     pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
         let is_news = !self.in_flight.tells.has(&subject);
         let content = is_news.then_some(Payload::Call(call));
@@ -201,7 +203,8 @@ impl Order {
         self.outbox.add(port, subject, Payload::State);
     }
 
-    /// Like [`Self::tell_state`], but not before `at`.
+    /// Queues, at the time `at`, a notification for the node at `port` with the state of `subject` at the time of
+    /// sending.
     pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
         self.repeats.add(at, port.to_owned(), subject);
     }
@@ -235,7 +238,8 @@ impl Order {
             let Some(notification) = self.outbox.pop(port) else {
                 continue;
             };
-            // The slower of two senders may send something older, so the node is told the state last.
+            // The master may be notifying the node of the same subject. The slower of the two senders may send
+            // something older, so the node is told the state again after both.
             if is_being_told || told.is_some() && notification.is_state() {
                 let again = told.unwrap_or(now + REPEAT_AFTER);
                 self.repeats.add(again, port.to_owned(), subject);
@@ -262,8 +266,8 @@ impl Order {
         NextNotification::Idle
     }
 
-    /// Notes that the node has taken the notification with this number, so that it reads later ones after it; or that
-    /// it could not be delivered. Returns whether anything waits for that.
+    /// Notes that the node has taken the notification `number`, or that the notification could not be delivered. A node
+    /// reads later notifications after one that it has taken. Returns whether anything waits for that.
     pub fn taken(&mut self, number: u64) -> bool {
         self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
@@ -327,7 +331,7 @@ struct Told {
 }
 
 impl Told {
-    /// Notes that the master has begun to notify this many nodes. Returns when it will be done.
+    /// Notes that the master has begun to notify `nodes` nodes of `subject`. Returns when the master will be done.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
         self.forget(now);
         let takes = MASTER_TAKES.max(self.pace) * u32::try_from(nodes).unwrap_or(u32::MAX);
@@ -354,8 +358,8 @@ impl Told {
     }
 }
 
-/// The repeats: which nodes, by port, to tell the state of a subject again, and when. That is after the last moment at
-/// which they may have read notifications in the wrong order.
+/// The repeats: which nodes, by port, to tell the state of a subject again, and when. Each time lies after the last
+/// moment at which the node may have read notifications in the wrong order.
 #[derive(Debug, Default)]
 struct Repeats {
     at: Schedule<(Subject, String)>,

@@ -1,10 +1,12 @@
-//! Recognises a master, reads its state, and brings it to the mirror's state.
+//! Recognises a master, reads its state, and brings it to the state of the *mirror*, which is rosrescue's model of the
+//! master. An *incarnation* is one life of a master process. An *injection* is the one call that brings a master to a
+//! state.
 //!
 //! * [`Token`] and [`Inspection`] recognise a master and read the state of an unknown one.
 //! * [`Plan`] is the one call that brings a new master to the mirror's state, and verifies the answer.
-//! * [`treatment`] decides what to do with a master, by its token and by what is known of it.
-//! * [`reconcile`] computes the state for a master that was unreachable.
-//! * [`accepted`] tells from a master's reply which parts of a call it has executed.
+//! * [`treatment`] decides what to do with a master, by its token and by what is known about the master.
+//! * [`reconcile`] computes the state for a master that has missed writes because it was unreachable.
+//! * [`accepted`] tells from a master's reply which parts of a call the master has executed.
 //! * [`difference`] describes how two states differ.
 
 mod accepted;

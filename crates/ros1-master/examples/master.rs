@@ -11,7 +11,8 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::{Mutex, PoisonError, mpsc};
 use std::{env, process, thread};
 
-/// The state, and a queue for each node. Each node is notified of changes in order, and delays no other node.
+/// The master's state, and a queue of encoded calls for each node's address. A node gets its calls in order, and a slow
+/// node delays no other node.
 type State = Mutex<(Master, HashMap<String, mpsc::SyncSender<Vec<u8>>>)>;
 
 fn main() -> io::Result<()> {
@@ -55,7 +56,8 @@ fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
     applied.reply
 }
 
-/// Calls a node, such as `http://robot:40123/`. Errors are ignored: the node may be gone.
+/// Sends `call` to the node at the address `node`, such as `http://robot:40123/`. Errors are ignored: the node may be
+/// gone.
 fn notify(node: &str, call: Vec<u8>) -> io::Result<()> {
     let at = node.trim_start_matches("http://").trim_end_matches('/');
     let length = call.len();

@@ -3,8 +3,8 @@
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`Request`]: a call, parsed once, with its [`Method`] and its [`Kind`].
 //!
-//! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that
-//! clients can see. Only the texts of errors that no ROS client causes are our own.
+//! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that clients can
+//! see. Only errors that no ROS client causes have other texts than in rosmaster.
 
 mod api;
 mod checks;

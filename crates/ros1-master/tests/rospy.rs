@@ -14,7 +14,8 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-/// Reports that it is ready, then what it has received, the new value of a parameter, and a service's answer.
+/// A node that prints that it is ready, then what it has received, the new value of a parameter, and a service's
+/// answer.
 const LISTENER: &str = "
 import rospy, std_msgs.msg, std_srvs.srv, threading
 heard = threading.Event()
@@ -28,7 +29,7 @@ print('reset', rospy.ServiceProxy('/reset', std_srvs.srv.Trigger)().message, flu
 print('gain', rospy.get_param('/gain'), flush=True)
 ";
 
-/// Starts after the listener, which finds it only through a notification.
+/// A node that starts after the listener. The listener finds this node only through a notification.
 const TALKER: &str = "
 import rospy, std_msgs.msg, std_srvs.srv
 rospy.init_node('talker')

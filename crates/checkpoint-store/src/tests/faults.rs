@@ -66,7 +66,8 @@ fn an_unprotected_store_reports_it_and_can_be_rearmed() {
 
 #[test]
 fn record_numbers_from_an_unprotected_time_are_never_used_again() {
-    // Otherwise the undamaged records of a failed batch in the previous generation would count as new.
+    // If numbers were used again, the undamaged records of a failed batch in the previous generation would count as
+    // new.
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();

@@ -75,7 +75,7 @@ const CHANGES: [(&str, &str, Change); 7] = [
 
 #[test]
 fn any_change_of_the_file_by_another_process_is_noticed_and_repaired() {
-    // Once while no calls come, and once while calls come.
+    // Each change happens once while no calls come, and once while calls come.
     for ((what, word, change), traffic) in CHANGES.into_iter().flat_map(|it| [(it, 0), (it, 1)]) {
         let (fs, mut model, mut store) = started();
         change(&fs);

@@ -1,4 +1,4 @@
-//! Describes how two states of a master differ, without the order of lists, which only a master's replies show.
+//! Describes how two states of a master differ. Ignores the order of lists, because only a master's replies show it.
 
 use std::collections::BTreeSet;
 
@@ -284,7 +284,7 @@ impl Comparison<'_> {
             Some(_) => None,
         };
         match (a, b, members(a), members(b)) {
-            // It is a namespace in one state, and empty or absent in the other.
+            // In each of the two states, this is a namespace or absent.
             (.., Some(a), Some(b)) => self.params(name, &a, &b),
             _ if a.is_some_and(|a| b.is_some_and(|b| same(a, b))) => {}
             _ => {

@@ -1,4 +1,4 @@
-//! Converts a checkpoint to and from text. Pure: the crate `checkpoint-store` handles the file.
+//! Converts a checkpoint to and from text. The crate `checkpoint-store` reads and writes the file.
 //!
 //! A checkpoint is one YAML document: a first line (a comment) with lengths and check sums, the snapshot in
 //! block style, and as its last key `journal:`, under which each appended line is one [`Record`] in flow
@@ -6,7 +6,7 @@
 //!
 //! * `emit` converts values to YAML that YAML 1.1 and YAML 1.2 readers read alike.
 //! * `yaml` converts YAML to values, from the events of serde-saphyr's parser.
-//! * `frame` handles the first line, the check sums, and finding the whole parts of a damaged file.
+//! * `frame` handles the first line and the check sums, and finds the undamaged parts of a damaged file.
 //! * `document` defines which value stands under which key.
 
 mod document;
@@ -35,30 +35,30 @@ pub const DEPTH_MAX: usize = 768;
 /// The facts from which a restart decides whether the session continues.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Session {
-    /// Identifies the session. It is also roslaunch's `run_id`.
+    /// Identifies the session. This is also roslaunch's `run_id`.
     pub id: String,
     /// The boot id of the kernel when the session began.
     pub boot_id: String,
     /// Whether the session ended with a clean stop.
     pub closed: bool,
-    /// The part of the incarnation token that identifies the session: the `id` of the first session at this checkpoint.
-    /// See [`Token`](crate::replay::Token).
+    /// Identifies the masters of this checkpoint, as a part of the [`Token`](crate::replay::Token) that rosrescue
+    /// leaves in each of them. It is the `id` of the first session at this checkpoint.
     pub mark: String,
     /// The master's address, if there has been a master.
     pub master_uri: Option<String>,
     /// Wall clock time of the start as text, for human readers only.
     pub started: String,
-    /// The number of the master's incarnation, as in its token.
+    /// The number of the present master process, as in its [`Token`](crate::replay::Token).
     pub incarnation: u64,
-    /// Number of the record up to which all pending writes have reached the master. Pending writes in a snapshot have
-    /// the number of its last record.
+    /// Number of the record up to which all pending writes have reached the master. Pending writes in a snapshot count
+    /// as if they had the number of the snapshot's last record.
     pub delivered: u64,
     /// The port that nodes use. 0 if an earlier version wrote the session.
     pub port: u16,
-    /// The last term in which this computer led. 0 if it never did.
+    /// With several computers: the last term in which this computer led. 0 if it never led.
     pub term: u64,
-    /// Number of the last record in etcd's journal of that term that this file contains. Each following call has the
-    /// next number. Lower if the number is unknown.
+    /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
+    /// that follows in this file has the next number. Too low if the true number is unknown.
     pub cluster_seq: u64,
 }
 
@@ -71,7 +71,7 @@ pub enum RecordContent {
         /// Whether the mirror answered the write before a master had run it.
         pending: bool,
     },
-    /// Replaces the session.
+    /// New facts about the session, which replace the previous ones.
     Session(Session),
 }
 
@@ -100,7 +100,7 @@ pub struct Checkpoint {
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
     pub pending: Vec<Call>,
-    /// Nodes that must shut down and may not have been told to.
+    /// Nodes that must shut down because another node has taken their name. Some of them may not have been told yet.
     pub displaced: Vec<Displaced>,
 }
 
@@ -185,10 +185,10 @@ pub struct Decoded {
 /// Encodes a new file that holds `checkpoint` and no records yet.
 ///
 /// ```
-/// use rescue_core::checkpoint::format::{self, Checkpoint, Entry, Record, Session};
+/// use rescue_core::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
 ///
 /// let fresh = format::encode_checkpoint(&Checkpoint::default(), 1)?;
-/// let entry = Entry::Session(Session::default());
+/// let entry = RecordContent::Session(Session::default());
 /// let record = Record { seq: 1, entry };
 /// let line = format::encode_record(&record, fresh.stamp)?;
 ///

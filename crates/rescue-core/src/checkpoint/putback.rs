@@ -5,8 +5,8 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Parameters that belong to the present session. roslaunch compares `/run_id` with its own, and stores its
-/// addresses below `/roslaunch`.
+/// Parameters that belong to the present session, so their values in a checkpoint are not used. roslaunch compares
+/// `/run_id` with its own, and stores its addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 
 /// A parameter of the checkpoint that is left out, and the reason.
@@ -48,7 +48,10 @@ impl ParamChanges {
                 (value, Some(there)) if value == there => {}
                 // Setting an empty namespace would delete everything in it.
                 (Value::Struct(none), Some(Value::Struct(_))) if none.is_empty() && !exact => {}
-                _ if !is_plain(key) => self.leave(name, "no call can name it alone"),
+                _ if !is_plain(key) => self.leave(
+                    name,
+                    "its name is empty or has a slash, so no call can set it alone",
+                ),
                 (Value::Struct(members), there) if is_namespace(members) => {
                     let none = Struct::new();
                     let there = there.and_then(Value::as_struct).unwrap_or(&none);

@@ -1,6 +1,7 @@
 //! Decides whether a checkpoint's session continues, or whether the robot was switched on again.
 //!
-//! A robot that is switched on in the morning must not start with yesterday's parameters.
+//! A *session* begins when rosrescue starts and restores no state. It survives crashes. A robot that is switched on in
+//! the morning needs a new session, because it must not start with yesterday's parameters.
 
 use std::collections::BTreeMap;
 
@@ -23,9 +24,9 @@ pub enum RestorePolicy {
 /// What is known about the session in a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionEvidence {
-    /// Whether the computer has not rebooted since.
+    /// Whether the computer has not rebooted since the session began.
     pub same_boot: bool,
-    /// Whether rosrescue was stopped cleanly.
+    /// Whether rosrescue ended the session with a clean stop.
     pub closed: bool,
     /// Whether a registered node answers. After a reboot only nodes on other computers count.
     pub node_alive: bool,
@@ -53,8 +54,8 @@ pub fn depends_on_nodes(policy: RestorePolicy, evidence: SessionEvidence) -> boo
     with(true) != with(false)
 }
 
-/// Decides whether the session in a checkpoint continues. It does after a kill. After a clean stop or a
-/// reboot it does only if one of its nodes is alive.
+/// Decides whether the session in a checkpoint continues. A session continues after a kill. After a clean stop or a
+/// reboot it continues only if one of its nodes is alive.
 pub fn decide(policy: RestorePolicy, evidence: SessionEvidence) -> Decision {
     let SessionEvidence {
         same_boot,
@@ -87,7 +88,7 @@ pub struct Rebuilt {
     /// Nodes whose names were taken in the records or shortly before the snapshot, ordered by address. It is unknown
     /// which of them were told to shut down.
     pub displaced: Vec<Displaced>,
-    /// Why the snapshot was not used: its state is impossible for a master.
+    /// Why the snapshot was not used, if no master can be in its state.
     pub trouble: Option<String>,
 }
 

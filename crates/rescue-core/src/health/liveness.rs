@@ -1,4 +1,5 @@
-//! Finds out which registered nodes are alive, without disturbing them. The result is only reported.
+//! Finds out which registered nodes are alive, without disturbing them. The result is only reported; nothing is
+//! unregistered because of it.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -20,7 +21,7 @@ const STALE: Duration = Duration::from_secs(120);
 pub enum Health {
     /// A process listens at the node's port, or the node has answered.
     Alive,
-    /// The node has not been asked, or not in the last two minutes.
+    /// Nothing has shown in the last two minutes whether the node is alive.
     Unchecked,
     /// The node does not answer, and there is no proof that it is dead. It stays registered.
     Unreachable,

@@ -17,7 +17,7 @@ const HOSTS: usize = 1024;
 /// The visits to each host, limited by a leaky bucket for each host (the generic cell rate algorithm).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rates<K: Ord> {
-    /// When all visits so far would have ended with a pause before each.
+    /// When all visits so far would be over if they had come one by one, with [`PAUSE`] between them.
     over_at: BTreeMap<K, Instant>,
     forget_at: usize,
 }

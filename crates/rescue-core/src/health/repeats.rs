@@ -1,9 +1,11 @@
-//! Decides when rosrescue itself notifies nodes because the master's notifications may be late.
+//! Decides when rosrescue itself notifies nodes of a *subject*, a changed topic or parameter, because the master's
+//! notifications may be late.
 //!
 //! rosmaster makes a list of publishers when something changes, but sends it only when one of its threads is free. If
-//! unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change as well. It does so no
-//! earlier than an undisturbed master would: if the master's older list arrived after the newer one, roscpp nodes would
-//! drop connections until the next notification. Such a list may still come later, so the notification is repeated.
+//! unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change as well, but no earlier
+//! than an undisturbed master would. If the master's older list arrived after rosrescue's newer one, roscpp nodes would
+//! drop connections until the next notification. The master's older list may come even later, so rosrescue repeats its
+//! notification.
 
 use std::{
     collections::BTreeMap,
@@ -19,10 +21,10 @@ const QUIET: Duration = Duration::from_millis(300);
 const LATEST: Duration = Duration::from_millis(600);
 /// Pause before the first repeat.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Pauses between repeats double up to this one.
+/// Longest pause between two repeats. Pauses double up to this length.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after the last change its notification is repeated: the time of two connection attempts of rosmaster
-/// without an answer.
+/// How long after a subject's last change its notification is repeated. Two connection attempts of rosmaster that get
+/// no answer take about this time.
 const LIFE: Duration = Duration::from_secs(300);
 
 /// The changed subjects, each with the time of its next notification.
@@ -63,8 +65,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. Without them the master
-    /// notifies nodes in time.
+    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. A subject is dropped if
+    /// there have been none since its change, because the master then notifies nodes in time.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {

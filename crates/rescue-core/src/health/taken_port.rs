@@ -1,8 +1,8 @@
 //! Finds nodes that are gone because another node now uses their port. One process listens at a port, so when a node
 //! registers with a port, all other nodes registered there are gone.
 //!
-//! A master does not know that. When the old node starts again at another port, the master sends a `shutdown` to the
-//! old address, where an innocent node listens by then (ros_comm issue 2241).
+//! A master does not know that these nodes are gone. When the old node starts again at another port, the master sends a
+//! `shutdown` to the old address, where an innocent node listens by then (ros_comm issue 2241).
 
 use std::collections::HashMap;
 
@@ -24,8 +24,8 @@ impl<'a> Holders<'a> {
         holders
     }
 
-    /// The nodes that lose their ports to `registrants`. If one call registers several names at one port, they belong
-    /// to one process.
+    /// The nodes that lose their ports to `registrants`, the names and ports that one call registers. Names that one
+    /// call registers at one port belong to one process, so they do not displace each other.
     fn displaced(&self, registrants: &[(&str, &str)]) -> Vec<&'a str> {
         let ports = registrants.iter();
         let holders = ports.flat_map(|(_, port)| self.0.get(port).map_or(&[][..], Vec::as_slice));
@@ -47,7 +47,7 @@ fn registrants(call: &Request) -> Vec<(&str, &str)> {
         .collect()
 }
 
-/// The first of `calls` that takes a port from a node of `mirror`, or from a node of an earlier call.
+/// The index of the first of `calls` that takes a port from a node of `mirror`, or from a node of an earlier call.
 pub fn first_taking<'a>(
     mirror: &'a Master,
     calls: impl Iterator<Item = &'a Request>,
@@ -75,8 +75,8 @@ pub struct Eviction {
 }
 
 impl Eviction {
-    /// The eviction that must precede `call`, because it takes ports from nodes of `mirror`. `None` if it takes none. A
-    /// registration that the master would refuse takes no port.
+    /// The eviction that must precede `call`, because `call` takes ports from nodes of `mirror`. `None` if `call` takes
+    /// no port. A registration that the master would refuse takes no port.
     pub fn before(mirror: &Master, call: &Request) -> Option<Self> {
         first_taking(mirror, std::iter::once(call))?;
         let mut after = mirror.clone();

@@ -61,11 +61,11 @@ fn a_different_process_id_means_another_node() {
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);
     // One process may have two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
-    // But the process may have been asked before it registered, under the name of its predecessor.
+    // But a process may have been asked before it registered, when only its predecessor's name was known at the port.
     let of_b = claims(&["/tb"], &[]);
     let both = verdicts([Some(2), Some(2)], 2, Some(&of_b));
     assert_eq!(both, [Another, Itself]);
-    // The process id takes precedence over topics: it is that node, whatever it has changed since.
+    // The process id takes precedence over topics, because a node may have changed its topics since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
 }

@@ -9,7 +9,7 @@ use super::backoff::Backoff;
 
 /// Pause before an unreachable node is asked again for the first time.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Pauses double up to this one.
+/// Longest pause before a node is asked again. Pauses double up to this length.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
 /// The unreachable ports, and when to ask each one next.
@@ -60,8 +60,8 @@ impl Unreachable {
         self.of.is_empty()
     }
 
-    /// The ports to ask now. A port is returned again only after it was added again, so only one visit asks it at a
-    /// time. The pauses grow.
+    /// The ports to ask now. Returns a port again only after another call of [`Self::add`], so it is asked by one visit
+    /// at a time. The pauses between visits grow.
     pub fn due(&mut self, now: Instant) -> Vec<String> {
         let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
         let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);

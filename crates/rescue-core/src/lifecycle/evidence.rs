@@ -1,4 +1,4 @@
-//! Decides from what the kernel shows of a process whether a master that does not answer hangs.
+//! Decides whether a master that does not answer hangs, by what the kernel shows of its process.
 //!
 //! Silence alone proves nothing. On a busy computer a healthy master may get no processor time, or rosrescue gets none
 //! and its probes are late. A hung process does not need the processor: it is stopped, or its threads get processor
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 pub const WATCHED_LEAST: Duration = Duration::from_millis(300);
 /// Shortest time that a silent master must have been watched if it was not stopped.
 const IDLE_LEAST: Duration = Duration::from_millis(900);
-/// Processor time since the last answer from which on the master is in an endless loop.
+/// A master that has used this much processor time since its last answer is in an endless loop.
 pub const BUSY_LIMIT: Duration = Duration::from_secs(30);
 /// A process that has used more than this part (1/n) of the time is busy. The threads of an idle rosmaster wake a
 /// hundred times a second and use 1/200 of the time, or 1/30 on a small computer.
@@ -33,11 +33,11 @@ pub struct Effort {
     pub on_disk: bool,
     /// Whether every thread was stopped, by SIGSTOP or a debugger.
     pub stopped: bool,
-    /// Processor time that they have used since they were started.
+    /// Processor time that the threads have used since they were started.
     pub ran: Duration,
-    /// Time that they have waited for the processor. The kernel adds a wait when it ends.
+    /// Time that the threads have waited for the processor. The kernel adds a wait when it ends.
     pub waited: Duration,
-    /// Number of times they were given the processor.
+    /// Number of times that the threads were given the processor.
     pub turns: u64,
 }
 
@@ -56,7 +56,7 @@ pub struct Sample {
 pub enum SilenceVerdict {
     /// The master hangs, or the system does not show what it does.
     Hung,
-    /// There is no proof that the master hangs, for this reason.
+    /// There is no proof that the master hangs. The text says why.
     Unproved(&'static str),
     /// The master has not been watched for long enough.
     Unknown,
@@ -110,7 +110,8 @@ impl Evidence {
     }
 
     /// Judges a master that was silent during all samples. A master that has used the processor for `busy_limit`
-    /// without an answer hangs. After a verdict without proof, only the last sample and later ones are judged.
+    /// without an answer hangs. After any verdict but [`SilenceVerdict::Unknown`], the next judgement uses only the
+    /// last sample and later ones.
     pub fn judge(&mut self, busy_limit: Duration) -> SilenceVerdict {
         let verdict = self.verdict(busy_limit);
         if verdict != SilenceVerdict::Unknown
@@ -184,7 +185,7 @@ mod tests {
     fn idle(at: u64) -> (Effort, Duration) {
         let effort = Effort {
             ran: Duration::from_secs(1) + ms(at) / 200,
-            // It wakes a hundred times a second.
+            // An idle rosmaster wakes a hundred times a second.
             turns: at / 10,
             waited: Duration::from_secs(1) + ms(at) / 20,
             ..Effort::default()
@@ -223,7 +224,7 @@ mod tests {
             effort.ran = ms(7);
         };
         assert_eq!(verdict(|_, effort, _| stop(effort)), SilenceVerdict::Hung);
-        // This holds however much processor time rosrescue gets.
+        // A stopped master hangs, however little processor time rosrescue gets.
         let starved = |at: u64, effort: &mut Effort, own: &mut Duration| {
             stop(effort);
             *own = ms(at);

@@ -5,19 +5,19 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// How long a false alarm counts.
+/// How long a false alarm counts. In a false alarm the mirror has stood in for a master that was only late.
 const MEMORY: Duration = Duration::from_secs(60);
 /// Number of false alarms within [`MEMORY`] that change nothing. Each further one doubles the patience.
 const FREE: usize = 5;
 /// The longest patience.
 const LONGEST: Duration = Duration::from_secs(10);
-/// Shortest time that a write waits, however long the master has been silent. It may be about to
-/// answer a slow read. A rosmaster answers within a millisecond, or within some ten behind a call
-/// that keeps its interpreter busy.
+/// Shortest time that a write waits, however long the master has been silent. The master may be about to answer a slow
+/// read. A rosmaster answers within a millisecond, or within about ten milliseconds if another call keeps its
+/// interpreter busy.
 const CHANCE: Duration = Duration::from_millis(20);
 
 /// How long writes wait for a slow master. The time grows when the mirror often stands in for a master that was only
-/// late, and shrinks when those times are a minute old.
+/// late. It shrinks again a minute later.
 #[derive(Clone, Debug)]
 pub struct Patience {
     base: Duration,

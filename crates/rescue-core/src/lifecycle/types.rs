@@ -20,7 +20,7 @@ pub struct Probing {
     pub count: u32,
     /// How long a write waits for the master before the mirror answers it.
     pub patience: Duration,
-    /// How long a new master may take to listen without making progress.
+    /// How long a new master that makes no progress may take until it listens.
     pub start_limit: Duration,
 }
 
@@ -29,14 +29,14 @@ pub struct Probing {
 pub enum Input {
     /// rosrescue starts.
     Start {
-        /// Whether a master of an earlier rosrescue still runs. Its end is reported like that of a
-        /// child.
+        /// Whether a master of an earlier rosrescue still runs. Its end is reported as [`Input::Exited`], as if this
+        /// rosrescue had started it.
         left: bool,
         /// Whether the mirror comes from a checkpoint whose session continues.
         restored: bool,
     },
-    /// The examined master has answered and is being brought to the mirror's state. If it ends now,
-    /// that counts as another death.
+    /// The examined master has answered and is being brought to the mirror's state. If the master ends now, that counts
+    /// as another death.
     Answered,
     /// A connection to the master has been made.
     Connected,
@@ -48,9 +48,9 @@ pub enum Input {
     Unreachable,
     /// The connection to the master has ended.
     ConnectionLost,
-    /// A thread of the master has ended, as all do when it is killed.
+    /// A thread of the master has ended, as all its threads do when the master is killed.
     ThreadEnded,
-    /// A batch of writes got no reply.
+    /// A batch of writes that went to the master got no reply.
     BatchLost,
     /// The master takes too long to answer a call.
     Slow,
@@ -59,7 +59,7 @@ pub enum Input {
     Late,
     /// The master has answered the calls that were outstanding when it was [late](Self::Late).
     LateAnswered,
-    /// The late master has got the writes that the mirror answered meanwhile.
+    /// The late master has got the writes that the mirror answered in its place.
     CaughtUp,
     /// The late master could not get the writes that it missed.
     NotCaughtUp,
@@ -120,8 +120,9 @@ impl Cause {
     }
 }
 
-/// An action that the shell must carry out, in order. A new `Connect`, `Examine` or `CatchUp` cancels the present step.
-/// A `Probe` does not.
+/// An action that the caller of [`Lifecycle::on`](super::Lifecycle::on) must carry out. Actions are carried out in
+/// order. A new `Connect`, `Examine` or `CatchUp` cancels the one of these that is still running, or a running `Probe`.
+/// A `Probe` cancels nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or `Unreachable`.
@@ -133,7 +134,7 @@ pub enum Action {
     ShutGate(Cause),
     /// Let the mirror answer until the master has answered its outstanding calls. Result: `LateAnswered`.
     StandIn,
-    /// Send the late master the writes that the mirror has answered meanwhile. Results: `CaughtUp` or `NotCaughtUp`.
+    /// Send the late master the writes that the mirror has answered in its place. Results: `CaughtUp` or `NotCaughtUp`.
     CatchUp,
     /// Open the gate: let calls pass.
     OpenGate,

@@ -9,14 +9,14 @@ use std::{
 use super::Subject;
 use crate::{health::port_of, master::Master, xmlrpc::Call};
 
-/// If more notifications than this wait for a node, it is told each subject only once, with the state at the time of
-/// sending.
+/// If more notifications than this wait for a node, the node is told each subject only once, with the state at the time
+/// of sending.
 const QUEUE_MAX: usize = 256;
 
 /// What to do next for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NextNotification {
-    /// Send `call`, then report it by [`taken`](super::Order::taken).
+    /// Send `call`, then pass `number` to [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
     /// Ask again when something has changed, or at `until` at the latest.
     Wait { until: Option<Instant> },
@@ -105,7 +105,7 @@ impl Outbox {
         self.ports.get_mut(port)?.pop_front()
     }
 
-    /// The call to make to `port` for `notification`. `None` if the node there is no longer concerned.
+    /// The call to make to `port` for `notification`. `None` if the node there no longer subscribes to the subject.
     pub(super) fn call(
         &mut self,
         port: &str,
@@ -116,7 +116,8 @@ impl Outbox {
         if let Payload::Call(call) = content {
             return Some(call);
         }
-        // Waiting notifications about the same subject are older than the present state.
+        // Waiting notifications about the same subject are older than the present state, so they are dropped. Those
+        // about keys above or below a parameter get the present state.
         let queue = self.ports.get_mut(port)?;
         renew(queue, |other| other.concerns(&subject));
         queue.retain(|other| other.subject != subject);
@@ -130,7 +131,7 @@ impl Outbox {
         }
     }
 
-    /// Like [`Self::renew`], for all ports.
+    /// Replaces, for each port, the notifications about `subject` by one with the state at the time of sending.
     pub(super) fn renew_all(&mut self, subject: &Subject) {
         for queue in self.ports.values_mut() {
             renew(queue, |other| other.concerns(subject));
@@ -138,7 +139,8 @@ impl Outbox {
     }
 }
 
-/// Replaces the notifications about each accepted subject by a single one with the state at the time of sending.
+/// Replaces the notifications about each subject that `is_it` accepts by a single one with the state at the time of
+/// sending.
 fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     let is_old = |it: &Notification| !it.is_state() && is_it(&it.subject);
     if !queue.iter().any(is_old) {
@@ -153,7 +155,7 @@ fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     });
 }
 
-/// The call that tells the node at `port` the state of `subject`. `None` if the node does not subscribe to it.
+/// The call that tells the node at `port` the state of `subject`. `None` if the node does not subscribe to `subject`.
 fn state(mirror: &Master, port: &str, subject: &Subject) -> Option<Arc<Call>> {
     let at = |api: &str| port_of(api) == port;
     match subject {

@@ -10,7 +10,8 @@ use crate::{
 pub enum Subject {
     /// The publishers of a topic, given by its resolved name.
     Topic(String),
-    /// A parameter, by its resolved key, which ends in a slash. News about it also concerns the keys above and below.
+    /// A parameter, by its resolved key, which ends in a slash. News about a parameter also concerns the keys above and
+    /// below.
     Param(String),
     /// A node's own name. A node is shut down when another node takes its name.
     Name(String),
@@ -36,7 +37,7 @@ pub struct Heard {
     pub subject: Subject,
 }
 
-/// The subjects of a write, and what it may tell nodes about them.
+/// The subjects of a write: those about which nodes may be notified, and those about which its answer tells the caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
     /// The subjects about which the master may notify nodes because of the write.
@@ -108,7 +109,8 @@ impl Concern {
         self.anything
     }
 
-    /// For a subject that is a name, the caller's port: a call never shuts its own node down.
+    /// If `subject` is a name, the port of the caller, which need not wait because a call never shuts its own node
+    /// down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),

@@ -165,7 +165,7 @@ fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
         lists.push(update.params[2].clone());
         order.notify(A, topic("/t"), update);
     }
-    // They are sent one by one, as a master would send them.
+    // The notifications are sent one by one, as a master would send them.
     let (first, number) = sent(order.next(now, A, &mirror));
     assert_eq!(first, lists[0]);
     order.taken(number);
@@ -232,7 +232,7 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     order.taken(number);
     assert_eq!(order.next(later, A, &mirror), NextNotification::Idle);
     // After the master's death, rosrescue's notification is sent at once. It is repeated, because the node may read the
-    // master's later.
+    // master's notification later.
     order.told_by_master(later, &topic("/t"), 1);
     order.notify(A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
     let (_, number) = sent(order.next(later, A, &mirror));

@@ -27,13 +27,13 @@ pub(super) enum DeliveryKind {
 struct Entry {
     kind: DeliveryKind,
     heard: Vec<Heard>,
-    /// Until when it delays others. `None` if there is no limit yet.
+    /// Until when this answer or notification delays others. `None` if there is no limit yet.
     limit: Option<Instant>,
     written: Option<Instant>,
 }
 
 impl Entry {
-    /// Whether it delays others, and until when.
+    /// Whether this answer or notification delays others, and until when.
     fn delays(&self, now: Instant) -> Option<MustWait> {
         let delays = self.written.is_none() && self.limit.is_none_or(|limit| now < limit);
         delays.then_some(MustWait { until: self.limit })

@@ -17,12 +17,12 @@ pub struct Answered<'a> {
 }
 
 impl Answered<'_> {
-    /// Whether the mirror's answer to the same call shows that both have the same state and return the same value. Two
-    /// refusals agree, whatever their text.
+    /// Whether `mirror`, the mirror's answer to the same call, shows that mirror and master have the same state and
+    /// return the same value. Two refusals agree, whatever their text.
     ///
-    /// `live` says that the same request may have written parameters later. A `subscribeParam` may then return the
-    /// later values: rosmaster encodes its own dictionary after all calls have run. By then a value that could not be
-    /// encoded may have been replaced as well.
+    /// `live` says that later entries of the same multicall may have written parameters. If so, a `subscribeParam` may
+    /// return the later values, because rosmaster encodes its own dictionary after all entries have run. A value that
+    /// cannot be encoded may also have been replaced by then.
     pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
@@ -54,8 +54,8 @@ pub struct Accepted<'a> {
 /// with an error: to a `setParam` whose callbacks cannot be computed, and to a `subscribeParam` of a value that cannot
 /// be returned.
 ///
-/// A multicall that fails as a whole has run up to the entry that failed. For it, this returns what `mirror`, the state
-/// before the call, would have accepted, and marks the result as not certain.
+/// A multicall that fails as a whole has run up to the entry that failed. For such a multicall, this function returns
+/// the writes that `mirror`, the state before the call, would have executed, and marks the result as not certain.
 pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accepted<'a> {
     let mut walk = Walk {
         mirror,
@@ -180,7 +180,7 @@ fn executed(method: &Method, reply: &Reply) -> Option<bool> {
 
 /// Whether a fault concerns the encoding of the reply, instead of the decoding of the call.
 pub(super) fn is_write_error(text: &str) -> bool {
-    // Python 3 and Python 2.
+    // The first form is from Python 3, the second from Python 2.
     let mut prefixes = ["<class '", "<type 'exceptions."].into_iter();
     let class = prefixes.find_map(|prefix| text.strip_prefix(prefix));
     let classes = [

@@ -1,4 +1,4 @@
-//! Reads the state of a master without knowing anything about it.
+//! Reads the state of an unknown master with two requests.
 
 use std::collections::HashSet;
 
@@ -15,7 +15,7 @@ use crate::xmlrpc::{Reply, Struct, Value};
 pub enum NotAMaster {
     /// The whole inspection was answered with a fault.
     #[error(
-        "the request for its state was answered with a fault, `{text}`: this is not a rosmaster, or it is failing"
+        "the server answered the request for the master's state with a fault, `{text}`: it is not a rosmaster, or it is failing"
     )]
     Fault { text: String },
     /// The parameters cannot be read, because one of them cannot be returned. Inspect again with
@@ -46,7 +46,7 @@ pub struct Inspection {
 }
 
 impl Inspection {
-    /// The inspection of a new rosmaster, process `pid`, which is empty.
+    /// The inspection of a new rosmaster with the process id `pid`, which is known to be empty.
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
@@ -59,7 +59,8 @@ impl Inspection {
         }
     }
 
-    /// Reorders everything that `mirror` also has as in the mirror. For a master with unordered dictionaries.
+    /// Puts everything that `mirror` also has into the mirror's order. Needed for a master with unordered dictionaries,
+    /// as on Python 2.
     pub fn arrange_like(&mut self, mirror: &Master) {
         let registry = mirror.registry();
         order::arrange(&mut self.publishers, &registry.publishers);
@@ -99,7 +100,7 @@ impl Inspection {
         ]
     }
 
-    /// Decodes the reply to either of the first requests, made with the same `token`.
+    /// Decodes the reply to [`Self::call`] or [`Self::call_without_params`], made with the same `token`.
     ///
     /// # Errors
     ///
@@ -186,7 +187,7 @@ impl Inspection {
     }
 
     /// The second request, which asks for all addresses: `lookupNode` of each node of the inspection or of `previous`,
-    /// and `lookupService` of each service. `None` if there are neither.
+    /// and `lookupService` of each service. `None` if there are no nodes and no services.
     pub fn second_call(&self, previous: &Master) -> Option<Request> {
         let nodes = self.nodes(previous).into_iter();
         let nodes = nodes.filter_map(|node| lookup(Method::LookupNode, node));
@@ -199,9 +200,9 @@ impl Inspection {
 
     /// Builds a model of the master's state.
     ///
-    /// What a master does not show is taken from `previous`, for nodes whose address is the same: parameter
-    /// subscriptions, references to nodes whose services were taken over, and the parameters if they cannot be read.
-    /// Anything that vanished between the two requests is left out.
+    /// Takes what a master does not show from `previous`, for nodes whose address is the same: parameter subscriptions,
+    /// references to nodes whose services were taken over, and the parameters if they cannot be read. Anything that
+    /// vanished between the two requests is left out.
     ///
     /// # Errors
     ///
@@ -279,8 +280,8 @@ impl Inspection {
     }
 }
 
-/// Explains nodes without a registration: adds the taken-over services because of which the master still knows them.
-/// Drops a node without such a service.
+/// Adds to each node the services that other nodes have taken over from it, because a master still knows a node that
+/// has nothing else. Drops a node that has neither a registration nor a service that was taken over.
 fn keep_references(found: &mut Snapshot, previous: &Master) {
     let shared = [
         &found.publishers,
@@ -305,8 +306,8 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
             };
             let known = previous.taken_over(caller_id, before).filter(lost);
             node.taken_over_services = known.cloned().collect();
-            // The master knows a node without a registration, so another node has taken over one of its services
-            // meanwhile.
+            // The master knows this node although it has no registration, so another node has taken over one of its
+            // services since `previous`.
             if node.taken_over_services.is_empty() && !held.contains(caller_id) {
                 let lost = before.services.iter().filter(lost);
                 node.taken_over_services = lost.cloned().collect();
@@ -316,7 +317,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
     });
 }
 
-/// The registrations of these nodes, without lists that would be empty.
+/// The registrations of the nodes that `of` accepts, without lists that would be empty.
 fn only(
     registrations: IndexMap<String, Vec<String>>,
     of: impl Fn(&str) -> bool,
@@ -328,7 +329,7 @@ fn only(
     lists.collect()
 }
 
-/// A lookup of `name`. `None` if no call can name it.
+/// A call of `method` that looks up `name`. `None` if no call can name it.
 pub(super) fn lookup(method: Method, name: &str) -> Option<Request> {
     let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
     Some(Request::new(method, [caller_id, name]))

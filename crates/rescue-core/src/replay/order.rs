@@ -5,13 +5,13 @@ use indexmap::IndexMap;
 
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Reorders `found` as in `known`. Whatever only `found` has comes last, in its own order.
+/// Puts `found` into the order of `known`. Whatever only `found` has comes last, in its own order.
 pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<String, B>) {
     let place = |key: &str| known.get_index_of(key).unwrap_or(usize::MAX);
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
-/// Like [`arrange`], including nested structs, also those in lists.
+/// Like [`arrange`], but also orders the structs inside `found`, including those in lists.
 pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;
@@ -44,7 +44,8 @@ pub(super) fn are_alike(a: &Reply, b: &Reply) -> bool {
     }
 }
 
-/// `value` with the members of its structs sorted. With `lists`, lists of the form `[name, …]` are sorted as well.
+/// `value` with the members of its structs sorted. With `lists`, lists whose elements all have the form `[name, …]` are
+/// sorted by name as well.
 pub(super) fn sorted(value: &Value, lists: bool) -> Value {
     match value {
         Value::Struct(members) => {

@@ -18,31 +18,31 @@ const MISMATCHES_MAX: usize = 20;
 /// # Order
 ///
 /// 1. One `setParam('/', tree)`. Parameters come before their subscribers, so these are not notified.
-/// 2. Publishers, before there are subscribers to notify. Some topic types are set by a helper that
-///    subscribes and unsubscribes at once: types of topics without publishers and subscribers, and types that
-///    the order of the calls would put too late in `getTopicTypes`. There are only as many of these as the
-///    order requires.
+/// 2. Publishers, before there are subscribers to notify. Some topic types are set by a helper that subscribes and
+///    unsubscribes at once: types of topics without publishers and subscribers, and types that the order of the calls
+///    would put too late in `getTopicTypes`. The plan sets no more types in this way than the order requires.
 /// 3. Services, each after the nodes that provided it before.
 /// 4. Subscribers, then subscribers of parameters.
-/// 5. Reads of everything, for [`Plan::verify`]. Addresses are read back only where the master had one
-///    before: a successful registration has the address of its call, and reading all addresses would take a
-///    tenth of the injection's time.
-/// 6. The token: a master that bears it has been brought to the whole state.
+/// 5. Reads of everything, for [`Plan::verify`]. Addresses are read back only where the master had one before. The
+///    other addresses are certain, because a successful registration has the address of its call. Reading all addresses
+///    would take a tenth of the injection's time.
+/// 6. The token: a master that has it has been brought to the whole state.
 ///
-/// An empty master sends no callback because of this call, and afterwards answers every read as before.
+/// An empty master sends no callback because of this call, and afterwards answers every read as the old master did.
 ///
 /// # A master that is not empty
 ///
-/// What it holds is newer and stays. A node that has another address there is left out, so that the master
-/// shuts no node down, and so is a service that has a provider there. Parameters are merged, and the target's
-/// values win. If the new master already has subscribers of a topic that lacks several publishers, they are
-/// unregistered first and registered again just before the last publisher. So they are notified once, with
-/// the complete list; each partial list would make a roscpp node drop live connections.
+/// What such a master holds is newer than the target, and stays. The plan leaves out a node that has another address in
+/// the master, so that the master shuts no node down. It also leaves out a service that has a provider in the master.
+/// Parameters are merged, and the target's values win. If the new master already has subscribers of a topic that lacks
+/// several publishers, the plan unregisters these subscribers first and registers them again just before the last
+/// publisher. So they are notified once, with the complete list. A partial list would make a roscpp node drop live
+/// connections.
 ///
 /// # Memory
 ///
-/// Call and answer are built as text. As values those of a thousand nodes would take ten times as much
-/// memory, and the C library keeps most of the memory of so many small allocations.
+/// The call and its answer are built as text. For a thousand nodes, values would take ten times as much memory. The C
+/// library would keep most of that memory, because it consists of many small allocations.
 ///
 /// # Example
 ///
@@ -63,7 +63,7 @@ const MISMATCHES_MAX: usize = 20;
 #[derive(Clone, Debug)]
 pub struct Plan {
     request: Bytes,
-    /// The answer's body that a rosmaster is expected to send.
+    /// The body of the answer that a rosmaster is expected to send.
     answer: Bytes,
     expected: Master,
     skipped: Vec<Skipped>,
@@ -75,9 +75,9 @@ pub enum Skipped {
     /// The node has another address in the new master.
     Node {
         caller_id: String,
-        /// Its address in the restored state.
+        /// The node's address in the restored state.
         api: String,
-        /// Its address in the new master, which stays.
+        /// The node's address in the new master, which stays.
         found_api: String,
     },
     /// The service has another provider in the new master.
@@ -119,7 +119,7 @@ impl fmt::Display for Skipped {
             ),
             Self::Reference { caller_id, service } => write!(
                 f,
-                "the reference of `{caller_id}` by the service `{service}` that it lost: the new \
+                "the reference to `{caller_id}`, which has lost the service `{service}`: the new \
                  master has that service"
             ),
             Self::Type { topic } => write!(
@@ -168,7 +168,8 @@ impl Plan {
         })
     }
 
-    /// Writes the calls. With `empties`, everything is removed first.
+    /// Plans the calls that bring a master from `found` to `target`. With `empties`, the first calls remove everything
+    /// that the master holds.
     fn write(
         target: &Master,
         found: &Master,
@@ -206,7 +207,8 @@ impl Plan {
             request.push(&call.into_entry());
             answer.push(&reply_entry(predicted));
         };
-        // A token is not part of the mirror: it is a subscription to a key that is not set.
+        // A token is not part of the mirror. It subscribes to a key that is not set, so an empty model predicts the
+        // right answer.
         let aside = |call: Request| {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
@@ -242,7 +244,7 @@ impl Plan {
         &self.answer
     }
 
-    /// The state of the master afterwards, without the token.
+    /// The state of the master after the call, without the token.
     pub fn expected(&self) -> &Master {
         &self.expected
     }
@@ -262,7 +264,8 @@ impl Plan {
         self.verify_by(reply, true)
     }
 
-    /// Like [`Self::verify`], for a master with unordered dictionaries.
+    /// Like [`Self::verify`], but also accepts answers that differ only in the order of names and struct members. A
+    /// master with unordered dictionaries gives such answers.
     ///
     /// # Errors
     ///
@@ -309,8 +312,8 @@ impl Plan {
     }
 }
 
-/// Reads that show everything that a master in the target state can show. Leaves out addresses that the same call has
-/// set.
+/// The reads that check the whole target state. Looks up only addresses that the master had before, because the others
+/// are set by the plan itself.
 fn reads(model: &Master, found: &Master) -> Vec<Request> {
     let own = |method| Request::new(method, [CALLER_ID]);
     let mut calls = vec![own(Method::GetSystemState), own(Method::GetTopicTypes)];

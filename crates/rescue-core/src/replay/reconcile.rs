@@ -1,4 +1,5 @@
-//! Computes the state for a master that could not be reached and is back.
+//! Computes the state for a master that could not be reached for a while and has missed writes. The *present
+//! incarnation* is the master process whose token has the latest number that rosrescue knows.
 
 use super::{Token, restore};
 use crate::master::{Master, Method, Request, names};
@@ -7,8 +8,8 @@ use crate::xmlrpc::Value;
 /// Which side wins where the mirror and a master of the present incarnation differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
-    /// The mirror wins only where it has answered writes since mirror and master were last equal. All other differences
-    /// are newer in the master: they were written to it directly, or the checkpoint lacks them.
+    /// The mirror wins only where it has answered writes since mirror and master were last equal. Everywhere else the
+    /// master wins, because its state is newer: clients wrote to it directly, or the checkpoint lacks the last writes.
     PendingWrites,
     /// The mirror wins wherever it has an entry, because the master got the mirror's state and has not confirmed it.
     Mirror,
@@ -37,12 +38,12 @@ pub fn reconcile(
     target
 }
 
-/// The part of the present incarnation's state that cannot be read back: the parameter subscriptions in `mirror`, and
-/// those that a pending write removes.
+/// What a master of the present incarnation may hold although no read shows it: the parameter subscriptions in
+/// `mirror`, and those that a pending write removes. Returns `mirror` with the removed ones added again.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        // A node with another address by now has no earlier subscriptions left.
+        // A node that has another address by now has lost its earlier subscriptions.
         let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
         if *call.method() == Method::UnsubscribeParam
             && known.is_none_or(|known| call.text(1) == Some(known))

@@ -9,8 +9,8 @@ use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, returnable};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Generates the calls that change state and passes each, with its predicted answer, to `write`. Afterwards
-/// `model` is the state of the master.
+/// Generates the calls that change state and passes each, with its predicted answer, to `write`. Afterwards `model` has
+/// the state that the master will have.
 pub(super) struct Restore<'a, W> {
     write: W,
     /// Number of calls so far.
@@ -24,7 +24,8 @@ pub(super) struct Restore<'a, W> {
     /// Whether the new master's list of topic types is a prefix of the target's. If not, the order of the target's
     /// types cannot be restored.
     ordered: bool,
-    /// Whether the target's topic types win over those of the new master. Then the new master has no registrations.
+    /// Whether the target's topic types win over those of the new master. This requires that the new master has no
+    /// registrations.
     types_win: bool,
 }
 
@@ -70,7 +71,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
         let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
-            // There is nothing to set. So even parameters that a master cannot return stay.
+            // There is nothing to set, so even parameters that a master cannot return stay.
             return;
         }
         let (tree, left_out) = returnable::writable(whole);
@@ -287,7 +288,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         true
     }
 
-    /// Registers a service for the nodes that provided it before.
+    /// Registers `service` for `losers`, the nodes from which other nodes have taken it over.
     fn lose(&mut self, service: &str, losers: &[&str]) {
         for caller_id in losers {
             let Some(api) = self.api(caller_id) else {
@@ -305,7 +306,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Like [`Self::lose`], for a service without a provider. At the end a helper registers and unregisters it.
+    /// Registers `service`, which has no provider now, for `losers`, the nodes that have lost it. Then a helper, a
+    /// caller id that no node has, takes the service over and unregisters it.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
@@ -349,7 +351,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the types that come before the type of the topic to be registered.
+    /// Adds the target's topic types that come before the type of `topic`, which is about to be registered.
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
             && !self.model.topic_types().contains_key(topic)
@@ -359,8 +361,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the types `*` of topics without publishers. Only a publisher can set them, and it must register before the
-    /// subscribers, which would be notified of it.
+    /// Adds the types `*` of topics without publishers. Only the registration of a publisher can set such a type. It
+    /// must come before the registrations of subscribers, because these would be notified of the publisher.
     fn star_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -371,8 +373,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Corrects the types of topics without publishers. Only a publisher can do that, and it must register before the
-    /// subscribers, which would be notified of it.
+    /// Corrects the types of topics without publishers. Only the registration of a publisher can change a type. It must
+    /// come before the registrations of subscribers, because these would be notified of the publisher.
     fn changed_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -412,7 +414,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
-            // This is repeated at the end, but listed once.
+            // This function runs for the topic a second time at the end, but the topic is listed once.
             if !self.skipped.contains(&skipped) {
                 self.skipped.push(skipped);
             }

@@ -1,4 +1,5 @@
-//! The incarnation token, which rosrescue leaves in a master to recognise that process later.
+//! The token that rosrescue leaves in a master to recognise that process later. An *incarnation* is one life of a
+//! master process. rosrescue numbers the incarnations.
 
 use crate::{
     master::{self, Method, Request},
@@ -14,13 +15,13 @@ pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
 /// Identifies an incarnation of a master.
 ///
-/// In the master it is two parameter subscriptions by unique caller ids: one contains the id of the session,
-/// the other one the id and the number of the incarnation. The address of the first one ends in that number
-/// too, so that a rosrescue with an older checkpoint can read it. A master with another number was ours
-/// before, or is newer than the checkpoint.
+/// In the master, a token is two parameter subscriptions with unique caller ids. The first caller id contains the id of
+/// the session. The second contains the id and the number of the incarnation. The address of the first subscription
+/// ends in the number too, so that a rosrescue with an older checkpoint can read the number. A master with a lower
+/// number is an earlier incarnation. A master with a higher number is newer than the checkpoint.
 ///
-/// Each subscription makes a reference to a node that only `lookupNode` finds: it has no registration,
-/// parameter or topic type that another read could show. The key is outside the tree that starts at `/`, so
+/// Each subscription makes a reference to a node that only `lookupNode` finds: this node has no registration, parameter
+/// or topic type that another read could show. The key of the subscription is outside the tree that starts at `/`, so
 /// no `setParam` or `deleteParam` of `/` or below ever queues a callback to it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Token {
@@ -29,16 +30,16 @@ pub struct Token {
     number: u64,
 }
 
-/// The token that a master has, compared with that of the present incarnation.
+/// The token that a master has, compared with the token of the latest incarnation that rosrescue knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bears {
-    /// The token of the present incarnation: the master has the whole state.
+    /// The token of the latest incarnation that rosrescue knows, so this master has got the whole state.
     Present,
-    /// The token of an earlier incarnation of the session.
+    /// The token of an earlier incarnation in this session.
     Earlier,
-    /// The token of a later incarnation of the session, with its number.
+    /// The token of a later incarnation in this session, with its number.
     Later(u64),
-    /// No token of the session.
+    /// The master has no token of this session.
     Nothing,
 }
 

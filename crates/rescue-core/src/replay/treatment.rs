@@ -7,14 +7,16 @@ use super::{Authority, Bears};
 pub enum KnownMaster {
     /// Nothing is known.
     Nothing,
-    /// If the master has the token, this process has already let calls pass to it.
+    /// If the master has the token of the latest incarnation, this rosrescue has already let calls pass to the master.
     ServedIfPresent,
-    /// If the master has the token, the state was injected but not confirmed.
+    /// If the master has the token of the latest incarnation, rosrescue has injected the state, but got no
+    /// confirmation.
     InjectedIfPresent,
-    /// This process has just started the master on a free loopback port, as the successor of a master that it served.
-    /// So it is empty, and is not read before the injection. Reading it afterwards would show if it was not empty.
+    /// This rosrescue has just started the master on a free loopback port, as the successor of another master. So the
+    /// master is empty, and rosrescue does not read it before the injection. The reads of the injection would show if
+    /// the master was not empty.
     New {
-        /// Its process id.
+        /// The process id of the master.
         pid: i32,
     },
 }
@@ -50,10 +52,10 @@ pub fn treatment(
         (Bears::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::TakeOver,
         // A later incarnation has been served, so the mirror is newer than everything in this master.
         (Bears::Earlier, _) => Treatment::Replace,
-        // The checkpoint is older than this master, or another rosrescue has a copy of it.
+        // The checkpoint is older than this master, or another rosrescue has a copy of the checkpoint.
         (Bears::Later(_), KnownMaster::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
         (Bears::Later(_), _) => Treatment::Replace,
-        // It has run all writes of the checkpoint that are not pending, and perhaps more.
+        // This master has run all writes of the checkpoint that are not pending, and perhaps more.
         (Bears::Present, KnownMaster::Nothing | KnownMaster::ServedIfPresent) => {
             Treatment::Reconcile(Authority::PendingWrites)
         }

@@ -13,9 +13,10 @@ pub(crate) type MethodResult = Result<(i32, String, Value), Failure>;
 pub(crate) enum Failure {
     /// A check refused a parameter. The text is the message of the answer.
     Refused(String),
-    /// rosmaster raises a `TypeError`, which it answers with code -1. The text is not rosmaster's.
+    /// rosmaster raises a `TypeError`, which it answers with code -1. The text differs from rosmaster's.
     Type(&'static str),
-    /// rosmaster raises another exception, which it answers with code 0. The text is not rosmaster's.
+    /// rosmaster raises an exception other than `TypeError`, which it answers with code 0. The text differs from
+    /// rosmaster's.
     Internal(&'static str),
 }
 
@@ -45,7 +46,8 @@ struct Spec {
 
 const MULTICALL: &str = "system.multicall";
 
-/// The public attributes of `ROSMasterHandler` with their Python types. rosmaster also treats their names as methods.
+/// The public attributes of rosmaster's `ROSMasterHandler` with their Python types. rosmaster also tries to call an
+/// attribute if a client uses its name as a method.
 const ATTRIBUTES: [(&str, &str); 11] = [
     ("done", "bool"),
     ("param_server", "ParamDictionary"),
@@ -136,7 +138,8 @@ impl fmt::Display for Method {
 }
 
 impl Method {
-    /// The kind of this method. [`Kind::Unknown`] for a multicall, whose entries decide.
+    /// The kind of this method. [`Kind::Unknown`] for a multicall, because the kind of a multicall depends on its
+    /// entries.
     pub(crate) fn kind(&self) -> Kind {
         self.spec().map_or(Kind::Unknown, |spec| spec.kind)
     }
@@ -154,14 +157,14 @@ pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Applied {
     pub reply: Reply,
-    /// The callbacks, in the order in which the master queues them. It sends callbacks to one address one after the
-    /// other, and to different addresses at the same time.
+    /// The callbacks, in the order in which the master queues them. rosmaster sends callbacks to one address one after
+    /// the other, and callbacks to different addresses at the same time.
     pub notices: Vec<Notice>,
 }
 
 impl Master {
-    /// Answers `request` and changes the state as rosmaster does. `shutdown` is answered but changes nothing.
-    /// Only the texts of errors that no ROS client causes are our own.
+    /// Answers `request` and changes the state as rosmaster does. `shutdown` is answered but changes nothing. Only
+    /// errors that no ROS client causes have other texts than in rosmaster.
     ///
     /// ```
     /// use ros1_master::master::{Master, Method, Notice, Request, is_success};
@@ -181,7 +184,8 @@ impl Master {
         Applied { reply, notices }
     }
 
-    /// Like [`Master::apply`], but passes the callbacks to `notices`, which can avoid copies.
+    /// Like [`Master::apply`], but passes the callbacks to `notices` instead of returning them. So `notices` can avoid
+    /// copies.
     pub fn apply_telling(&mut self, request: &Request, notices: &mut dyn NoticeSink) -> Reply {
         let result = match request.method() {
             Method::Multicall => self.run_multicall(request.entries(), notices),
@@ -196,8 +200,8 @@ impl Master {
         }
     }
 
-    /// The result of a read, if rosmaster would give the same result byte for byte. `None` for any other call, and if
-    /// rosmaster's text may differ.
+    /// The result of a read, if rosmaster would give the same result byte for byte. `None` if rosmaster's result may
+    /// differ, and for a call that is not a read.
     pub fn exact_answer(&mut self, read: &Request) -> Option<Value> {
         if self.is_inexact() {
             return None;
@@ -218,14 +222,14 @@ impl Master {
             .validate_and_run(spec, read.params(), &mut ())
             .ok()
             .filter(|(_, _, value)| *value != Value::Nil)?;
-        // A node that only subscribes to parameters may have registered without rosrescue's knowledge. No other read
-        // shows such a node.
+        // A node that only subscribes to parameters may have registered without rosrescue's knowledge. Only
+        // `lookupNode` shows such a node.
         let hidden = *read.method() == Method::LookupNode && code != 1;
         let in_some_order = self.unordered && shows_order(read.method(), &value);
         (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
-    /// Answers any method except a multicall. The error is the text of a fault.
+    /// Answers any call except a multicall. The error is the text of a fault.
     pub(crate) fn dispatch(
         &mut self,
         request: &Request,
@@ -256,7 +260,7 @@ impl Master {
         Ok(Value::Array(vec![code.into(), message.into(), value]))
     }
 
-    /// The text of the fault that answers a method that rosmaster does not have.
+    /// The text of the fault with which rosmaster answers an unknown method `name`.
     fn unsupported(&self, name: &str) -> String {
         let attribute = ATTRIBUTES.iter().find(|(attribute, _)| *attribute == name);
         let (class, text) = match attribute {
@@ -270,7 +274,7 @@ impl Master {
         }
     }
 
-    /// rosmaster's `apivalidate`.
+    /// Checks the number of parameters and the caller id, then runs the method, like rosmaster's `apivalidate`.
     fn validate_and_run(
         &mut self,
         spec: &Spec,
@@ -295,7 +299,7 @@ impl Master {
     }
 }
 
-/// Whether a method was answered with code 1, success.
+/// Whether `reply` is an answer of the Master API with code 1, success.
 pub fn is_success(reply: &Reply) -> bool {
     matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
 }
@@ -315,7 +319,7 @@ pub(crate) fn fault(text: &str) -> Reply {
     }
 }
 
-/// Whether the value of this read shows the order of a dictionary.
+/// Whether `value`, the result of the read `method`, shows the order of a dictionary's keys.
 fn shows_order(method: &Method, value: &Value) -> bool {
     match (method, value) {
         (Method::GetSystemState, Value::Array(lists)) => {

@@ -1,4 +1,4 @@
-//! The checks of parameters from `rosmaster/validators.py`, with the same messages.
+//! Checks the parameters of calls as `rosmaster/validators.py` does, with the same error messages.
 
 use super::api::Failure;
 use super::names;
@@ -67,8 +67,8 @@ pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<St
     }
 }
 
-/// rosmaster's `valid_type_name('topic_type')`. rosmaster also accepts a date whose text is `*`, and keeps it as a
-/// date. Here it becomes a string.
+/// rosmaster's `valid_type_name('topic_type')`. rosmaster also accepts a date whose text is `*`, and keeps the date.
+/// This function returns the date's text instead.
 pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     match value {
         Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),

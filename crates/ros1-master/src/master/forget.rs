@@ -2,14 +2,15 @@
 
 use super::{Master, Method, Request, names};
 
-/// The address under which a service is registered only to unregister it again.
+/// The address under which a node takes a service back, only to unregister it at once.
 const GONE_SERVICE: &str = "rosrpc://127.0.0.1:1";
 
 impl Master {
     /// The calls that make a master drop a node completely.
     ///
-    /// If another node has taken over a service of this node, rosmaster keeps a reference to the node. To remove it,
-    /// the node takes the service back and unregisters it. Then the other node's service is registered again.
+    /// If another node has taken over a service of this node, rosmaster keeps a reference to this node. To remove the
+    /// reference, the calls let this node take the service back and unregister it. Then they register the other node as
+    /// the provider again.
     pub fn forget_calls(&self, caller_id: &str) -> Vec<Request> {
         let mut calls = self.unregister_calls(caller_id);
         let Some(node) = self.registry.nodes.get(caller_id) else {
@@ -22,7 +23,7 @@ impl Master {
                 let params = [&entry.node, &name, &entry.api, self.api_of(&entry.node)?];
                 Some(Request::new(Method::RegisterService, params))
             });
-            // This is only possible if the service can be given back to the other node.
+            // Takes the service back only if it can be registered for the other node again afterwards.
             if let Some(name) = names::name_for(service, caller_id)
                 && again != Some(None)
             {

@@ -1,6 +1,6 @@
 //! The kinds of calls: reads, writes, and calls that only the master understands.
 
-/// The kind of a call. Its method decides; for a multicall its entries do.
+/// The kind of a call. It depends on the method, or for a multicall on the entries.
 ///
 /// ```text
 ///            Shutdown
@@ -14,9 +14,9 @@
 ///            Identity
 /// ```
 ///
-/// The kind of a multicall is the lowest kind that lies above those of all its entries, including nested
-/// ones. A call that unregisters something and also does something unknown must be recorded and must go to
-/// the master, so it is a `Mutate`.
+/// The kind of a multicall is the lowest kind in this diagram that equals or lies above the kind of every entry,
+/// including nested ones. For example, a multicall with an `Unregister` and an `Unknown` is a `Mutate`, because it must
+/// be recorded and must go to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
     /// `getPid` and `getUri`: ask about the master's process.
@@ -39,7 +39,7 @@ impl Kind {
         matches!(self, Self::Unregister | Self::Mutate)
     }
 
-    /// The lowest kind that lies above both.
+    /// The lowest kind that equals or lies above both kinds in the diagram at [`Kind`].
     #[must_use]
     pub fn join(self, other: Self) -> Self {
         match (self, other) {

@@ -245,7 +245,7 @@ impl Master {
         Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
     }
 
-    /// Queues the topic's list of publishers for its subscribers, and returns the addresses of the
+    /// Queues a `publisherUpdate` with the topic's publishers for each subscriber, and returns the addresses of the
     /// subscribers.
     fn notify_publishers(&self, topic: &str, notices: &mut dyn NoticeSink) -> Vec<String> {
         let subscribers = self.registry.apis(SharedRegistration::Subscribers, topic);
@@ -263,7 +263,8 @@ impl Master {
             checks::topic_type(topic_type)?,
             checks::api("caller_api", api)?,
         );
-        // This is a date, and rosmaster keeps it as a date.
+        // A type that passes the check and is not a string is a date. rosmaster keeps the date; this master keeps its
+        // text.
         self.inexact |= topic_type.as_str().is_none();
         Ok(params)
     }
@@ -274,7 +275,8 @@ fn pair(topic: &str, topic_type: &str) -> Value {
 }
 
 impl Master {
-    /// Tells a node whose name was taken to shut down.
+    /// Queues a `shutdown` for the node at the address `bumped`, if any, because another node has registered with the
+    /// same name `by`.
     fn notify_bumped(&self, by: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
         if let Some(to) = bumped {
             notices.shutdown(&to, &super::tell::bump_reason(by, self.old == Some(true)));

@@ -55,7 +55,7 @@ impl Master {
     }
 
     /// Whether the answers to all reads of a multicall fit into about `most` bytes of memory. Creates each answer and
-    /// drops it again. Other calls always fit.
+    /// drops it again. A call that is not a multicall always fits.
     pub fn fits(&mut self, request: &Request, mut most: usize) -> bool {
         if *request.method() != Method::Multicall {
             return true;
@@ -72,7 +72,8 @@ impl Master {
         })
     }
 
-    /// Notes where the result contains a dict of the parameter tree itself.
+    /// Notes where the result contains a dict of the parameter tree itself, because later entries may still change that
+    /// dict.
     fn watch(&mut self, request: &Request, result: Option<&Value>, at: &[usize]) {
         let (key, subscribes) = match request.method() {
             Method::GetParam => (request.text(1), false),
@@ -91,7 +92,7 @@ impl Master {
         if subscribes {
             key = names::param_key(&key);
         }
-        // For a key that is not set, `subscribeParam` returns a new dict.
+        // For a key that is not set, `subscribeParam` returns a new dict, which is not part of the tree.
         if self.params.has(&key) {
             let at = at.iter().copied().chain([2]).collect();
             self.params.watch(&key, at);
@@ -106,7 +107,7 @@ fn place<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
     })
 }
 
-/// A fault, as an entry of a multicall's result.
+/// Converts a fault to an entry of a multicall's result.
 fn fault_entry(text: String) -> Value {
     Value::Struct(Struct::from([
         ("faultCode".to_owned(), 1.into()),
@@ -114,7 +115,7 @@ fn fault_entry(text: String) -> Value {
     ]))
 }
 
-/// A reply, as an entry of a multicall's result.
+/// Converts a reply to an entry of a multicall's result.
 pub fn reply_entry(reply: Reply) -> Value {
     match reply {
         Reply::Value(value) => Value::Array(vec![value]),

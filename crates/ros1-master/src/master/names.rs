@@ -79,8 +79,8 @@ pub(crate) fn has_illegal_chars(name: &str) -> bool {
     name.contains([':', ' '])
 }
 
-/// A name that the master resolves to `key` for `caller_id`. There is one for every key that this caller has
-/// ever registered.
+/// A name that the master resolves to `key` in a call of `caller_id`. Such a name exists for every key that this caller
+/// has ever registered.
 pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
     let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
     if plain && canonicalize(key) == key {
@@ -91,7 +91,7 @@ pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
     })
 }
 
-/// Like [`name_for`], for the key of a parameter subscription.
+/// A name that the master resolves to `key`, the key of a parameter subscription, in a call of `caller_id`.
 pub fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
     let trimmed = if key == "/" {
         key

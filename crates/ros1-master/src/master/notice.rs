@@ -1,4 +1,4 @@
-//! The callbacks that a master sends to nodes.
+//! The callbacks (notifications) that a master sends to nodes.
 
 use crate::xmlrpc::{Call, Value};
 
@@ -39,7 +39,7 @@ impl Notice {
         }
     }
 
-    /// The call of the node's slave API.
+    /// The call of the node's slave API that carries this callback.
     pub fn call(&self) -> Call {
         match self {
             Self::PublisherUpdate {

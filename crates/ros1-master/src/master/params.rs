@@ -6,16 +6,16 @@ use super::registry::Registrations;
 use super::updates::{GONE, Update, updates};
 use crate::xmlrpc::{Struct, Value};
 
-/// Number of levels of the tree that are kept. rosmaster accepts any depth, through long keys or deep values, but
-/// returns at most 491 levels at once. Deeper parts are kept as nil, which limits recursion over the tree, including
-/// when it is dropped. rosmaster does return deeper parts for a key that leads close enough to them, but such parts
-/// could not be injected into another master anyway.
+/// Maximum number of levels of the parameter tree that are kept. Values below that become nil, which limits recursion
+/// over the tree, including when it is dropped. rosmaster accepts any depth, through long keys or deep values, but
+/// returns at most 491 levels at once. It does return deeper values for a key that leads close enough to them, but
+/// these values could not be restored in another master anyway.
 const DEEPEST_TREE: usize = 512;
 
 #[derive(Clone, Default)]
 pub(crate) struct Params {
     tree: Struct,
-    /// Whether anything below [`DEEPEST_TREE`] was left out.
+    /// Whether any value was too deep for [`DEEPEST_TREE`] and became nil.
     cut: bool,
     /// The results of the running multicall that are dicts of the tree itself; see [`Live`].
     live: Vec<Live>,
@@ -29,7 +29,7 @@ struct Live {
     /// The place of the dict in the multicall's result.
     at: Vec<usize>,
     path: Vec<String>,
-    /// The last value of the dict, once it was removed from the tree.
+    /// The value that the dict had when it was removed from the tree. `None` while it is in the tree.
     detached: Option<Value>,
 }
 
@@ -83,8 +83,8 @@ impl Params {
         Some(found)
     }
 
-    /// rosmaster's `set_param`, for a key with a trailing slash. The tree changes even if the updates cannot be
-    /// computed. The node `ignored` gets no updates.
+    /// rosmaster's `set_param`, for a key with a trailing slash. Returns the `paramUpdate`s to send. The tree changes
+    /// even if they cannot be computed. The node `ignored` gets none for `key` itself.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
@@ -106,7 +106,7 @@ impl Params {
         updates
     }
 
-    /// Sets a value and creates the namespaces on the way to it. Values that lie too deep become nil.
+    /// Sets a value and creates the namespaces on the way to it. Values below level [`DEEPEST_TREE`] become nil.
     pub(crate) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
         let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
@@ -148,7 +148,8 @@ impl Params {
             Some(Found::Tree(members) | Found::Value(Value::Struct(members))) => {
                 members.contains_key(*last)
             }
-            // Python's `in` finds a substring, or an element of a list, which then cannot be deleted.
+            // rosmaster uses Python's `in`, which also finds a substring of a string or an element of a list. Deleting
+            // it then raises a `TypeError`.
             Some(Found::Value(Value::String(text))) if !text.contains(*last) => false,
             Some(Found::Value(Value::Array(elements))) if !elements.iter().any(is(last)) => false,
             Some(Found::Value(_)) => return Err(Failure::Type("this parameter is no namespace")),
@@ -224,7 +225,7 @@ impl Params {
         count(&self.tree)
     }
 
-    /// Notes that the result of the current multicall contains the dict under `key`.
+    /// Notes that the result of the running multicall contains the dict under `key`, at the position `at`.
     pub(crate) fn watch(&mut self, key: &str, at: Vec<usize>) {
         self.live.push(Live {
             at,
@@ -247,7 +248,8 @@ impl Params {
             .collect()
     }
 
-    /// Keeps the values of the noted dicts at `path` and below, because they will be removed from the tree.
+    /// Keeps the values of the dicts noted by [`Self::watch`] at `path` and below, because the caller is about to
+    /// remove these dicts from the tree.
     fn detach(&mut self, path: &[&str]) {
         let mut live = std::mem::take(&mut self.live);
         for entry in &mut live {
@@ -262,7 +264,7 @@ impl Params {
     }
 }
 
-/// The namespace with this name, created if needed. It silently replaces any other value.
+/// The namespace `name` in `members`, created if needed. Replaces a value that is not a namespace.
 fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> {
     let value = members.entry(name.to_owned()).or_insert(Value::Nil);
     if !matches!(value, Value::Struct(_)) {

@@ -18,13 +18,13 @@ pub(crate) enum SharedRegistration {
 /// A reference to a node. rosmaster drops it when the node has no registration left.
 #[derive(Clone, Default, PartialEq)]
 pub struct Node {
-    /// The address of its slave API.
+    /// The address of the node's slave API.
     pub api: String,
-    /// The topics that it publishes.
+    /// The topics that the node publishes.
     pub publications: IndexSet<String>,
-    /// The topics to which it subscribes.
+    /// The topics to which the node subscribes.
     pub subscriptions: IndexSet<String>,
-    /// The keys of the parameters to which it subscribes.
+    /// The keys of the parameters to which the node subscribes.
     pub param_subscriptions: IndexSet<String>,
     /// Services that this node has registered, including those that another node has taken over since.
     pub services: IndexSet<String>,
@@ -90,8 +90,8 @@ impl Registry {
             .collect()
     }
 
-    /// Registers a node under a key. Returns the address of the node of the same name that this displaces, if
-    /// any.
+    /// Registers a node under a key. If a node of the same name was registered at another address, removes that node's
+    /// registrations and returns its address.
     pub(crate) fn register(
         &mut self,
         kind: SharedRegistration,
@@ -107,7 +107,8 @@ impl Registry {
         bumped
     }
 
-    /// Like [`Registry::register`], for a service. The previous provider loses the service but keeps a reference.
+    /// Registers a service of a node, and returns the same as [`Registry::register`]. The previous provider loses the
+    /// service, but stays in [`Self::nodes`].
     pub(crate) fn register_service(
         &mut self,
         service: &str,
@@ -126,8 +127,8 @@ impl Registry {
         bumped
     }
 
-    /// The reference to a node. With a different address, this is a new node of the same name, and all registrations of
-    /// the old one are removed.
+    /// The reference to a node, created if needed. If the name is registered at another address, that is an old node:
+    /// removes its registrations and also returns its address.
     fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
         let mut bumped = None;
         if let Some(node) = self.nodes.get_mut(caller_id)
@@ -185,7 +186,7 @@ impl Registry {
         (unregistered(caller_id, key), true)
     }
 
-    /// Like [`Registry::unregister`], for a service.
+    /// Unregisters a service of a node. Returns the message, and whether there was anything to unregister.
     pub(crate) fn unregister_service(
         &mut self,
         service: &str,

@@ -9,7 +9,7 @@ use crate::xmlrpc::{self, Call, DecodeError, Value};
 /// three of its levels.
 const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 
-/// One more parameter than any method takes.
+/// A number of parameters that is too many for every method: one more than any method takes.
 const TOO_MANY: usize = 5;
 
 /// A call to a master, parsed once.
@@ -42,7 +42,7 @@ pub enum Entry {
     /// An entry that is answered with a fault. This is the fault's text.
     Refused(&'static str),
     /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is always the
-    /// last one. The text is rosmaster's only if it starts with `<`.
+    /// last entry of its multicall. The text is rosmaster's only if it starts with `<`.
     Malformed(Cow<'static, str>),
 }
 
@@ -116,7 +116,8 @@ impl Request {
         self.params.get(index)?.as_str()
     }
 
-    /// This call; for a multicall all calls in it, in order, including those of nested multicalls.
+    /// Only this call if it is no multicall. For a multicall, all calls in it, in order, including those of nested
+    /// multicalls.
     pub fn calls(&self) -> Vec<&Self> {
         fn collect<'a>(request: &'a Request, found: &mut Vec<&'a Request>) {
             if request.method != Method::Multicall {
@@ -140,16 +141,16 @@ impl Request {
         let kinds = self.entries.iter().enumerate();
         let kinds = kinds.map(|(index, entry)| match entry {
             Entry::Request(request) => request.kind(),
-            // The previous entries have run, and the reply does not show their results.
+            // The entries before a malformed one have run, and the reply does not show their results.
             Entry::Malformed(_) if index > 0 => Kind::Mutate,
             Entry::Refused(_) | Entry::Malformed(_) => Kind::Unknown,
         });
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror can answer this call without a master, because only one answer is possible. It cannot answer
-    /// `shutdown`, errors whose text depends on the Python version, or a method that rosmaster exports by accident and
-    /// that has an effect.
+    /// Whether [`Master`](super::Master) can answer this call in place of rosmaster, because only one answer is
+    /// possible. It cannot answer `shutdown`, or a call whose error text depends on the Python version, or
+    /// `param_update_task`, which rosmaster exports by accident and which has an effect.
     pub fn is_answerable(&self) -> bool {
         match &self.method {
             Method::Multicall => self.entries.iter().all(|entry| match entry {
@@ -157,7 +158,8 @@ impl Request {
                 Entry::Refused(_) => false,
                 Entry::Malformed(text) => text.starts_with('<'),
             }),
-            // Without its two parameters it is refused.
+            // rosmaster refuses a `shutdown` that does not have exactly two parameters, or whose caller id is not a
+            // string.
             Method::Shutdown => self.params.len() != 2 || self.caller().is_none(),
             Method::Unknown(name) => **name != *"param_update_task",
             _ => true,
@@ -186,7 +188,7 @@ impl From<Call> for Request {
     }
 }
 
-/// Converts a call. A malformed entry of a multicall becomes nil.
+/// Converts a call. An entry of a multicall that cannot be run becomes nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
         let mut params = request.params;
@@ -225,7 +227,7 @@ impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
         let mut members = match element {
             Value::Struct(members) => members,
-            // rosmaster's error depends on the Python version.
+            // For a string, rosmaster's error depends on the Python version.
             Value::String(_) => {
                 return Self::Malformed("an entry of a multicall is a string".into());
             }

@@ -1,4 +1,5 @@
-//! Finds out which parameter values a master can return. It accepts values that `xmlrpc.client.dumps` cannot encode.
+//! Finds out which parameter values a master can return. A master also accepts values that Python's
+//! `xmlrpc.client.dumps` cannot encode, so it can never return them.
 
 use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
 
@@ -7,7 +8,8 @@ pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
     error_within(reply, 0)
 }
 
-/// Like [`reply_error`], for the value of a parameter, which is returned as `[code, message, value]`.
+/// The text of the fault that rosmaster answers when it cannot encode this value of a parameter in a reply `[code,
+/// message, value]`. `None` if it can.
 pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
     error_within(value, 1)
 }

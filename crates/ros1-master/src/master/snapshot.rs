@@ -7,7 +7,8 @@ use crate::xmlrpc::Struct;
 /// The whole state of a master. Every map and list keeps the master's order, because replies show it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Snapshot {
-    /// References to nodes by caller id, including nodes without any registration left.
+    /// References to nodes by caller id, including nodes that have nothing but services that other nodes have taken
+    /// over.
     pub nodes: IndexMap<String, SnapshotNode>,
     /// Types by topic. A type remains when the topic has no nodes left.
     pub topic_types: IndexMap<String, String>,

@@ -24,8 +24,8 @@ pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
-    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends such
-    /// values.
+    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends a
+    /// value that causes this.
     pub(crate) inexact: bool,
     /// Whether the modelled master has unordered dictionaries, as on Python 2.
     pub(crate) unordered: bool,
@@ -107,13 +107,13 @@ pub enum InvalidSnapshot {
     NoType { topic: String },
     /// A service is listed as taken over from the node that provides it now.
     #[error(
-        "the service `{service}` is listed as taken over from its own provider `{caller_id}`: remove it there"
+        "the node `{caller_id}` provides the service `{service}`, but also lists it under taken_over_services: remove it from that list"
     )]
     NotTakenOver { service: String, caller_id: String },
 }
 
 impl Master {
-    /// Publishers, subscribers, services and the references of nodes.
+    /// Publishers, subscribers, services and the references to nodes.
     pub fn registry(&self) -> &Registry {
         &self.registry
     }
@@ -160,8 +160,8 @@ impl Master {
         self.unordered
     }
 
-    /// Sets whether the modelled master behaves like rosmaster 1.14.3 and earlier: it also notifies the node that sets
-    /// a parameter, and the value of three of its refusals is 0. `None` if unknown.
+    /// Sets whether the modelled master behaves like rosmaster 1.14.3 and earlier. Such a master also notifies the node
+    /// that sets a parameter, and three of its methods refuse a call with the value 0. `None` if unknown.
     pub fn set_old(&mut self, old: Option<bool>) {
         self.old = old;
     }
@@ -234,7 +234,8 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// Whether a node publishes a topic, or if `publishes` is false, whether it subscribes to it.
+    /// Whether the node publishes `topic`, if `publishes` is true. If it is false, whether the node subscribes to
+    /// `topic`.
     pub fn has_topic(&self, caller_id: &str, publishes: bool, topic: &str) -> bool {
         let node = self.registry.nodes.get(caller_id);
         node.is_some_and(|node| match publishes {
@@ -281,8 +282,8 @@ impl Master {
 
     /// The calls that unregister everything a node has, as the node itself would when it stops.
     ///
-    /// If another node has taken over a service of this node, the master keeps a reference to it. `forget_calls`
-    /// removes that as well.
+    /// If another node has taken over a service of this node, the master keeps a reference to this node even after
+    /// these calls. The calls of [`Self::forget_calls`] remove that reference as well.
     pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();
@@ -335,7 +336,7 @@ impl Master {
         }
     }
 
-    /// Services that the node registered and does not provide any more.
+    /// Services that the node `caller_id` has registered and no longer provides.
     pub fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,
@@ -352,7 +353,7 @@ impl Master {
         self.params.get(key)
     }
 
-    /// The master that has this state.
+    /// Creates the master that has the state in `snapshot`.
     ///
     /// # Errors
     ///
@@ -444,7 +445,8 @@ fn unknown_node(key: &str, caller_id: &str) -> InvalidSnapshot {
 }
 
 impl Registry {
-    /// Queues the callbacks for changed parameters. A value that cannot be encoded is never sent.
+    /// Queues the callbacks for changed parameters. Skips values that rosmaster cannot encode, because it never sends
+    /// them.
     pub(crate) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
         for update in updates {
             if super::returnable::param_error(update.value).is_some() {

@@ -16,13 +16,13 @@ pub const PARAM_UPDATE: &str = "paramUpdate";
 /// A node that must shut down because another node has taken its name, at another address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Displaced {
-    /// Its name.
+    /// The node's name.
     pub node: String,
-    /// Its address.
+    /// The node's address.
     pub api: String,
-    /// The last process id seen at the address, if any.
+    /// The last process id that was seen at this address, if any.
     pub pid: Option<i32>,
-    /// The topics that it published and subscribed to.
+    /// The topics that the node published and subscribed to.
     pub topics: Vec<String>,
 }
 
@@ -32,8 +32,8 @@ impl Master {
         publisher_update(topic, &self.publishers_of(topic))
     }
 
-    /// The `paramUpdate` with the value under `key`, which ends in a slash. As in rosmaster, the value is an
-    /// empty struct if the key is not set. `None` for a value that rosmaster could not send either.
+    /// The `paramUpdate` with the value under `key`, which ends in a slash. As in rosmaster, the value is an empty
+    /// struct if the key is not set. `None` if rosmaster cannot encode the value and so never sends it.
     pub fn param_update(&self, key: &str) -> Option<Call> {
         let value = self.params.get(key);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
@@ -80,7 +80,7 @@ impl Master {
         all.collect()
     }
 
-    /// Whether a node at an address that `at` accepts subscribes to a topic.
+    /// Whether any node subscribes to `topic`. Counts only nodes whose address `at` accepts.
     pub fn subscribes(&self, at: impl Fn(&str) -> bool, topic: &str) -> bool {
         let nodes = self
             .registry
@@ -89,8 +89,8 @@ impl Master {
         self.any_at(&at, nodes)
     }
 
-    /// Whether a node at an address that `at` accepts subscribes to `key`, to a namespace above it, or to a
-    /// key below it.
+    /// Whether any node subscribes to `key`, to a namespace above it, or to a key below it. Counts only nodes whose
+    /// address `at` accepts.
     pub fn subscribes_param(&self, at: impl Fn(&str) -> bool, key: &str) -> bool {
         let subscribers = self
             .registry
@@ -109,8 +109,8 @@ impl Master {
             .any(|node| self.api_of(node).is_some_and(at))
     }
 
-    /// The node that `call` displaces. If the call registers something under the same name at another address, the
-    /// master tells that node to shut down. Its process id is unknown here.
+    /// The node that `call` displaces: the call registers something under that node's name at another address, so the
+    /// master tells the old node to shut down. Leaves [`Displaced::pid`] empty.
     pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
         let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
@@ -149,7 +149,8 @@ pub fn shutdown(node: &str) -> Call {
     )
 }
 
-/// The reason that rosmaster gives for such a shutdown. An `old` rosmaster leaves out the node's name.
+/// The reason in the `shutdown` that rosmaster sends to a node whose name `node` was taken. rosmaster 1.14.3 and
+/// earlier (`old`) leave out the name.
 pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     let reason = "new node registered with same name";
     match old {
@@ -158,12 +159,12 @@ pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     }
 }
 
-/// A call with the caller id as its only parameter, to a node or a master.
+/// A call of `method`, for a node or a master, with rosrescue's caller id as its only parameter.
 pub fn question(method: &str) -> Call {
     Call::new(method, vec![CALLER_ID.into()])
 }
 
-/// Asks a node or a master for its process id.
+/// The call that asks a node or a master for its process id.
 pub fn get_pid() -> Call {
     question(Method::GetPid.name())
 }

@@ -10,7 +10,8 @@ use crate::xmlrpc::{Struct, Value};
 /// The value of a deleted parameter in a `paramUpdate`.
 pub(crate) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
-/// A `paramUpdate` to the subscribers of one key. Its value is the value of the call, or a part of it.
+/// A `paramUpdate` to the subscribers of one key. Its value is the value that the call sets, a part of that value, or
+/// [`GONE`].
 pub(crate) struct Update<'a> {
     pub(crate) nodes: &'a [String],
     /// The node that made the change and so is not notified.
@@ -19,8 +20,8 @@ pub(crate) struct Update<'a> {
     pub(crate) value: &'a Value,
 }
 
-/// The updates caused by setting `key`, which ends in a slash and already has its new value. The node `ignored` gets
-/// none.
+/// The updates caused by setting `key`, which ends in a slash, to `value`. The node `ignored` gets no updates for `key`
+/// itself.
 pub(crate) fn updates<'a>(
     subscribers: &'a Registrations,
     key: &'a str,
@@ -63,7 +64,8 @@ pub(crate) fn updates<'a>(
     }
     let length = key.chars().count();
     for (changed, nodes) in below.found {
-        // rosmaster cuts off as many characters as the changed key has, even if this key does not start with it.
+        // To get the path of a changed key below `key`, rosmaster cuts off as many characters as `key` has, even if the
+        // changed key does not start with `key`.
         let rest: String = changed.chars().skip(length).collect();
         updates.push(Update {
             nodes,
@@ -89,7 +91,7 @@ impl Below<'_> {
     /// Finds keys with subscribers among `members` of the namespace `key`. Restores `key` at the end.
     fn find(&mut self, key: &mut String, members: &Struct) {
         for (name, value) in members {
-            // `ns_join` does not join such a name to the namespace.
+            // rosgraph's `ns_join` does not join a name that starts with `/` or `~` to the namespace.
             let mut alone = String::new();
             let key = match name.starts_with(['/', '~']) {
                 true => &mut alone,
@@ -111,8 +113,7 @@ impl Below<'_> {
     }
 }
 
-/// Finds the value at `path`. Like rosmaster, it fails for members whose names contain slashes, although it announces
-/// them.
+/// Finds the value at `path`. Like rosmaster, fails if the name of a member on the path contains a slash.
 fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
         Value::Struct(members) => {

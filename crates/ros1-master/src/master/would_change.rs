@@ -14,13 +14,13 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state already is as `call` would make it. `None` if unknown.
+    /// Whether the state is already the one that `call` would lead to. `None` if unknown.
     fn is_settled(&self, call: &Request) -> Option<bool> {
         let text = |index| call.text(index);
         let caller_id = call.caller()?;
         let name = |index| Some(names::resolve(text(index)?, caller_id));
         let key = |index| Some(names::param_key(&name(index)?));
-        // The node, if it is registered at the address in the call.
+        // The calling node, if it is registered at the address in the call.
         let node = |index| {
             let node = self.registry.nodes.get(caller_id);
             node.filter(|node| Some(node.api.as_str()) == text(index))
@@ -65,7 +65,7 @@ impl Master {
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }
             Method::DeleteParam => !self.is_set(&name(1)?),
-            // A read changes nothing. A write that is not above might.
+            // A read changes nothing. A write that is not listed above might.
             method => !method.kind().mutates(),
         })
     }

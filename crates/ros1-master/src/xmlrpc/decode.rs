@@ -19,7 +19,7 @@ use super::value::{Call, Reply, Struct, Value};
 pub const MAX_DEPTH: usize = 512;
 
 /// Maximum number of open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`, `data`).
-/// The others are for the envelope and for clients that nest a little more.
+/// The remaining elements are for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Decodes a request.
@@ -52,11 +52,11 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     Ok(Call::new(method, document.values))
 }
 
-/// Decodes an answer as CPython's server meant it.
+/// Decodes an answer of CPython's server.
 ///
-/// That server does not escape a carriage return, which XML reads as a line feed, or the text of a date, in
-/// which XML would find references. So this function interprets neither, and a master's values are read
-/// unchanged.
+/// CPython's server escapes neither carriage returns nor the text of dates. An XML parser would turn a carriage return
+/// into a line feed, and would find references in a date. This function keeps both as they are, so a master's values
+/// arrive unchanged.
 ///
 /// # Errors
 ///
@@ -126,7 +126,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
         match event {
             Event::Start(tag) => machine.start(tag.name().0, scanner.at())?,
             Event::End(tag) => machine.end(tag.name().0, scanner.at())?,
-            // There is mostly one piece; adding it to an empty text only borrows it.
+            // Most texts have only one piece, and adding a piece to an empty text borrows it without a copy.
             Event::Text(piece) => machine.text += piece,
             Event::Reference(reference, _) if machine.is_unescaped => {
                 machine.text += "&";
@@ -147,7 +147,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
     })
 }
 
-/// The kind of document. As in CPython, the last such element decides.
+/// The kind of document. As in CPython, the last `params`, `fault` or `methodName` element decides.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Call,
@@ -270,7 +270,7 @@ impl Unmarshaller<'_> {
         Ok(())
     }
 
-    /// Makes a struct of the names and values that alternate on the stack.
+    /// Makes a struct of the names and values that the stack holds by turns.
     fn end_struct(&mut self, at: usize) -> Result<Value, DecodeError> {
         let mark = self.marks.pop().unwrap_or_default();
         let mut members = Struct::with_capacity((self.stack.len() - mark) / 2);

@@ -51,7 +51,7 @@ pub fn encode_reply(reply: &Reply) -> Vec<u8> {
     }
 }
 
-/// Encodes the result of a method like [`encode_reply`].
+/// Encodes the result of a method in the same form as [`encode_reply`].
 ///
 /// # Errors
 ///

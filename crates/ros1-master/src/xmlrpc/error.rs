@@ -156,12 +156,12 @@ fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
     Some(format!("{text}: line {line}, column {column}"))
 }
 
-/// Whether a root element may still follow: there is nothing yet, or only an XML declaration.
+/// Whether `text`, the start of a document, ends before the root element: it is empty or only an XML declaration.
 fn is_before_root(text: &str) -> bool {
     text.trim_ascii().is_empty() || text.starts_with("<?xml ") && text.matches('<').count() == 1
 }
 
-/// The part of `text` between `begin`, at its start, and the next `end`.
+/// The part of `text` after `begin`, with which `text` must start, up to the next `end`.
 fn inside<'t>(text: &'t str, begin: &str, end: &str) -> Option<&'t str> {
     Some(text.strip_prefix(begin)?.split_once(end)?.0)
 }

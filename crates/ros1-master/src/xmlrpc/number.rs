@@ -38,8 +38,8 @@ pub(super) fn int(text: &str) -> Option<Value> {
     })
 }
 
-/// Python's `float(text)`, for ASCII text. Every `nan` becomes the same one, because Python's text does not show sign
-/// and payload.
+/// Python's `float(text)`, for ASCII text. Every NaN becomes [`f64::NAN`], because Python's text of a NaN shows neither
+/// its sign nor its payload.
 pub(super) fn float(text: &str) -> Option<f64> {
     // Rust accepts exactly what Python accepts, except for white space and underscores.
     let number: f64 = match text.parse() {
@@ -102,11 +102,11 @@ pub(super) fn repr(number: f64) -> String {
     format!("{sign}{digits}")
 }
 
-/// The fewest digits that identify the number, such as `d.ddde-7`.
+/// The text with the fewest digits that identify the number, such as `d.ddde-7`.
 ///
-/// If two texts of that length are equally near, Rust takes the upper one and Python the even one:
-/// -823967287502993.25 is `…993.3` in Rust and `…993.2` in Python. Rounding to that many digits gives
-/// Python's.
+/// If two texts of this length are equally near to the number, Rust takes the upper one, and Python the one with an
+/// even last digit: -823967287502993.25 is `…993.3` in Rust and `…993.2` in Python. Rounding the number to as many
+/// digits gives Python's text.
 fn shortest(number: f64) -> String {
     let shortest = format!("{number:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();

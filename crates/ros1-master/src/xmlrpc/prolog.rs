@@ -44,8 +44,8 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     Ok(text)
 }
 
-/// The document without its document type, if that is only a name and so declares nothing. `None` if there is no such
-/// document type.
+/// The document without its document type, if that is only a name and so declares nothing. `None` if the document has
+/// no document type, or one that declares something.
 pub fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
     const DOCTYPE: &[u8] = b"<!DOCTYPE";
     let declared = match body.starts_with(b"<?xml") {

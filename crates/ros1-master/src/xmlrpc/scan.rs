@@ -18,7 +18,7 @@ use super::error::{
     SECOND_ROOT, TEXT_AFTER_ROOT, TEXT_BEFORE_ROOT,
 };
 
-/// One event of the scanner. An empty element gives a start and an end.
+/// One event of the scanner. An empty element causes two events, a start and an end.
 pub(super) enum Event<'a> {
     Start(BytesStart<'a>),
     End(BytesEnd<'a>),
@@ -134,7 +134,7 @@ impl<'a> Scanner<'a> {
                 Markup::Eof if !is_outside => NOT_CLOSED,
                 Markup::Eof if !self.seen_root => NO_ELEMENT,
                 Markup::Eof => return Ok(None),
-                // Empty elements arrive as a start and an end as well.
+                // quick-xml expands an empty element to a start and an end, so `Empty` never comes.
                 Markup::Comment(_) | Markup::Empty(_) => continue,
             };
             return Err(DecodeError::Syntax { at, what });

@@ -153,7 +153,7 @@ impl Value {
         size
     }
 
-    /// Whether it uses more than about this many bytes of memory. Stops counting there.
+    /// Whether this value uses more than about `bytes` of memory. Stops counting at this limit.
     pub fn is_larger_than(&self, mut bytes: usize) -> bool {
         !self.visit_sizes(&mut |part| {
             let rest = bytes.checked_sub(part);
@@ -162,7 +162,8 @@ impl Value {
         })
     }
 
-    /// Passes the size of each part to `visit` until that returns false. Returns whether all were accepted.
+    /// Passes the size of each part to `visit` until `visit` returns false. Returns whether it returned true for all
+    /// parts.
     fn visit_sizes(&self, visit: &mut impl FnMut(usize) -> bool) -> bool {
         let within = match self {
             Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),

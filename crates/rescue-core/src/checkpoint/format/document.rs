@@ -1,4 +1,4 @@
-//! Defines the document: which value is under which key.
+//! Defines the YAML document of a checkpoint: which value is under which key.
 
 use indexmap::IndexMap;
 
@@ -351,7 +351,7 @@ fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
-    // Taken out instead of cloned. The order of the remaining keys does not matter.
+    // The value is taken out instead of cloned. This changes the order of the remaining keys, which does not matter.
     document
         .swap_remove(key)
         .and_then(structure)

@@ -160,7 +160,7 @@ pub(super) fn decimal(out: &mut Vec<u8>, number: impl std::fmt::Display) {
     let _ = write!(out, "{number}");
 }
 
-/// Whether plain `digits` are read back as the same [`Value::BigInt`].
+/// Whether a YAML reader reads `digits` without quotes back as the same [`Value::BigInt`].
 fn is_plain_big_int(digits: &str) -> bool {
     let magnitude = digits.strip_prefix('-').unwrap_or(digits);
     (10..=INT_DIGITS_MAX).contains(&magnitude.len())

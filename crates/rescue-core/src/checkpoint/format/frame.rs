@@ -1,4 +1,4 @@
-//! Check sums, and how to find the whole parts of a damaged file.
+//! Adds and verifies check sums, and finds the undamaged parts of a damaged file.
 //!
 //! ```text
 //! # rosrescue checkpoint v1 generation=G seq=S snapshot=LENGTH crc32c=C header=H
@@ -29,8 +29,8 @@ const HEADER_BYTES_MAX: usize = 256;
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Highest number of a generation or a record. Counting continues from the numbers in a file. A higher number was never
-/// written, and adding to it could overflow.
+/// Highest number of a generation or a record that is accepted from a file. Counting continues from the numbers in a
+/// file, so a number near the maximum of `u64` could overflow. rosrescue never writes a number above this limit.
 const COUNT_MAX: u64 = u64::MAX / 2;
 
 /// Connects a file's records to its snapshot.
@@ -74,10 +74,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
     out.push(b'\n');
 }
 
-/// The stamp of records outside of any file.
+/// The stamp of records that are outside of any checkpoint file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends the line of a record outside of any file.
+/// Appends the line of a record that is outside of any checkpoint file.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
     push_body(out, record.seq, &record.entry)?;
@@ -253,9 +253,9 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
     Ok(header)
 }
 
-/// Whether a file without a valid first line and without a valid record is a damaged checkpoint, or else another
-/// program's file. It is a checkpoint if it is empty, begins with zeros (as after a crash of the computer), or still
-/// has most of the start of the first line or of the document.
+/// Whether a file without a valid first line and without a valid record is a damaged checkpoint and not another
+/// program's file. It counts as a checkpoint if it is empty, begins with zeros (as after a crash of the computer), or
+/// still has most of the start of the first line or of the document.
 fn resembles(bytes: &[u8]) -> bool {
     let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
     let differing = bytes
@@ -333,8 +333,8 @@ impl<'a> Framed<'a> {
     }
 
     /// Finds the valid lines of the journal, and describes the damage of the others. If the first line is damaged, it
-    /// is unknown where the journal starts. All lines can be searched then, because no line of a snapshot looks like a
-    /// record.
+    /// is unknown where the journal starts. All lines are searched in that case. This is safe, because no line of a
+    /// snapshot looks like a record.
     fn scan_lines(&mut self) {
         let start = match self.header {
             Some(header) => usize::try_from(header.snapshot)

@@ -1,8 +1,9 @@
 //! Converts YAML to values.
 //!
-//! It reads the events of serde-saphyr's parser and does not use serde. serde's data model lacks scalar styles, tags,
-//! and integers beyond 64 bits, which distinguish the values. It accepts only what `emit` writes: no anchors, no
-//! aliases, no other tags. So no text can expand to more than its own length. No function recurses.
+//! This module reads the events of serde-saphyr's parser and does not use serde, because serde's data model lacks
+//! scalar styles, tags, and integers beyond 64 bits, which distinguish the values. The module accepts only what `emit`
+//! writes: no anchors, no aliases, no other tags. So no text can expand to more than its own length. No function
+//! recurses.
 
 use std::borrow::Cow;
 
@@ -126,7 +127,8 @@ fn scalar(text: Cow<'_, str>, style: ScalarStyle, tag: Option<&Tag>) -> Option<V
 
 fn plain(text: &str) -> Option<Value> {
     Some(match text {
-        // The parser reports `~` for a key without a value. Here that is the journal, whose lines are read separately.
+        // The parser reports `~` for a key without a value. In a checkpoint that is `journal:`, whose lines are read
+        // separately.
         "null" | "~" => Value::Nil,
         "true" => Value::Bool(true),
         "false" => Value::Bool(false),

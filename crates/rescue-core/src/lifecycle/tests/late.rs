@@ -56,7 +56,7 @@ const BUSY: Action = Action::Spare("it is busy");
 fn a_starved_master_whose_connections_end_is_not_killed() {
     let mut script = Script::serving(Supervision::Ours);
     script.lose();
-    // It closes each connection that the starved rosrescue has left idle for too long.
+    // The master closes each connection that the starved rosrescue has left idle for too long.
     let mut lose_again = |does| {
         script.now += Duration::from_secs(1);
         script.machine.on(script.now, Input::Wake);
@@ -72,7 +72,7 @@ fn a_starved_master_whose_connections_end_is_not_killed() {
     let actions: Vec<_> = (0..300).flat_map(|_| lose_again(Does::Starve)).collect();
     assert!(actions.contains(&STARVED));
     assert!(!actions.contains(&Action::Kill), "{actions:?}");
-    // One that has the processor and closes each connection nevertheless is of no use.
+    // A master that gets processor time and closes each connection nevertheless is of no use.
     let mut actions = (0..3).flat_map(|_| lose_again(Does::Nothing));
     assert!(actions.any(|action| action == Action::Kill));
 }
@@ -97,7 +97,7 @@ fn a_late_master_is_stood_in_for_and_given_what_it_missed() {
                 Input::NotCaughtUp,
                 &[Action::ShutGate(Cause::Late), Action::Connect],
             )
-            // This answer belongs to the time before.
+            // This answer belongs to the time before the gate was shut.
             .feed(Input::LateAnswered, &[])
             .feed(Input::CaughtUp, &[])
             .serve(false)
@@ -180,7 +180,7 @@ fn a_master_that_hangs_at_last_is_killed_at_last() {
         .miss_all(Does::Starve, STARVED)
         .wake(FIRST_PAUSE, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine]);
-    // The previous sample still shows it starved.
+    // The previous sample still shows a starved master.
     script.now += Duration::from_secs(3);
     script
         .feed_seen(Does::Nothing, Input::Unreachable, &[STARVED])
@@ -228,7 +228,7 @@ fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
         actions
     };
     assert_eq!(refuse(&mut script, Does::Work, 120), []);
-    // From then on it waits forever.
+    // From then on the master waits forever.
     let actions = refuse(&mut script, Does::Nothing, 2);
     assert_eq!(actions.first(), Some(&Action::Kill));
     script.feed(Input::Exited, &[Action::Spawn]);

@@ -33,7 +33,7 @@ fn deleting_a_key_below_a_value_changes_nothing() {
 
 #[test]
 fn reading_a_relative_key_forgets_its_first_part() {
-    // Only a caller id without a leading slash can resolve to such a key.
+    // The key is `a/k`, without a leading slash. Only a caller id without a leading slash resolves to such a key.
     let mut master = Master::default();
     master.apply(&Request::new(
         Method::SetParam,
@@ -157,7 +157,7 @@ fn no_key_or_value_makes_the_tree_too_deep_for_the_stack() {
     );
 }
 
-/// `ns_join` does not join such a name to the namespace above it.
+/// rosgraph's `ns_join` does not join a name that starts with a slash to the namespace above it.
 #[test]
 fn member_names_that_start_with_a_slash_may_have_any_characters() {
     for name in ["/€", "~€", "/", "/€/€"] {
