@@ -224,7 +224,7 @@ async fn certificates_are_checked_on_both_sides() {
                 endpoints: Vec::new(),
                 access: Credentials::default(),
             },
-            "no endpoint of etcd is given",
+            "no etcd endpoint is given",
         ),
     ] {
         let error = Etcd::new(&options).unwrap_err().to_string();

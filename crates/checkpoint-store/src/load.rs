@@ -172,7 +172,7 @@ fn join(
     // a compaction.
     let mut records = present.records(base, &mut damaged);
     let own = records.len();
-    // The records of the previous generation are used only if its number is lower. If somebody has copied an old file
+    // The records of the previous generation are used only if its number is lower. If a user has copied an old file
     // to the path, that file's number can be the lower one.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {

@@ -75,7 +75,7 @@ impl Endpoint {
         config: Option<&TlsSettings>,
     ) -> Result<Self, EtcdError> {
         let refused =
-            |why: &str| EtcdError::Options(format!("`{url}` is not an endpoint of etcd: {why}"));
+            |why: &str| EtcdError::Options(format!("`{url}` is not an etcd endpoint: {why}"));
         let uri: hyper::Uri = url.parse().map_err(|_| refused("it is not a URL"))?;
         let host = uri.host().ok_or_else(|| refused("it has no host"))?;
         let host = host

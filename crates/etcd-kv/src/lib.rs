@@ -92,9 +92,7 @@ impl Client {
         let endpoints = endpoints.map(|url| Endpoint::new(url, &access, tls.as_ref()));
         let endpoints: Vec<_> = endpoints.collect::<Result<_, _>>()?;
         if endpoints.is_empty() {
-            return Err(EtcdError::Options(
-                "no endpoint of etcd is given".to_owned(),
-            ));
+            return Err(EtcdError::Options("no etcd endpoint is given".to_owned()));
         }
         Ok(Self {
             endpoints: endpoints.into(),

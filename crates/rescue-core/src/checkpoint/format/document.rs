@@ -351,7 +351,7 @@ fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
-    // The value is taken out instead of cloned. This changes the order of the remaining keys, which does not matter.
+    // Takes the value instead of cloning it. This changes the order of the remaining keys, which does not matter.
     document
         .swap_remove(key)
         .and_then(structure)
