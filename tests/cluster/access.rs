@@ -217,7 +217,7 @@ async fn certificates_are_checked_on_both_sides() {
         ),
         (
             options(Credentials::default(), "127.0.0.1:1"),
-            "is no endpoint",
+            "is not an etcd endpoint",
         ),
         (
             Options {
