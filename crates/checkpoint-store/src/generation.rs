@@ -1,4 +1,5 @@
-//! Writes a new generation of the checkpoint while records are appended to the present one.
+//! Writes a new *generation* of the checkpoint, a file that replaces the present one, while records are appended to the
+//! present one.
 
 use std::io;
 use std::path::Path;
@@ -9,10 +10,10 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// Minimum size of a journal for which a new generation is written.
+/// Minimum size of a journal for which a new checkpoint file is written.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
-/// Maximum size of the records that are kept in memory while a new generation is written. Beyond it the new
-/// generation is dropped and the present file stays in use.
+/// Maximum size of the records that are kept in memory while a new checkpoint file is written. If they take more, the
+/// new file is dropped and the present file stays in use.
 pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
 pub(super) struct PendingGeneration {
@@ -20,12 +21,12 @@ pub(super) struct PendingGeneration {
     /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// The ticket of this generation's job. It is gone if the job or its result was dropped.
+    /// Tells the job that writes this generation whether it is still wanted. Gone if the job or its result was dropped.
     ticket: Weak<Ticket>,
 }
 
-/// Whether a generation is still wanted. Locked while the generation's job renames files, so that an obsolete job
-/// cannot touch its successor's files.
+/// Whether a new generation, a file that replaces the checkpoint, is still wanted. Locked while the job that writes it
+/// renames files, so that an obsolete job cannot touch its successor's files.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
@@ -187,7 +188,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Whether the journal is large enough for a new generation.
+    /// Whether the journal is so large that a new checkpoint file should be written.
     pub fn wants_compaction(&self) -> bool {
         !self.is_busy()
             && self.active.as_ref().is_some_and(|active| {

@@ -1,11 +1,11 @@
-//! The subjects of calls and notifications.
+//! What calls and notifications are about: topics, parameters and node names.
 
 use crate::{
     health::port_of,
     master::{Master, Method, Request, names},
 };
 
-/// A subject about which nodes are notified.
+/// What a call or a notification is about.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Subject {
     /// The publishers of a topic, given by its resolved name.
@@ -29,7 +29,7 @@ impl Subject {
     }
 }
 
-/// A subject about which the node at a port is told, by an answer or a notification.
+/// A [`Subject`] about which the node at a port is told, by an answer or a notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     /// The node's port; see [`port_of`].
@@ -37,7 +37,8 @@ pub struct Heard {
     pub subject: Subject,
 }
 
-/// The subjects of a write: those about which nodes may be notified, and those about which its answer tells the caller.
+/// The [`Subject`]s of a write: those about which nodes may be notified, and those about which its answer tells the
+/// caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
     /// The subjects about which the master may notify nodes because of the write.
@@ -109,8 +110,8 @@ impl Concern {
         self.anything
     }
 
-    /// If `subject` is a name, the port of the caller, which need not wait because a call never shuts its own node
-    /// down.
+    /// The caller's port if `subject` is a node name. The call need not wait for answers to that port, because it never
+    /// shuts its own node down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),

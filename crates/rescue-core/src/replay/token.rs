@@ -13,7 +13,7 @@ pub(super) const HELPER: &str = "rosrescue/injection";
 /// An address that rosmaster accepts but never connects to, because `xmlrpc.client` refuses its scheme.
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
-/// Identifies an incarnation of a master.
+/// Identifies an *incarnation* of a master, which is one life of a master process.
 ///
 /// In the master, a token is two parameter subscriptions with unique caller ids. The first caller id contains the id of
 /// the session. The second contains the id and the number of the incarnation. The address of the first subscription
