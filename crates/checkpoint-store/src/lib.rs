@@ -119,7 +119,7 @@ impl Store<Disk> {
     }
 }
 
-/// The name of the previous generation of the file at `path`.
+/// The name of the previous generation: the file that the one at `path` has replaced.
 pub fn previous_of(path: &Path) -> PathBuf {
     names::previous(path)
 }

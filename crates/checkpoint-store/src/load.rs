@@ -47,7 +47,7 @@ pub(super) struct LoadedStore {
     pub(super) loaded: Loaded,
     /// The highest record number known.
     pub(super) seq: u64,
-    /// The highest number of a generation known.
+    /// The highest known number of a generation (checkpoint file).
     pub(super) generation: u64,
     /// False if the present file may lack records of the previous generation, which it must not replace in that case.
     usable: bool,

@@ -39,7 +39,7 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long a notification of rosrescue waits after an answer about the same subject was written. A notification of
+/// How long a notification of rosrescue waits after an answer about the same [`Subject`] was written. A notification of
 /// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
 /// A notification that follows an answer within this time may be read before that answer. With thirty runnable
@@ -125,7 +125,7 @@ impl Order {
     }
 
     /// Whether a call must wait before it goes to the master. It must wait if it may notify a node while an answer to
-    /// that node about the same subject is on its way.
+    /// that node about the same [`Subject`] is on its way.
     pub fn must_wait(&mut self, now: Instant, concern: &Concern) -> Option<MustWait> {
         let wait = match concern.is_anything() {
             true => self.under_way.must_wait(now),

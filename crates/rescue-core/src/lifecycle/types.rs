@@ -130,13 +130,13 @@ pub enum Action {
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
-    /// Shut the gate: let no call pass.
+    /// Shut the gate: let no call pass to the master.
     ShutGate(Cause),
     /// Let the mirror answer until the master has answered its outstanding calls. Result: `LateAnswered`.
     StandIn,
     /// Send the late master the writes that the mirror has answered in its place. Results: `CaughtUp` or `NotCaughtUp`.
     CatchUp,
-    /// Open the gate: let calls pass.
+    /// Open the gate: let calls pass to the master.
     OpenGate,
     /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
     Probe,

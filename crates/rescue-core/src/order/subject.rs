@@ -41,9 +41,9 @@ pub struct Heard {
 /// caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
-    /// The subjects about which the master may notify nodes because of the write.
+    /// The topics, parameters and names about which the master may notify nodes because of the write.
     tells: Vec<Subject>,
-    /// The subjects about which the answer tells the caller.
+    /// The topics, parameters and names about which the answer tells the caller.
     hears: Vec<Heard>,
     /// The port of the node that registers; see [`port_of`].
     port: Option<String>,
@@ -52,7 +52,7 @@ pub struct Concern {
 }
 
 impl Concern {
-    /// The subjects of a call. `None` stands for a call that could not be decoded.
+    /// What a call is about. `None` stands for a call that could not be decoded.
     pub fn of(call: Option<&Request>) -> Self {
         let Some(call) = call else {
             return Self {
@@ -101,7 +101,7 @@ impl Concern {
         self.port.get_or_insert_with(|| port.to_owned());
     }
 
-    /// The subjects about which the master may notify nodes because of the write.
+    /// The topics, parameters and names about which the master may notify nodes because of the write.
     pub fn tells(&self) -> &[Subject] {
         &self.tells
     }
@@ -119,12 +119,12 @@ impl Concern {
         }
     }
 
-    /// The subjects about which the answer tells the caller.
+    /// The topics, parameters and names about which the answer tells the caller.
     pub fn heard(&self) -> Vec<Heard> {
         self.hears.clone()
     }
 
-    /// All subjects of the write.
+    /// All [`Subject`]s of the write.
     pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
         self.tells
             .iter()
@@ -132,8 +132,8 @@ impl Concern {
     }
 }
 
-/// The subjects about which the answer to a read tells the caller: parameters to which the caller subscribes. roscpp
-/// uses the value that `getParam` returns until it is notified of a newer one.
+/// The parameters about which the answer to a read tells the caller, if the caller subscribes to them. roscpp uses the
+/// value that `getParam` returns until it is notified of a newer one.
 pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
     let of = |call: &Request| {
         let (caller, key) = (call.caller()?, call.text(1)?);
