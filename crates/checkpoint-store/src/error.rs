@@ -97,11 +97,11 @@ pub enum StoreError {
         /// The number of the last record in the journal.
         journal: u64,
     },
-    /// A new generation is already being written.
+    /// A new checkpoint file is already being written.
     #[error("another generation of the checkpoint is being written; finish that one first")]
     Busy,
-    /// The new generation is obsolete, because a later one was begun, the file was set aside, or too much was recorded
-    /// while it was written.
+    /// The new checkpoint file is obsolete, because a later one was begun, the file was set aside, or too much was
+    /// recorded while it was written.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken { path: PathBuf },
     /// The state or the record cannot be encoded.

@@ -1,4 +1,5 @@
-//! Writes a new generation of the checkpoint while records are appended to the present one.
+//! Writes a new *generation* of the checkpoint, a file that replaces the present one, while records are appended to the
+//! present one.
 
 use std::io;
 use std::path::Path;
@@ -9,10 +10,10 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// Minimum size of a journal for which a new generation is written.
+/// Minimum size of a journal for which a new checkpoint file is written.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
-/// Maximum size of the records that are kept in memory while a new generation is written. Beyond it the new
-/// generation is dropped and the present file stays in use.
+/// Maximum size of the records that are kept in memory while a new checkpoint file is written. If they take more, the
+/// new file is dropped and the present file stays in use.
 pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
 pub(super) struct PendingGeneration {
@@ -20,12 +21,12 @@ pub(super) struct PendingGeneration {
     /// Records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// The ticket of this generation's job. It is gone if the job or its result was dropped.
+    /// Tells the job that writes this generation whether it is still wanted. Gone if the job or its result was dropped.
     ticket: Weak<Ticket>,
 }
 
-/// Whether a generation is still wanted. Locked while the generation's job renames files, so that an obsolete job
-/// cannot touch its successor's files.
+/// Whether a new generation, a file that replaces the checkpoint, is still wanted. Locked while the job that writes it
+/// renames files, so that an obsolete job cannot touch its successor's files.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
@@ -36,7 +37,8 @@ impl Ticket {
     }
 }
 
-/// A job that writes a new generation; see [`Store::begin_compaction`](super::Store::begin_compaction).
+/// A job that writes a new checkpoint file (generation); see
+/// [`Store::begin_compaction`](super::Store::begin_compaction).
 #[must_use = "the journal keeps growing until the job has run and has been finished"]
 pub struct CompactionJob<S: Storage> {
     plan: Plan<S>,
@@ -56,7 +58,7 @@ struct Plan<S: Storage> {
     ticket: Arc<Ticket>,
 }
 
-/// A new generation on disk under a temporary name, or the reason why there is none.
+/// A new checkpoint file on disk under a temporary name, or the reason why there is none.
 #[must_use = "give it to `Store::finish_compaction`"]
 pub struct Compacted<S: Storage> {
     generation: u64,
@@ -167,12 +169,12 @@ impl<S: Storage> Plan<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Writes `checkpoint` as a new generation and syncs it. The present file becomes the previous
-    /// generation.
+    /// Writes `checkpoint` to a new file and syncs it. The new file replaces the present one, which is kept as the
+    /// previous generation.
     ///
     /// # Errors
     ///
-    /// If the generation cannot be written. If the store was [unprotected](Self::unprotected), it stays so; if not, it
+    /// If the file cannot be written. If the store was [unprotected](Self::unprotected), it stays so; if not, it
     /// continues to use the present file. It is also an error if [`Checkpoint::seq`] is behind [`seq`](Self::seq); then
     /// nothing is written.
     pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
@@ -187,7 +189,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Whether the journal is large enough for a new generation.
+    /// Whether the journal is so large that a new checkpoint file should be written.
     pub fn wants_compaction(&self) -> bool {
         !self.is_busy()
             && self.active.as_ref().is_some_and(|active| {
@@ -195,14 +197,14 @@ impl<S: Storage> Store<S> {
             })
     }
 
-    /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] equals
+    /// Begins a new checkpoint file with `checkpoint`, which must be current: its [`Checkpoint::seq`] equals
     /// [`seq`](Self::seq). Run the job in any thread, continue to append, then pass the result to
     /// [`finish_compaction`](Self::finish_compaction). This also ends the [unprotected](Self::unprotected) state while
     /// calls continue.
     ///
     /// # Errors
     ///
-    /// If the checkpoint is behind the journal, or another generation is being written.
+    /// If the checkpoint is behind the journal, or another new file is being written.
     pub fn begin_compaction(
         &mut self,
         checkpoint: Checkpoint,
@@ -262,15 +264,15 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Appends the records that came since [`begin_compaction`](Self::begin_compaction) to the new generation, and
-    /// moves its file to the checkpoint's path. This is quick, because it waits for the disk only if the file system
+    /// Appends the records that came since [`begin_compaction`](Self::begin_compaction) to the new checkpoint file, and
+    /// moves that file to the checkpoint's path. This is quick, because it waits for the disk only if the file system
     /// has no hard links.
     ///
     /// # Errors
     ///
-    /// If the new generation cannot be written or is obsolete. The present file then stays in use, and the next
-    /// compaction is due when its journal has doubled in size. If the new file could not be moved to the path, the
-    /// store is [unprotected](Self::unprotected).
+    /// If the new file cannot be written or is obsolete. The present file then stays in use, and
+    /// [`wants_compaction`](Self::wants_compaction) becomes true when its journal has doubled in size. If the new file
+    /// could not be moved to the path, the store is [unprotected](Self::unprotected).
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
@@ -347,8 +349,7 @@ impl<S: Storage> Store<S> {
         Ok(())
     }
 
-    /// Ends the [unprotected](Self::unprotected) state: writes `checkpoint` as a new generation, like
-    /// [`begin`](Self::begin).
+    /// Ends the [unprotected](Self::unprotected) state: writes `checkpoint` to a new file, like [`begin`](Self::begin).
     ///
     /// # Errors
     ///
@@ -357,7 +358,7 @@ impl<S: Storage> Store<S> {
         self.begin(checkpoint)
     }
 
-    /// Writes a last generation, which `checkpoint` must mark as closed, and stops recording.
+    /// Writes `checkpoint`, which must be marked as closed, to a last new file, and stops recording.
     ///
     /// # Errors
     ///

@@ -27,7 +27,7 @@ pub(super) struct Active<S: Storage> {
     pub(super) suspect: bool,
     /// Whether everything that was appended has been synced.
     pub(super) clean: bool,
-    /// Whether the name of the file has been synced.
+    /// Whether the file's name in its folder has been synced.
     pub(super) named: bool,
 }
 
@@ -133,7 +133,7 @@ impl<S: Storage> Store<S> {
         error
     }
 
-    /// A job for the sync that is due. `None` if no sync is due.
+    /// A job that syncs what has been written to the file. `None` if everything written is synced.
     pub fn sync_job(&self) -> Option<SyncJob<S>> {
         let active = self
             .active

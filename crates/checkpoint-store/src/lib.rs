@@ -50,11 +50,11 @@ const BROKEN: &str = "broken";
 /// Part of the name under which an unreadable file is kept.
 const UNREADABLE: &str = "unreadable";
 
-/// The known file at the checkpoint's path.
+/// The file at the checkpoint's path, as this store has read or written it.
 #[derive(Clone, Copy, Debug)]
 struct Present {
     id: FileId,
-    /// Whether the file can become the previous generation.
+    /// False if the file may lack records of the previous generation, which it must not replace in that case.
     usable: bool,
 }
 
@@ -70,9 +70,10 @@ pub struct Store<S: Storage = Disk> {
     /// Number of the last entry, recorded or not. No number is used twice.
     seq: u64,
     synced_seq: u64,
-    /// The number of the last generation that was begun.
+    /// The number of the last generation (checkpoint file) that was begun.
     generation: u64,
-    /// The known file at the path. Any other file there is kept under another name before it is replaced.
+    /// The file at the path, as this store has read or written it. Any other file there is kept under another name
+    /// before it is replaced.
     present: Option<Present>,
     /// Part of the name under which the next foreign file is kept.
     aside_kind: &'static str,
@@ -118,7 +119,7 @@ impl Store<Disk> {
     }
 }
 
-/// The name of the previous generation of the file at `path`.
+/// The name of the previous generation: the file that the one at `path` has replaced.
 pub fn previous_of(path: &Path) -> PathBuf {
     names::previous(path)
 }

@@ -47,9 +47,9 @@ pub(super) struct LoadedStore {
     pub(super) loaded: Loaded,
     /// The highest record number known.
     pub(super) seq: u64,
-    /// The highest number of a generation known.
+    /// The highest known number of a generation (checkpoint file).
     pub(super) generation: u64,
-    /// Whether the present file can become the previous generation.
+    /// False if the present file may lack records of the previous generation, which it must not replace in that case.
     usable: bool,
     /// The present file, if it was readable.
     pub(super) present: Option<Present>,

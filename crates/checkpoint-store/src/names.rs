@@ -98,7 +98,7 @@ impl Names {
     }
 }
 
-/// The name of the previous generation of the file at `path`.
+/// The name of the previous generation: the file that the one at `path` has replaced.
 pub(super) fn previous(path: &Path) -> PathBuf {
     with(path, ".previous")
 }

@@ -24,7 +24,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Topics that most nodes have, so they are no evidence.
+/// Topics that most nodes have, so they do not show which node answers.
 const COMMON: [&str; 6] = [
     "/rosout",
     "/clock",

@@ -9,7 +9,7 @@ use crate::xmlrpc::{Struct, Value};
 /// Regular expression for the parameter names whose values are hidden by default.
 pub const DEFAULT: &str =
     "password|passwd|passphrase|pwd|token|secret|key|credential|private|(^|[^a-z])pin([^a-z]|$)";
-/// Replaces a hidden value.
+/// The text that is shown in place of a hidden value.
 pub const HIDDEN: &str = "(hidden)";
 
 /// Chooses the parameters with hidden values by their full names.

@@ -44,9 +44,9 @@ const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 enum Phase {
     /// No master is connected.
     Seeking,
-    /// A master is connected. It is not yet known to hold the state.
+    /// A master is connected. It is not yet known to have the mirror's state.
     Examining,
-    /// The gate is open.
+    /// Calls pass to the master.
     Serving,
     /// The master is late, and the mirror answers in its place.
     Late,
@@ -84,7 +84,7 @@ pub struct Lifecycle {
     /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`], and no master has
     /// served for [`CALM`] since.
     crash_loop: bool,
-    /// When the gate was opened. `None` while it is shut.
+    /// Since when calls pass to the master. `None` while they do not.
     serving_since: Option<Instant>,
     /// Whether an external master, which another program starts, has closed its connection and may have died.
     lost: bool,
@@ -149,7 +149,8 @@ impl Lifecycle {
         self.total_deaths
     }
 
-    /// Whether the mirror may answer while the gate is shut, because it is known to equal the state of a master.
+    /// Whether the mirror may answer while no calls pass to the master, because it is known to equal the state of a
+    /// master.
     pub fn may_stand_in(&self) -> bool {
         self.known
     }
@@ -177,7 +178,7 @@ impl Lifecycle {
             }
     }
 
-    /// Adds a sample of the child to the evidence of a hang.
+    /// Adds a sample of the child, which shows whether the child hangs.
     pub fn observe(&mut self, sample: Sample) {
         self.evidence.add(sample);
     }
@@ -382,7 +383,7 @@ impl Lifecycle {
         self.seeking_since.get_or_insert(now);
     }
 
-    /// Handles the loss of the master: shuts the gate, then takes the actions `then`.
+    /// Handles the loss of the master: lets no more calls pass to it, then takes the actions `then`.
     fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
         let was_serving = self.is_serving();
@@ -434,7 +435,8 @@ impl Lifecycle {
         }
     }
 
-    /// Kills the useless child. Its end arrives as [`Input::Exited`], which starts the next master.
+    /// Kills the child, which hangs or cannot serve. Its end arrives as [`Input::Exited`], which starts the next
+    /// master.
     fn give_up(&mut self, now: Instant) -> Vec<Action> {
         self.seek(now);
         vec![Action::Kill]

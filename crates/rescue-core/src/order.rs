@@ -39,14 +39,15 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long a notification of rosrescue waits after an answer about the same subject was written. A notification of
+/// How long a notification of rosrescue waits after an answer about the same [`Subject`] was written. A notification of
 /// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
-/// A notification that follows an answer within this time may be read before it. With thirty runnable processes on two
-/// cores, a node took 42 ms to switch threads.
+/// A notification that follows an answer within this time may be read before that answer. With thirty runnable
+/// processes on two cores, a node took 42 ms to switch threads.
 pub const RECENT: Duration = Duration::from_millis(500);
 /// How long after a notification that may have been read in the wrong order the node is told the state again. Idle
-/// threads of rosmaster look for work every 100 ms, so by then a master without a backlog has sent everything.
+/// threads of rosmaster look for work every 100 ms, so a master without a backlog has sent its own notifications within
+/// this time.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
 /// Longest time that a master with enough CPU time takes for one notification while many wait. A Python thread gives up
 /// its lock every 5 ms.
@@ -55,21 +56,24 @@ const MASTER_TAKES: Duration = Duration::from_millis(5);
 const BACKLOG_MAX: Duration = Duration::from_secs(10);
 /// How long a client that does not read its answer can delay other nodes' writes.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(1);
-/// How long a node that does not take a notification can delay writes about its subject. With thirty runnable processes
-/// on two cores, a node took more than 100 ms for that, and a newer value from the master came first.
+/// How long a node that does not take a notification can delay writes about the same topic, parameter or name. With
+/// thirty runnable processes on two cores, a node took more than 100 ms for that, and a newer value from the master
+/// came first.
 pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
 
-/// Answers and notifications on their way to nodes, and the notifications and calls that wait for them.
+/// The answers and notifications on their way to nodes, and the notifications that rosrescue still has to send. Decides
+/// which calls and notifications must wait.
 #[derive(Debug, Default)]
 pub struct Order {
     under_way: UnderWay,
     outbox: Outbox,
     /// The calls that the master has not answered yet. The master may be notifying nodes because of them.
     in_flight: InFlight,
-    /// The subjects about which the master has recently notified nodes.
+    /// The topics, parameters and names about which the master has recently notified nodes.
     told: Told,
     repeats: Repeats,
-    /// Whether a call or a notification waits for a change of the other fields.
+    /// Whether a call or a notification waits until an answer or a notification has arrived, or until the master has
+    /// answered its calls.
     awaited: bool,
 }
 
@@ -83,13 +87,14 @@ struct InFlight {
 /// Says that a call or a notification has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MustWait {
-    /// When to ask again at the latest. `None` if a change will be reported.
+    /// When to ask again at the latest. Before that, ask again when [`Order::written`], [`Order::settled`] or
+    /// [`Order::taken`] returns true.
     pub until: Option<Instant>,
 }
 
 impl Order {
-    /// Adds an answer about `heard` that is on its way. Returns its number, for [`Self::written`]. `None` if `heard` is
-    /// empty, because such an answer delays nothing.
+    /// Adds an answer that is on its way and tells nodes about `heard`. Returns its number, for [`Self::written`].
+    /// `None` if `heard` is empty, because nothing needs to wait for such an answer.
     pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
         self.under_way.forget(now);
         if heard.is_empty() {
@@ -106,20 +111,21 @@ impl Order {
         )
     }
 
-    /// Notes that the answer is ready. From now on, it delays calls and notifications for at most [`ANSWER_LIMIT`].
+    /// Notes that the answer can be sent to its caller. From now on, calls and notifications wait for it for at most
+    /// [`ANSWER_LIMIT`].
     pub fn ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
 
-    /// Notes that the answer has been written to its caller, or never will be. Returns whether anything waits
-    /// for that.
+    /// Notes that the answer has been written to its caller, or never will be. Returns whether a call or a notification
+    /// waits for that.
     pub fn written(&mut self, now: Instant, answer: u64) -> bool {
         self.under_way.written(now, answer);
         std::mem::take(&mut self.awaited)
     }
 
     /// Whether a call must wait before it goes to the master. It must wait if it may notify a node while an answer to
-    /// that node about the same subject is on its way.
+    /// that node about the same [`Subject`] is on its way.
     pub fn must_wait(&mut self, now: Instant, concern: &Concern) -> Option<MustWait> {
         let wait = match concern.is_anything() {
             true => self.under_way.must_wait(now),
@@ -132,8 +138,8 @@ impl Order {
         wait
     }
 
-    /// Whether a read must wait until the master has answered a call. If the read did not wait, its answer could be
-    /// older than a notification that the master sends to the reader.
+    /// Whether a read about `heard` must wait until the master has answered its calls. If the read did not wait, its
+    /// answer could be older than a notification that the master sends to the reader.
     pub fn read_must_wait(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
         let waits = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
@@ -141,8 +147,8 @@ impl Order {
         waits
     }
 
-    /// Notes that the master gets calls that may notify nodes of `tells`. `answers` are the numbers of these calls'
-    /// answers.
+    /// Notes that the master gets calls because of which it may notify nodes about `tells`. `answers` are the numbers
+    /// that [`Self::begin`] gave the answers to these calls.
     pub fn sent<'a>(&mut self, tells: impl IntoIterator<Item = &'a Subject>, answers: Vec<u64>) {
         // A call never displaces its own node, so the node's other calls need not wait for its own name.
         let told = tells
@@ -154,14 +160,14 @@ impl Order {
         self.in_flight.answers = answers;
     }
 
-    /// Notes that the master has no unanswered calls left, or that the mirror has answered them. Returns whether
-    /// anything waits for that.
+    /// Notes that the master has no unanswered calls left, or that the mirror has answered these calls. Returns whether
+    /// a call or a notification waits for that.
     pub fn settled(&mut self) -> bool {
         let in_flight = std::mem::take(&mut self.in_flight);
         !in_flight.tells.is_empty() && std::mem::take(&mut self.awaited)
     }
 
-    /// Notes that the master notifies `nodes` nodes of `subject`.
+    /// Notes that the master now notifies nodes of a change of `subject`. `nodes` is the number of these nodes.
     pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
         let until = self.told.add(now, subject, nodes);
         self.outbox.renew_all(subject);
@@ -176,8 +182,8 @@ impl Order {
         }
     }
 
-    /// Notes that the master answered a batch of `calls` after `took`. A busy computer delays the master's
-    /// notifications as much as its answers.
+    /// Notes that the master answered calls that were sent together, `calls` in number, after `took`. A busy computer
+    /// delays the master's notifications as much as its answers.
     pub fn master_answered(&mut self, took: Duration, calls: usize) {
         let per_call = took / u32::try_from(calls.max(1)).unwrap_or(u32::MAX);
         self.told.pace = per_call.max(self.told.pace * 7 / 8);
@@ -214,7 +220,7 @@ impl Order {
         self.outbox.take_idle_ports()
     }
 
-    /// What to do next for the node at `port`.
+    /// What to do next about the notifications for the node at `port`.
     pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> NextNotification {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
@@ -267,7 +273,8 @@ impl Order {
     }
 
     /// Notes that the node has taken the notification `number`, or that the notification could not be delivered. A node
-    /// reads later notifications after one that it has taken. Returns whether anything waits for that.
+    /// reads later notifications after one that it has taken. Returns whether a call or a notification waits for this
+    /// one.
     pub fn taken(&mut self, number: u64) -> bool {
         self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
@@ -284,7 +291,8 @@ impl Order {
         (self.told, self.repeats) = Default::default();
     }
 
-    /// Queues the repeats that are due.
+    /// Queues the notifications whose time has come: those that tell a state once more (see [`REPEAT_AFTER`]), and
+    /// those of [`Self::tell_state_at`].
     pub fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
             self.outbox.add(&port, subject, Payload::StateAgain);
@@ -296,12 +304,12 @@ impl Order {
         std::mem::take(&mut self.repeats.is_new)
     }
 
-    /// When [`Self::repeat`] is due next.
+    /// When to call [`Self::repeat`] next.
     pub fn next_repeat(&self) -> Option<Instant> {
         self.repeats.at.next()
     }
 
-    /// Whether an answer to the node at `port` about `subject` is on its way, and until when it delays others.
+    /// Whether an answer to the node at `port` about `subject` is on its way, and until when to wait for it.
     pub fn is_under_way(
         &mut self,
         now: Instant,
@@ -318,20 +326,21 @@ impl Order {
     }
 }
 
-/// The subjects about which the master may still be notifying nodes.
+/// The topics, parameters and names about which the master may still be notifying nodes.
 #[derive(Debug, Default)]
 struct Told {
-    /// When the master will have sent everything about each subject.
+    /// For each [`Subject`], when the master will certainly have sent all notifications about it.
     until: BySubject<Instant>,
     ends: Schedule<Subject>,
-    /// When the master is expected to have sent everything.
+    /// When the master is expected to have sent all notifications that it has begun.
     busy: Option<Instant>,
     /// How long the master recently took for a call.
     pace: Duration,
 }
 
 impl Told {
-    /// Notes that the master has begun to notify `nodes` nodes of `subject`. Returns when the master will be done.
+    /// Notes that the master has begun to notify `nodes` nodes of `subject`. Returns when the master will certainly
+    /// have sent all these notifications.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
         self.forget(now);
         let takes = MASTER_TAKES.max(self.pace) * u32::try_from(nodes).unwrap_or(u32::MAX);
@@ -358,7 +367,7 @@ impl Told {
     }
 }
 
-/// The repeats: which nodes, by port, to tell the state of a subject again, and when. Each time lies after the last
+/// Which nodes, by port, to tell the state of which [`Subject`] once more, and when. Each time lies after the last
 /// moment at which the node may have read notifications in the wrong order.
 #[derive(Debug, Default)]
 struct Repeats {
@@ -372,7 +381,7 @@ impl Repeats {
         self.at.set((subject, port), at);
     }
 
-    /// Drops the repeats of `subject` for nodes at ports other than `kept`.
+    /// Drops the planned notifications about `subject` for nodes at ports other than `kept`.
     fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
         let from = (subject.clone(), String::new());
         let about = self.at.at.range(from..);
@@ -386,7 +395,7 @@ impl Repeats {
     }
 }
 
-/// Times at which things are due.
+/// Things to do, each with its time.
 #[derive(Debug)]
 struct Schedule<T> {
     at: BTreeMap<T, Instant>,
@@ -403,7 +412,7 @@ impl<T> Default for Schedule<T> {
 }
 
 impl<T: Clone + Ord> Schedule<T> {
-    /// Sets when `thing` is due. Returns when it was due before.
+    /// Sets the time of `thing`. Returns its previous time.
     fn set(&mut self, thing: T, at: Instant) -> Option<Instant> {
         let before = self.at.insert(thing.clone(), at);
         if let Some(before) = before {

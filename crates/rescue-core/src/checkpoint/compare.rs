@@ -11,7 +11,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// The kind of the difference.
+/// What kind of entry differs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum What {

@@ -86,7 +86,7 @@ impl RecordContent {
 /// A line of the journal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// The number of the record. It grows by one with each record, across all generations of the file.
+    /// The number of the record. It grows by one with each record, also when a new file replaces the old one.
     pub seq: u64,
     pub entry: RecordContent,
 }
@@ -170,7 +170,7 @@ pub struct Damage {
 /// The readable parts of a file.
 #[derive(Debug)]
 pub struct Decoded {
-    /// The generation of the file. 0 if the first line is damaged.
+    /// The number of this file among all that were written at its path. 0 if the first line is damaged.
     pub generation: u64,
     /// The snapshot, or why it cannot be used.
     pub checkpoint: Result<Checkpoint, SnapshotError>,

@@ -88,7 +88,7 @@ pub struct Rebuilt {
     /// Nodes whose names were taken in the records or shortly before the snapshot, ordered by address. It is unknown
     /// which of them were told to shut down.
     pub displaced: Vec<Displaced>,
-    /// Why the snapshot was not used, if no master can be in its state.
+    /// If the snapshot was not used because no master can be in its state: the reason.
     pub trouble: Option<String>,
 }
 

@@ -12,7 +12,7 @@ use super::Reaction;
 
 /// Pause before a node is asked again. It is shorter if the socket table shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
-/// Age from which evidence no longer counts.
+/// Age from which the last [`Reaction`] of a port no longer counts.
 const STALE: Duration = Duration::from_secs(120);
 
 /// Whether a node is alive, as far as known.
@@ -29,14 +29,14 @@ pub enum Health {
     Dead,
 }
 
-/// The latest evidence about a port.
+/// The last [`Reaction`] of a port, and when it was seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Seen {
     sign: Reaction,
     pub at: Instant,
 }
 
-/// The latest evidence about each port at which a node is registered.
+/// The last [`Reaction`] of each port at which a node is registered.
 #[derive(Debug, Default)]
 pub struct Liveness(BTreeMap<String, Port>);
 
@@ -117,8 +117,8 @@ impl Port {
 }
 
 impl Health {
-    /// The health of a node with this evidence about its port. `unreachable` says whether the node left a health check
-    /// or a notification unanswered.
+    /// The health of a node whose port was last seen as in `seen`. `unreachable` says whether the node left a health
+    /// check or a notification unanswered.
     pub fn of(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {

@@ -1,20 +1,21 @@
-//! Limits how often the nodes of one host are asked, so that registrations cannot make rosrescue flood a
-//! host.
+//! Limits how often the nodes of one host are asked, so that registrations cannot make rosrescue flood a host. A
+//! *visit* asks the nodes at one port.
 
 use std::{
     collections::BTreeMap,
     time::{Duration, Instant},
 };
 
-/// Number of visits that a host may get at once. A recovery asks all nodes of a robot at the same time, and asks again
-/// soon after they have started. All of them may be on one computer.
+/// Number of visits, each to the nodes at one port, that a host may get at once. A recovery asks all nodes of a robot
+/// at the same time, and asks again soon after they have started. All of them may be on one computer.
 const AT_ONCE: u32 = 400;
 /// Pause between further visits to the same host.
 const PAUSE: Duration = Duration::from_millis(10);
 /// Number of hosts to remember. If there are more, those without recent visits are forgotten.
 const HOSTS: usize = 1024;
 
-/// The visits to each host, limited by a leaky bucket for each host (the generic cell rate algorithm).
+/// The visits to each host, each to the nodes at one port. A leaky bucket for each host limits them (the generic cell
+/// rate algorithm).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rates<K: Ord> {
     /// When all visits so far would be over if they had come one by one, with [`PAUSE`] between them.

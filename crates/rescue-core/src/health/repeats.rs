@@ -1,5 +1,5 @@
-//! Decides when rosrescue itself notifies nodes of a *subject*, a changed topic or parameter, because the master's
-//! notifications may be late.
+//! Decides when rosrescue itself notifies nodes of a changed topic or parameter, because the master's notifications may
+//! be late.
 //!
 //! rosmaster makes a list of publishers when something changes, but sends it only when one of its threads is free. If
 //! unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change as well, but no earlier
@@ -14,20 +14,20 @@ use std::{
 
 use super::backoff::Backoff;
 
-/// How long a subject must be unchanged before its notification. Idle threads of rosmaster look for work
+/// How long a topic or parameter must be unchanged before its notification. Idle threads of rosmaster look for work
 /// every 100 ms.
 const QUIET: Duration = Duration::from_millis(300);
-/// Longest delay of a notification while its subject keeps changing.
+/// Longest delay of a notification while its topic or parameter keeps changing.
 const LATEST: Duration = Duration::from_millis(600);
 /// Pause before the first repeat.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Longest pause between two repeats. Pauses double up to this length.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after a subject's last change its notification is repeated. Two connection attempts of rosmaster that get
-/// no answer take about this time.
+/// How long after the last change of a topic or parameter its notification is repeated. Two connection attempts of
+/// rosmaster that get no answer take about this time.
 const LIFE: Duration = Duration::from_secs(300);
 
-/// The changed subjects, each with the time of its next notification.
+/// The changed topics and parameters, each with the time of its next notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Repeats<K: Ord> {
     of: BTreeMap<K, Wait>,
@@ -35,7 +35,7 @@ pub struct Repeats<K: Ord> {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
-    /// The first change since the last notification.
+    /// When the topic or parameter first changed since its last notification. `None` if it has not.
     untold: Option<Instant>,
     backoff: Backoff,
     end: Instant,
@@ -65,8 +65,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. A subject is dropped if
-    /// there have been none since its change, because the master then notifies nodes in time.
+    /// The notifications to send now. `holding_up` says whether there are unreachable nodes. A topic or parameter is
+    /// dropped if all nodes have been reachable since its change, because the master then notifies nodes in time.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
@@ -84,7 +84,7 @@ impl<K: Ord + Clone> Repeats<K> {
         due
     }
 
-    /// When the next notification is due.
+    /// When to send the next notification.
     pub fn next(&self) -> Option<Instant> {
         self.of.values().map(|wait| wait.backoff.next()).min()
     }

@@ -2,7 +2,7 @@
 //! registers with a port, all other nodes registered there are gone.
 //!
 //! A master does not know that these nodes are gone. When the old node starts again at another port, the master sends a
-//! `shutdown` to the old address, where an innocent node listens by then (ros_comm issue 2241).
+//! `shutdown` to the old address, where an innocent node listens now (ros_comm issue 2241).
 
 use std::collections::HashMap;
 

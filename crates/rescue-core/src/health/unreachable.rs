@@ -60,8 +60,8 @@ impl Unreachable {
         self.of.is_empty()
     }
 
-    /// The ports to ask now. Returns a port again only after another call of [`Self::add`], so it is asked by one visit
-    /// at a time. The pauses between visits grow.
+    /// The ports to ask now. Returns a port again only after another call of [`Self::add`], so no port is asked twice
+    /// at the same time. The pauses grow.
     pub fn due(&mut self, now: Instant) -> Vec<String> {
         let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
         let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);
@@ -72,7 +72,7 @@ impl Unreachable {
         .collect()
     }
 
-    /// When the next port is due.
+    /// When to ask the next port.
     pub fn next(&self) -> Option<Instant> {
         let waiting = self.of.values().filter(|wait| !wait.asked);
         waiting.map(|wait| wait.backoff.next()).min()

@@ -6,7 +6,7 @@
 
 use std::time::{Duration, Instant};
 
-/// Shortest time that a silent master must have been watched before there can be proof.
+/// Shortest time that a silent master must have been watched before it can be judged to hang.
 pub const WATCHED_LEAST: Duration = Duration::from_millis(300);
 /// Shortest time that a silent master must have been watched if it was not stopped.
 const IDLE_LEAST: Duration = Duration::from_millis(900);
@@ -51,7 +51,7 @@ pub struct Sample {
     pub own_wait: Duration,
 }
 
-/// The conclusion from a silence.
+/// What the samples of a silent master show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SilenceVerdict {
     /// The master hangs, or the system does not show what it does.
@@ -67,10 +67,10 @@ pub enum SilenceVerdict {
 pub struct Evidence {
     /// The first sample since the last answer.
     silent: Option<Sample>,
-    /// The first sample that is judged.
+    /// The first sample that the next judgement uses.
     first: Option<Sample>,
     last: Option<Sample>,
-    /// The first of the latest consecutive samples in which the master was stopped and made no progress.
+    /// The first of the latest consecutive samples in which the master was stopped and used no processor time.
     stopped: Option<Sample>,
     /// Whether in any judged sample a thread needs the processor.
     runnable: bool,

@@ -7,9 +7,9 @@ use std::{
 
 /// How long a false alarm counts. In a false alarm the mirror has stood in for a master that was only late.
 const MEMORY: Duration = Duration::from_secs(60);
-/// Number of false alarms within [`MEMORY`] that change nothing. Each further one doubles the patience.
+/// Number of false alarms within [`MEMORY`] that do not make writes wait longer. Each further one doubles the wait.
 const FREE: usize = 5;
-/// The longest patience.
+/// Longest time that a write waits, unless the configured time is longer.
 const LONGEST: Duration = Duration::from_secs(10);
 /// Shortest time that a write waits, however long the master has been silent. The master may be about to answer a slow
 /// read. A rosmaster answers within a millisecond, or within about ten milliseconds if another call keeps its
@@ -26,7 +26,7 @@ pub struct Patience {
 }
 
 impl Patience {
-    /// Creates a patience of `base`, for a master that is mostly in time.
+    /// `base` is the time that a write waits while the master is rarely late.
     pub fn new(base: Duration) -> Self {
         Self {
             base,

@@ -20,7 +20,7 @@ pub struct Probing {
     pub count: u32,
     /// How long a write waits for the master before the mirror answers it.
     pub patience: Duration,
-    /// How long a new master that makes no progress may take until it listens.
+    /// How long a new master may take until it listens. Later it is killed if it hangs.
     pub start_limit: Duration,
 }
 
@@ -50,7 +50,7 @@ pub enum Input {
     ConnectionLost,
     /// A thread of the master has ended, as all its threads do when the master is killed.
     ThreadEnded,
-    /// A batch of writes that went to the master got no reply.
+    /// Writes that went to the master together got no reply.
     BatchLost,
     /// The master takes too long to answer a call.
     Slow,
@@ -63,9 +63,9 @@ pub enum Input {
     CaughtUp,
     /// The late master could not get the writes that it missed.
     NotCaughtUp,
-    /// The master holds the whole state.
+    /// The examination has ended: master and mirror have the same state.
     Examined {
-        /// Whether the master is a new incarnation.
+        /// Whether the master is another process than the one that served before.
         new: bool,
     },
     /// The server at the master's address is not a master.
@@ -89,7 +89,7 @@ pub enum Input {
     Stop,
 }
 
-/// Why the gate is shut.
+/// Why no calls pass to the master any more.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cause {
     /// The master's connection ended: it died, or it closed an idle connection.
@@ -130,13 +130,13 @@ pub enum Action {
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
-    /// Shut the gate: let no call pass.
+    /// Shut the gate: let no call pass to the master.
     ShutGate(Cause),
     /// Let the mirror answer until the master has answered its outstanding calls. Result: `LateAnswered`.
     StandIn,
     /// Send the late master the writes that the mirror has answered in its place. Results: `CaughtUp` or `NotCaughtUp`.
     CatchUp,
-    /// Open the gate: let calls pass.
+    /// Open the gate: let calls pass to the master.
     OpenGate,
     /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
     Probe,

@@ -1,4 +1,4 @@
-//! A collection with lookup by subject.
+//! A collection with lookup by topic, parameter or node name.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -7,7 +7,7 @@ use std::{
 
 use super::Subject;
 
-/// Values by subject. A parameter is also found by the keys above and below its own.
+/// Values by [`Subject`]: topic, parameter or node name. A parameter is also found by the keys above and below its own.
 #[derive(Debug)]
 pub struct BySubject<T> {
     exact: HashMap<Subject, Vec<T>>,
@@ -51,7 +51,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         }
     }
 
-    /// The values under subjects that `subject` concerns.
+    /// The values of all subjects that [concern](Subject::concerns) `subject`.
     pub fn about<'a>(&'a self, subject: &'a Subject) -> impl Iterator<Item = T> + 'a {
         let (exact, key) = match subject {
             Subject::Param(key) => (None, Some(key.as_str())),
@@ -77,7 +77,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         self.exact.is_empty() && self.params.is_empty()
     }
 
-    /// Whether `subject` concerns anything in this collection.
+    /// Whether [`Self::about`] finds any value.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
     }

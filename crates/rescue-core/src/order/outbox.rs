@@ -9,16 +9,16 @@ use std::{
 use super::Subject;
 use crate::{health::port_of, master::Master, xmlrpc::Call};
 
-/// If more notifications than this wait for a node, the node is told each subject only once, with the state at the time
-/// of sending.
+/// If more notifications than this wait for a node, those about the same topic or parameter become a single one with
+/// the state at the time of sending.
 const QUEUE_MAX: usize = 256;
 
-/// What to do next for a node.
+/// What to do next about the notifications for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NextNotification {
     /// Send `call`, then pass `number` to [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
-    /// Ask again when something has changed, or at `until` at the latest.
+    /// Ask again when the answer that is on its way to the node has been written, or at `until` at the latest.
     Wait { until: Option<Instant> },
     /// No notification waits. When there is one again, the port is among the [idle
     /// ports](super::Order::take_idle_ports).
@@ -40,7 +40,7 @@ pub(super) enum Payload {
     Call(Arc<Call>),
     /// The state at the time of sending.
     State,
-    /// The state at the time of sending, as a repeat.
+    /// The state at the time of sending, told once more in case the node has read notifications in the wrong order.
     StateAgain,
 }
 
@@ -56,7 +56,7 @@ impl Notification {
         !matches!(self.content, Payload::Call(_))
     }
 
-    /// Whether the notification is a repeat.
+    /// Whether the notification only tells a state once more; see [`Payload::StateAgain`].
     pub(super) fn is_repeat(&self) -> bool {
         matches!(self.content, Payload::StateAgain)
     }

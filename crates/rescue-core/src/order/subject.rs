@@ -1,11 +1,11 @@
-//! The subjects of calls and notifications.
+//! What calls and notifications are about: topics, parameters and node names.
 
 use crate::{
     health::port_of,
     master::{Master, Method, Request, names},
 };
 
-/// A subject about which nodes are notified.
+/// What a call or a notification is about.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Subject {
     /// The publishers of a topic, given by its resolved name.
@@ -29,7 +29,7 @@ impl Subject {
     }
 }
 
-/// A subject about which the node at a port is told, by an answer or a notification.
+/// A [`Subject`] about which the node at a port is told, by an answer or a notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     /// The node's port; see [`port_of`].
@@ -37,12 +37,13 @@ pub struct Heard {
     pub subject: Subject,
 }
 
-/// The subjects of a write: those about which nodes may be notified, and those about which its answer tells the caller.
+/// The [`Subject`]s of a write: those about which nodes may be notified, and those about which its answer tells the
+/// caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
-    /// The subjects about which the master may notify nodes because of the write.
+    /// The topics, parameters and names about which the master may notify nodes because of the write.
     tells: Vec<Subject>,
-    /// The subjects about which the answer tells the caller.
+    /// The topics, parameters and names about which the answer tells the caller.
     hears: Vec<Heard>,
     /// The port of the node that registers; see [`port_of`].
     port: Option<String>,
@@ -51,7 +52,7 @@ pub struct Concern {
 }
 
 impl Concern {
-    /// The subjects of a call. `None` stands for a call that could not be decoded.
+    /// What a call is about. `None` stands for a call that could not be decoded.
     pub fn of(call: Option<&Request>) -> Self {
         let Some(call) = call else {
             return Self {
@@ -100,7 +101,7 @@ impl Concern {
         self.port.get_or_insert_with(|| port.to_owned());
     }
 
-    /// The subjects about which the master may notify nodes because of the write.
+    /// The topics, parameters and names about which the master may notify nodes because of the write.
     pub fn tells(&self) -> &[Subject] {
         &self.tells
     }
@@ -109,8 +110,8 @@ impl Concern {
         self.anything
     }
 
-    /// If `subject` is a name, the port of the caller, which need not wait because a call never shuts its own node
-    /// down.
+    /// The caller's port if `subject` is a node name. The call need not wait for answers to that port, because it never
+    /// shuts its own node down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),
@@ -118,12 +119,12 @@ impl Concern {
         }
     }
 
-    /// The subjects about which the answer tells the caller.
+    /// The topics, parameters and names about which the answer tells the caller.
     pub fn heard(&self) -> Vec<Heard> {
         self.hears.clone()
     }
 
-    /// All subjects of the write.
+    /// All [`Subject`]s of the write.
     pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
         self.tells
             .iter()
@@ -131,8 +132,8 @@ impl Concern {
     }
 }
 
-/// The subjects about which the answer to a read tells the caller: parameters to which the caller subscribes. roscpp
-/// uses the value that `getParam` returns until it is notified of a newer one.
+/// The parameters about which the answer to a read tells the caller, if the caller subscribes to them. roscpp uses the
+/// value that `getParam` returns until it is notified of a newer one.
 pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
     let of = |call: &Request| {
         let (caller, key) = (call.caller()?, call.text(1)?);

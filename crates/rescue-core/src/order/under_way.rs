@@ -27,30 +27,32 @@ pub(super) enum DeliveryKind {
 struct Entry {
     kind: DeliveryKind,
     heard: Vec<Heard>,
-    /// Until when this answer or notification delays others. `None` if there is no limit yet.
+    /// When calls and notifications stop waiting for this answer, or calls for this notification. `None` if there is no
+    /// limit yet.
     limit: Option<Instant>,
     written: Option<Instant>,
 }
 
 impl Entry {
-    /// Whether this answer or notification delays others, and until when.
+    /// Whether calls or notifications must wait for this answer or notification, and until when.
     fn delays(&self, now: Instant) -> Option<MustWait> {
         let delays = self.written.is_none() && self.limit.is_none_or(|limit| now < limit);
         delays.then_some(MustWait { until: self.limit })
     }
 }
 
-/// The state of the last answer to a node about a subject.
+/// The state of the last answer to a node about a [`Subject`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Answer {
-    /// The answer is on its way and delays others, until `limit` if that is set.
+    /// The answer is on its way. Calls and notifications about the same [`Subject`] wait for it, but only until `limit`
+    /// if that is set.
     UnderWay { limit: Option<Instant> },
     /// The answer was written at this time, less than [`RECENT`] ago.
     Written { at: Instant },
 }
 
 impl UnderWay {
-    /// Adds an answer or a notification about `heard`, which delays others until `limit`. Returns its number.
+    /// Adds an answer or a notification about `heard`. `limit` is explained at [`Entry::limit`]. Returns its number.
     pub(super) fn add(
         &mut self,
         kind: DeliveryKind,
@@ -108,12 +110,13 @@ impl UnderWay {
         }
     }
 
-    /// Whether a call about any subject must wait for something on its way.
+    /// Whether a call that may change anything must wait for an answer or a notification on its way, and until when.
     pub(super) fn must_wait(&self, now: Instant) -> Option<MustWait> {
         self.entries.values().find_map(|entry| entry.delays(now))
     }
 
-    /// Whether a call about `subject` must wait for something on its way to a port other than `port`.
+    /// Whether a call about `subject` must wait for an answer or a notification on its way to a port other than `port`,
+    /// and until when.
     pub(super) fn must_wait_for(
         &self,
         now: Instant,
@@ -127,7 +130,8 @@ impl UnderWay {
         })
     }
 
-    /// Numbers and ports of everything about `subject` that is on its way, or was written recently.
+    /// Numbers and ports of the answers and notifications about `subject` that are on their way, and of answers about
+    /// it that were written recently.
     pub(super) fn about(&mut self, now: Instant, subject: &Subject) -> Vec<(u64, String)> {
         self.forget(now);
         self.concerned(subject)

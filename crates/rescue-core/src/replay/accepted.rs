@@ -22,7 +22,7 @@ impl Answered<'_> {
     ///
     /// `live` says that later entries of the same multicall may have written parameters. If so, a `subscribeParam` may
     /// return the later values, because rosmaster encodes its own dictionary after all entries have run. A value that
-    /// cannot be encoded may also have been replaced by then.
+    /// cannot be encoded may also have been replaced before that.
     pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
@@ -44,7 +44,7 @@ impl Answered<'_> {
 pub struct Accepted<'a> {
     /// The writes in the order in which the master executed them.
     pub calls: Vec<Answered<'a>>,
-    /// Whether this list is certain. If not, the master's state must be read again.
+    /// Whether this list is certainly complete and correct. If not, the master's state must be read again.
     pub certain: bool,
 }
 

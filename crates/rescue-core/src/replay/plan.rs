@@ -138,25 +138,25 @@ impl fmt::Display for Skipped {
 }
 
 impl Plan {
-    /// Plans to bring a master that holds `found` to `target`, and to leave `token` in it.
+    /// Plans to bring a master whose state is `found` to `target`, and to leave `token` in it.
     ///
     /// Tokens in `target` and `found` are ignored.
     pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
         Self::write(target, found, None, false, token)
     }
 
-    /// Plans to replace the token `before` of a master that holds `found`, and to change nothing else.
+    /// Plans to replace the token `before` of a master whose state is `found`, and to change nothing else.
     pub fn renew(found: &Master, before: &Token, token: &Token) -> Self {
         Self::write(found, found, Some(before), false, token)
     }
 
-    /// Plans to bring a master that holds `found` to exactly `target`, and to replace its token `before` by
+    /// Plans to bring a master whose state is `found` to exactly `target`, and to replace its token `before` by
     /// `token`. Everything is removed, subscribers first, and added again. No node is notified.
     pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
         Self::write(target, found, Some(before), true, token)
     }
 
-    /// Plans to run `writes` on a master that holds `behind`, and to replace its token `before` by `token`.
+    /// Plans to run `writes` on a master whose state is `behind`, and to replace its token `before` by `token`.
     pub fn run(behind: &Master, writes: Vec<Request>, before: &Token, token: &Token) -> Self {
         Self::sequence(behind, Some(before), token, |write| {
             let mut model = behind.clone();
@@ -193,8 +193,8 @@ impl Plan {
         })
     }
 
-    /// Plans the calls that `bring` writes, for a master that holds `found`. `bring` returns the resulting state and
-    /// what it has left out.
+    /// Plans the calls that `bring` writes, for a master whose state is `found`. `bring` returns the resulting state
+    /// and what it has left out.
     fn sequence(
         found: &Master,
         before: Option<&Token>,

@@ -1,11 +1,11 @@
-//! Computes the state for a master that could not be reached for a while and has missed writes. The *present
-//! incarnation* is the master process whose token has the latest number that rosrescue knows.
+//! Computes the state for a master that could not be reached for a while and has missed writes. That master has the
+//! latest token: the one with the highest number that rosrescue knows.
 
 use super::{Token, restore};
 use crate::master::{Master, Method, Request, names};
 use crate::xmlrpc::Value;
 
-/// Which side wins where the mirror and a master of the present incarnation differ.
+/// Which side wins where the mirror and a master with the latest [`Token`] differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
     /// The mirror wins only where it has answered writes since mirror and master were last equal. Everywhere else the
@@ -15,7 +15,7 @@ pub enum Authority {
     Mirror,
 }
 
-/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending` are writes that the
+/// Combines `held`, the state of a master with the latest [`Token`], with `mirror`. `pending` are writes that the
 /// mirror has answered and the master may not have run. Writes that the master has already run may run again: the
 /// result is the same.
 pub fn reconcile(
@@ -38,8 +38,8 @@ pub fn reconcile(
     target
 }
 
-/// What a master of the present incarnation may hold although no read shows it: the parameter subscriptions in
-/// `mirror`, and those that a pending write removes. Returns `mirror` with the removed ones added again.
+/// What a master with the latest [`Token`] may hold although no read shows it: the parameter subscriptions in `mirror`,
+/// and those that a pending write removes. Returns `mirror` with the removed subscriptions added again.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {

@@ -1,4 +1,4 @@
-//! Generates the calls of an injection, and tries each one on a model of the new master.
+//! Generates the calls that bring a new master to a state, and tries each one on a model of that master.
 
 use std::collections::HashMap;
 
@@ -19,13 +19,13 @@ pub(super) struct Restore<'a, W> {
     pub(super) skipped: Vec<Skipped>,
     target: &'a Master,
     found: &'a Master,
-    /// Number of the target's topic types that the new master has so far.
+    /// Number of topic types of `target`, the state to restore, that the new master has so far.
     types_in: usize,
-    /// Whether the new master's list of topic types is a prefix of the target's. If not, the order of the target's
-    /// types cannot be restored.
+    /// Whether the new master's list of topic types is a prefix of the list in `target`, the state to restore. If not,
+    /// the order of the types cannot be restored.
     ordered: bool,
-    /// Whether the target's topic types win over those of the new master. This requires that the new master has no
-    /// registrations.
+    /// Whether the topic types of `target`, the state to restore, win over those of the new master. This requires that
+    /// the new master has no registrations.
     types_win: bool,
 }
 
@@ -83,7 +83,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Notes the nodes that are left out.
+    /// Notes the nodes that are left out because the new master has them at another address.
     fn nodes(&mut self) {
         for (caller_id, api) in self.target.nodes() {
             if let Some(found_api) = self.found.api_of(caller_id)

@@ -13,7 +13,7 @@ pub(super) const HELPER: &str = "rosrescue/injection";
 /// An address that rosmaster accepts but never connects to, because `xmlrpc.client` refuses its scheme.
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
-/// Identifies an incarnation of a master.
+/// Identifies an *incarnation* of a master, which is one life of a master process.
 ///
 /// In the master, a token is two parameter subscriptions with unique caller ids. The first caller id contains the id of
 /// the session. The second contains the id and the number of the incarnation. The address of the first subscription
@@ -30,22 +30,22 @@ pub struct Token {
     number: u64,
 }
 
-/// The token that a master has, compared with the token of the latest incarnation that rosrescue knows.
+/// The token that a master has, compared with the latest [`Token`] that rosrescue knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bears {
-    /// The token of the latest incarnation that rosrescue knows, so this master has got the whole state.
+    /// The latest token that rosrescue knows, so this master has got the whole state.
     Present,
-    /// The token of an earlier incarnation in this session.
+    /// An earlier token of this session.
     Earlier,
-    /// The token of a later incarnation in this session, with its number.
+    /// A later token of this session, with its number.
     Later(u64),
     /// The master has no token of this session.
     Nothing,
 }
 
 impl Token {
-    /// Creates the token of incarnation `number` in the session `id`. Characters of `id` other than ASCII letters,
-    /// digits and `-` are replaced by `_`.
+    /// Creates the token of the master process with this `number` in the session `id`. Characters of `id` other than
+    /// ASCII letters, digits and `-` are replaced by `_`.
     pub fn new(id: &str, number: u64) -> Self {
         let safe = |c: char| {
             if c.is_ascii_alphanumeric() || c == '-' {
@@ -62,19 +62,19 @@ impl Token {
         }
     }
 
-    /// The calls that set the token in a master. The one with the incarnation's number comes last.
+    /// The calls that set the token in a master. The one with the master's number in its caller id comes last.
     pub fn leave(&self) -> [Request; 2] {
         let session_api = format!("{NO_API}/{}", self.number);
         [(&self.session, session_api.as_str()), (&self.name, NO_API)]
             .map(|(name, api)| subscription(Method::SubscribeParam, name, api))
     }
 
-    /// The call that removes the incarnation's number from a master.
+    /// The call that removes the part of the token with the number from a master.
     pub fn remove(&self) -> Request {
         subscription(Method::UnsubscribeParam, &self.name, NO_API)
     }
 
-    /// The call that looks up the incarnation's number. The answer has code 1 if the master has it.
+    /// The call that looks up the part of the token with the number. The answer has code 1 if the master has that part.
     pub fn lookup(&self) -> Request {
         lookup(&self.name)
     }
@@ -86,7 +86,7 @@ impl Token {
 
     /// The token that a master has. `number` says whether [`Self::lookup`] found the number, and `session` is the
     /// address that [`Self::lookup_session`] returned. An address without a number was left by an earlier version of
-    /// rosrescue, so that master is not a later incarnation.
+    /// rosrescue, so the token is not a later one.
     pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
         let later = session
             .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())

@@ -7,9 +7,9 @@ use super::{Authority, Bears};
 pub enum KnownMaster {
     /// Nothing is known.
     Nothing,
-    /// If the master has the token of the latest incarnation, this rosrescue has already let calls pass to the master.
+    /// If the master has the latest [`Token`](super::Token), this rosrescue has already let calls pass to the master.
     ServedIfPresent,
-    /// If the master has the token of the latest incarnation, rosrescue has injected the state, but got no
+    /// If the master has the latest [`Token`](super::Token), rosrescue has sent it the whole state, but got no
     /// confirmation.
     InjectedIfPresent,
     /// This rosrescue has just started the master on a free loopback port, as the successor of another master. So the
@@ -37,7 +37,7 @@ pub enum Treatment {
 }
 
 /// Decides what to do with a master that has the token `bears`. Not called for a master that can continue unchanged,
-/// because it has the present token, has been served and has missed no write.
+/// because it has the latest token, calls have already passed to it, and it has missed no write.
 pub fn treatment(
     bears: Bears,
     known: KnownMaster,

@@ -24,8 +24,8 @@ pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
-    /// Whether something is stored differently than in rosmaster, so that answers may differ. No ROS client sends a
-    /// value that causes this.
+    /// Whether a value is stored differently than in rosmaster, so that answers may differ. No ROS client sends a value
+    /// that causes this.
     pub(crate) inexact: bool,
     /// Whether the modelled master has unordered dictionaries, as on Python 2.
     pub(crate) unordered: bool,
@@ -145,7 +145,7 @@ impl Master {
         self.inexact || self.params.is_cut()
     }
 
-    /// Sets whether something is stored differently than in rosmaster, so that answers may differ.
+    /// Sets whether a value is stored differently than in rosmaster, so that answers may differ.
     pub fn set_inexact(&mut self, inexact: bool) {
         self.inexact = inexact;
     }

@@ -29,8 +29,9 @@ const HEADER_BYTES_MAX: usize = 256;
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Highest number of a generation or a record that is accepted from a file. Counting continues from the numbers in a
-/// file, so a number near the maximum of `u64` could overflow. rosrescue never writes a number above this limit.
+/// Highest number of a generation (checkpoint file) or a record that is accepted from a file. Counting continues from
+/// the numbers in a file, so a number near the maximum of `u64` could overflow. rosrescue never writes a number above
+/// this limit.
 const COUNT_MAX: u64 = u64::MAX / 2;
 
 /// Connects a file's records to its snapshot.
@@ -129,7 +130,7 @@ fn hex(digits: &[u8]) -> Option<u32> {
     })
 }
 
-/// Reads the number of a generation or a record.
+/// Reads the number of a generation (checkpoint file) or a record.
 pub(super) fn count(digits: &str) -> Option<u64> {
     digits.parse().ok().filter(|count| *count <= COUNT_MAX)
 }
