@@ -41,7 +41,7 @@ impl New {
     }
 }
 
-/// Asks the nodes whose turn it is.
+/// Asks the nodes whose last registration was at least [`IDENTIFY_AFTER`] ago.
 pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
     let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
         return;

@@ -153,7 +153,7 @@ async fn post(
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
             server.stats.requests_refused.count();
-            rarely!(warn, %peer, "refused a request from another computer that cannot be decoded");
+            rarely!(warn, %peer, "refused a request that cannot be decoded, from another computer");
             return Ok(xml(&Reply::Fault {
                 code: 1,
                 text: UNDECODED.to_owned(),
