@@ -25,7 +25,7 @@ pub enum State {
     /// rosrescue is giving the master its state (an injection). The mirror answers reads, and
     /// writes that change nothing. Other writes wait.
     Injecting,
-    /// Another computer has the master or will have it soon. Calls go there.
+    /// Another computer has the master or will have it soon. Calls are forwarded to that computer.
     Elsewhere,
     /// No master has been seen yet, so the state is unknown and calls wait.
     Unknown,

@@ -60,7 +60,8 @@ enum Done {
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// Carries out what the lifecycle decides.
+/// Carries out what the [lifecycle](crate::lifecycle) decides: starts and watches the master, gives it its state, and
+/// lets calls pass to it.
 pub(crate) struct Driver {
     examiner: Examiner,
     write_queue: WriteQueue,
@@ -82,7 +83,7 @@ pub(crate) struct Driver {
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
-    /// Total delay of timers that fired late.
+    /// Total delay of timers that fired late because this process had to wait for the processor.
     timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,

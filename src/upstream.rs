@@ -392,8 +392,8 @@ fn is_local(stream: &TcpStream) -> io::Result<bool> {
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
 }
 
-/// Listens like a master, and connects to it: the listener, the accepted end of the sentinel, the connections, and the
-/// sentinel.
+/// Listens like a master, and connects to that listener. Returns the listener, the accepted end of the sentinel, the
+/// connections, and the sentinel.
 #[cfg(test)]
 pub(crate) async fn test_master() -> (
     tokio::net::TcpListener,

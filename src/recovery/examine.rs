@@ -59,7 +59,7 @@ impl From<CallError> for ExamineError {
 }
 
 impl ExamineError {
-    /// The lifecycle's input for this error.
+    /// The [`Input`] that reports this error to the lifecycle.
     pub(crate) fn as_input(&self) -> Input {
         match self {
             Self::Silent { .. } | Self::Connect(ConnectError::Unreachable { .. }) => {

@@ -37,7 +37,7 @@ const UNDECODED: &str = "rosrescue cannot decode this request, and accepts such 
 
 /// The reason if a large answer finds no memory and cannot be made again later.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
-/// How often an answer is made again because it has grown.
+/// How often an answer is made at most. It is made again if it has grown meanwhile.
 const ATTEMPTS: u32 = 4;
 
 /// Answers one request.

@@ -94,7 +94,7 @@ pub struct Report {
     /// Time from when calls passed to the master again to the end of the health check, in milliseconds. `None` until it
     /// ends.
     pub health_check_ms: Option<f64>,
-    /// Number of items of each kind that the master holds now.
+    /// Number of items of each kind that the master holds after the recovery.
     pub restored: Counts,
     /// Parts of the state that could not be given to the master, with the reasons.
     pub not_restored: Vec<String>,
