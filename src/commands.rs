@@ -39,9 +39,11 @@ use crate::{
 /// Exit status of a command that has a result. [`CommandFailure`] has the other statuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Exit {
-    /// The command worked, and its answer is yes: protected, equal, in time.
+    /// The command worked, and its answer is yes. For example, the robot is protected, the states are equal, or the
+    /// wait ended in time.
     Good = 0,
-    /// The command worked, and its answer is no: unprotected, different, too late.
+    /// The command worked, and its answer is no. For example, the robot is unprotected, the states differ, or the wait
+    /// took too long.
     Bad = 1,
 }
 

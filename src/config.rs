@@ -53,7 +53,7 @@ pub enum UsageError {
     #[error("--listen: `{given}` is not an address; write {form}")]
     Listen {
         given: String,
-        /// The accepted forms.
+        /// The accepted forms of the address.
         form: &'static str,
     },
     /// A number of seconds that is not a valid duration.

@@ -12,7 +12,7 @@ use tokio::{sync::watch, time::Instant};
 /// The state of the gate: it says which side answers calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// Calls pass to the master with this incarnation number.
+    /// Calls pass to the master.
     Open {
         /// Number of the incarnation, which is one life of a master process; see [`Token`](crate::replay::Token).
         incarnation: u64,
@@ -25,7 +25,7 @@ pub enum State {
     /// rosrescue is giving the master its state (an injection). The mirror answers reads, and
     /// writes that change nothing. Other writes wait.
     Injecting,
-    /// Another computer has the master or will have it soon. Calls go there.
+    /// Another computer has the master or will have it soon. Calls are forwarded to that computer.
     Elsewhere,
     /// No master has been seen yet, so the state is unknown and calls wait.
     Unknown,
@@ -41,11 +41,11 @@ impl State {
 #[derive(Clone, Copy, Debug)]
 struct Gate {
     state: State,
-    /// When the gate was last opened or shut.
+    /// When calls last began or stopped passing to the master.
     since: Instant,
 }
 
-/// Creates a shut gate and returns its writing and its reading half.
+/// Creates a [gate](self) that lets no calls pass, and returns its writing and its reading half.
 pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
@@ -54,7 +54,7 @@ pub(crate) fn gate() -> (Tx, Rx) {
     (Tx(tx), Rx(rx))
 }
 
-/// The writing half, which opens and shuts the gate.
+/// The writing half of the [gate](self), which sets whether calls pass to the master.
 #[derive(Debug, Clone)]
 pub(crate) struct Tx(watch::Sender<Gate>);
 
@@ -79,7 +79,7 @@ impl Tx {
     }
 }
 
-/// The reading half, which reads the gate and waits for it.
+/// The reading half of the gate, which tells whether calls pass to the master and waits for a change.
 #[derive(Clone, Debug)]
 pub struct Rx(watch::Receiver<Gate>);
 
@@ -93,7 +93,7 @@ impl Rx {
         self.state().is_open()
     }
 
-    /// When the gate last opened or shut.
+    /// When calls last began or stopped passing to the master.
     pub fn since(&self) -> Instant {
         self.0.borrow().since
     }
@@ -128,8 +128,8 @@ impl Rx {
         }
     }
 
-    /// Waits until the gate has been shut for an uninterrupted `time`, counted from now at the earliest. Never returns
-    /// while the gate is open. Cancel safe, but cancelling restarts the count.
+    /// Waits until no calls have passed to the master for an uninterrupted `time`, counted from now at the earliest.
+    /// Never returns while calls pass. Cancel safe, but cancelling restarts the count.
     pub async fn shut_for(&mut self, time: Duration) {
         loop {
             self.wait_for(|state| !state.is_open()).await;

@@ -40,7 +40,7 @@ const PROGRAM: &str = "/proc/self/exe";
 /// Equals `OOMScoreAdjust=` in the systemd unit.
 const OOM_SCORE_ADJUST: &str = "-500";
 
-/// How long to wait until a worker handles signals. Then signals are sent anyway.
+/// Longest wait until a worker handles signals. After that, a signal is passed on even if it kills the worker.
 const START_TIME: Duration = Duration::from_secs(1);
 
 /// Why there is no worker. The exit status is 1.
@@ -126,7 +126,9 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
             Ok(signal) => return Ok(Some(signal)),
             Err(RecvTimeoutError::Timeout) => return Ok(None),
             Err(RecvTimeoutError::Disconnected) => {
-                return Err(io::Error::other("signals are no longer received"));
+                return Err(io::Error::other(
+                    "this process can no longer receive signals",
+                ));
             }
         }
     }
@@ -134,7 +136,8 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
 
 struct Worker {
     pid: u32,
-    /// Through this link the worker reports its progress and notices the guardian's end.
+    /// Through this link the worker reports that it handles signals, and later that it answers calls. Through it the
+    /// worker also notices the guardian's end.
     link: UnixStream,
     handles_signals: bool,
 }

@@ -11,7 +11,7 @@ const BURST: u32 = 10;
 /// Time after which one more event may pass: some 300 a day.
 const REFILL: Duration = Duration::from_secs(300);
 
-/// Permission for one event.
+/// Permission to let one event pass, for example to write one log line.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Pass {
     /// Number of events left out before this one. `None` if there were none.

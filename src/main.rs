@@ -26,7 +26,7 @@ use tracing_subscriber::{
     Layer, filter::Targets, fmt, layer::SubscriberExt, util::SubscriberInitExt,
 };
 
-/// How long threads may still run after everything else has ended.
+/// How long other threads may finish slow work, such as a name lookup, after rosrescue has stopped serving.
 const LAST_JOBS: Duration = Duration::from_millis(500);
 /// A signal to all processes named rosrescue, as sent by killall, reaches a worker twice: directly
 /// and through its guardian. A second signal within this time counts as the first one.

@@ -1,4 +1,4 @@
-//! Watches the nodes, and keeps what their registrations do not tell.
+//! Watches the nodes, and keeps facts about them that their registrations do not contain.
 
 pub(crate) mod client;
 pub(crate) mod health_check;
@@ -153,7 +153,7 @@ impl Nodes {
         }
     }
 
-    /// The names of the unreachable nodes.
+    /// The names of the unreachable nodes, whose ports did not answer.
     pub fn unreachable(&self) -> Vec<String> {
         // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
@@ -193,8 +193,8 @@ impl Nodes {
         was
     }
 
-    /// Decides whether rosrescue notifies nodes in addition to the master: while a node is unreachable or a check is
-    /// running. Returns whether that begins now.
+    /// Decides whether rosrescue notifies nodes in addition to the master. It does so while a node is unreachable or
+    /// the health check of a recovery runs. Returns whether it begins now.
     fn update_notifying(&self) -> bool {
         // Only here is the ledger's lock taken while this lock is held. Otherwise an older result could be stored last.
         let unreachable = self.lock();
@@ -204,8 +204,8 @@ impl Nodes {
             && notifying
     }
 
-    /// Makes rosrescue notify nodes in addition to the master until the result is dropped. Until the end of the check
-    /// it is unknown which nodes are unreachable and hold up the master's notifications.
+    /// Makes rosrescue notify nodes in addition to the master until the result is dropped. Until the end of the health
+    /// check it is unknown which nodes are unreachable and hold up the master's notifications.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
         nodes.update_notifying();
@@ -213,7 +213,8 @@ impl Nodes {
     }
 }
 
-/// The health check of a recovery.
+/// The health check of a recovery, until it ends. Until this value is dropped, rosrescue notifies nodes in addition to
+/// the master.
 pub(super) struct CheckUnderWay(Arc<Nodes>);
 
 impl Drop for CheckUnderWay {
@@ -291,7 +292,8 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<NotifyingChange>) {
 }
 
 /// Takes the topics and parameters whose notifications may not have been sent by the master that was lost at `outage`.
-/// Also begins to shut down nodes whose names were taken, if that master may not have told them.
+/// Also begins to shut down nodes whose names other nodes have taken, if that master may have died before it asked them
+/// to.
 fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
     let owed = nodes
         .ledger
@@ -394,7 +396,7 @@ async fn reap(nodes: Arc<Nodes>) {
             info,
             ?removed,
             ?reconciled,
-            "the regular health check has corrected the master"
+            "the regular health check has corrected registrations in the master"
         );
     }
 }

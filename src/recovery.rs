@@ -44,7 +44,8 @@ use crate::{
 /// Limits the log lines about the beginning and the end of a crash loop.
 static CRASH_LOOP: Pair = Pair::new();
 
-/// The result of a step. At most one step runs at a time.
+/// The result of a step of the recovery, such as connecting to the master or examining it. At most one step runs at a
+/// time.
 enum Done {
     Connected(Arc<Sentinel>),
     NotConnected(ConnectError),
@@ -59,7 +60,8 @@ enum Done {
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// Carries out what the lifecycle decides.
+/// Carries out what the [lifecycle](crate::lifecycle) decides: starts and watches the master, gives it its state, and
+/// lets calls pass to it.
 pub(crate) struct Driver {
     examiner: Examiner,
     write_queue: WriteQueue,
@@ -69,18 +71,19 @@ pub(crate) struct Driver {
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     rescues: Rescues,
-    /// Number of the rescue in which the present master was restored. Set until the gate opens.
+    /// Number of the rescue in which the present master was restored. Set until calls pass to that master.
     restored: Option<u64>,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
     /// Completes when the [`Sentinel`]'s connection ends, which shows that the master has ended.
     ended: Option<Ended>,
-    /// Completes when a thread of the master ends. Used once for each master.
+    /// Completes when a thread of the master ends, which is an early sign of its death. Only the first such end of each
+    /// master counts.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
-    /// Total delay of timers that fired late.
+    /// Total delay of timers that fired late because this process had to wait for the processor.
     timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
@@ -126,14 +129,15 @@ impl Driver {
         }
     }
 
-    /// Does what [`Self::start`] does, on a computer that gets the master from another computer. `cause` is the reason.
+    /// Does what [`Self::start`] does, on a computer that gets the master from another computer. `cause` is the reason,
+    /// for the report.
     pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
         self.outage.cause = cause;
         self.start(true)
     }
 
-    /// Lets the mirror stand in if the state is known, and returns the first actions. `restored` says whether the
-    /// mirror comes from a checkpoint whose session continues.
+    /// Lets the mirror answer calls if the state is known, and returns the first actions of the recovery. `restored`
+    /// says whether the mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
         let actions = self
@@ -195,7 +199,8 @@ impl Driver {
         }
     }
 
-    /// Samples the master's process, if the lifecycle needs a sample for `input`.
+    /// Measures what the master's process does, if the lifecycle needs that to decide about `input`: it may have to
+    /// tell a hung master from a slow one.
     async fn sample_for(&mut self, input: Input) {
         let process = self.process.as_ref();
         let pid = process.and_then(MasterProcess::pid);
@@ -211,8 +216,9 @@ impl Driver {
         });
     }
 
-    /// Handles an input that ends the contact with the master. First tells the lifecycle whether that master had
-    /// answered, then drops the step in progress.
+    /// Drops the connection to the master and the step in progress, if `input` says that the master has ended or cannot
+    /// be used. Before that, if the master died while it was getting its state, tells the lifecycle that it had
+    /// answered.
     fn end_contact(&mut self, input: Input) {
         if !matches!(
             input,
@@ -336,7 +342,7 @@ impl Driver {
             Action::StandIn => {
                 rarely!(
                     info,
-                    "the master is slow to answer; rosrescue answers in its place until it does"
+                    "the master is slow to answer; rosrescue answers in its place until the master answers again"
                 );
                 self.examiner.gate.set(State::Late);
             }
@@ -488,7 +494,7 @@ impl Driver {
         self.probe_deadline = None;
     }
 
-    /// Shuts the gate. The mirror stands in if the state is known.
+    /// Lets no calls pass to the master. The mirror answers them if the state is known; otherwise they wait.
     fn keep_shut(&self) {
         self.examiner.ledger.end_injection();
         self.examiner.gate.set(match self.lifecycle.may_stand_in() {
@@ -549,8 +555,8 @@ impl Driver {
     }
 }
 
-/// Completes when a thread of the master `pid` ends. `None` if the master runs elsewhere. Never completes if the kernel
-/// cannot watch threads.
+/// Completes when a thread of the master `pid` ends. `None` if the master runs on another computer. Never completes if
+/// the kernel cannot watch threads.
 fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     let id = u32::try_from(pid).ok().filter(|_| sentinel.is_local())?;
     Some(Box::pin(async move {

@@ -124,7 +124,8 @@ pub fn address_override(env: Lookup<'_>) -> Option<String> {
         .filter(|address| !address.is_empty())
 }
 
-/// Name and value of the variable, if [`address_override`] is invalid. `None` if it is valid or unset.
+/// Name and value of the variable that [`address_override`] reads, if its value is neither a host name nor an address.
+/// `None` if it is valid or unset.
 pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     let host = address_override(env)?;
     // The scope of an address such as fe80::1%eth0 is not checked.
@@ -161,8 +162,8 @@ pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     }
 }
 
-/// The announced host of this computer, chosen as rosgraph does. It is the override, else the host name unless that is
-/// a loopback name, else `local_address`.
+/// The announced host of this computer, chosen as rosgraph does. It is the [`address_override`], else the host name
+/// unless that is a loopback name, else `local_address`.
 pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<IpAddr>) -> String {
     if let Some(address) = address_override(env) {
         return address;

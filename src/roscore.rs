@@ -39,7 +39,7 @@ pub(crate) struct Roscore {
     pub gate: gate::Rx,
     /// The address that rosrescue serves.
     pub uri: String,
-    /// Path of the checkpoint. It marks the rosout of this rosrescue.
+    /// Path of the checkpoint. The rosout of this rosrescue is known by this path in its environment.
     pub checkpoint: PathBuf,
     /// Longest time for a node to answer.
     pub node_timeout: Duration,
@@ -61,7 +61,7 @@ fn run_id(roscore: &Roscore) -> Request {
     set("/run_id", &roscore.ledger.session().id)
 }
 
-/// Sets the run id of a new session before there is a master. It is injected with the rest of the state, so every
+/// Sets the run id of a new session before there is a master. The master gets it with the rest of the state, so every
 /// roslaunch sees a master with a run id. Does nothing if the master may already have a run id.
 pub(crate) fn seed_run_id(roscore: &Roscore) {
     if !has(roscore, "/run_id") {

@@ -178,7 +178,8 @@ impl Facts {
         }
     }
 
-    /// Since when everything has been in order. Must be called only while calls pass and everything is in order.
+    /// Since when changes have been recorded and there has been no crash loop. Must be called only while this is so and
+    /// calls pass to the master.
     fn settled_since(&self) -> Instant {
         self.disk.since.max(self.calm_since.unwrap_or(self.started))
     }

@@ -69,7 +69,7 @@ pub enum CallError {
     /// The master may have run the call.
     #[error("the master sent no reply: {0}")]
     MaybeSent(hyper::Error),
-    /// The reply may be from another incarnation.
+    /// The reply may be from another master process, which does not hold the present state.
     #[error("the reply may come from another master: {0}")]
     Unverified(Box<VerifyError>),
     /// The reply's body ended early or exceeded a limit.
@@ -155,7 +155,8 @@ pub struct Upstream {
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
     /// Number of connections for writes.
     writers: watch::Sender<usize>,
-    /// How calls are verified to reach the present incarnation. `None` while calls do not pass.
+    /// How rosrescue verifies that a call reaches the master process that holds the present state. `None` while no
+    /// calls pass to a master.
     verification: Mutex<Option<Verification>>,
     open_calls: Mutex<OpenCalls>,
 }
@@ -242,7 +243,8 @@ impl Upstream {
         Ok((address, stream))
     }
 
-    /// How calls are verified to reach the present incarnation. `None` while calls do not pass.
+    /// How rosrescue verifies that a call reaches the master process that holds the present state. `None` while no
+    /// calls pass to a master.
     pub(crate) fn verification(&self) -> Option<Verification> {
         self.lock_verification().clone()
     }
@@ -264,7 +266,7 @@ impl Upstream {
         OpenCall(self)
     }
 
-    /// Since when calls to the served master are under way and none has ended.
+    /// Since when calls to the master have been under way without any of them ending. `None` if none is under way.
     pub(crate) fn silent_since(&self) -> Option<Instant> {
         self.lock_open_calls().silent_since()
     }
@@ -390,8 +392,8 @@ fn is_local(stream: &TcpStream) -> io::Result<bool> {
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
 }
 
-/// Listens like a master, and connects to it: the listener, the accepted end of the sentinel, the connections, and the
-/// sentinel.
+/// Listens like a master, and connects to that listener. Returns the listener, the accepted end of the sentinel, the
+/// connections, and the sentinel.
 #[cfg(test)]
 pub(crate) async fn test_master() -> (
     tokio::net::TcpListener,

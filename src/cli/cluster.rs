@@ -20,7 +20,8 @@ pub struct ClusterArgs {
     #[arg(long, env = "ROSRESCUE_CLUSTER", value_name = "URLS")]
     #[arg(value_parser = members)]
     pub cluster: Option<ClusterArg>,
-    /// Address where the other computers reach this one, HOST or HOST:PORT [default: that of its ROS_MASTER_URI]
+    /// Address where the other computers reach this one, HOST or HOST:PORT [default: the host and port of the
+    /// ROS_MASTER_URI that rosrescue prints]
     #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST", help_heading = COMPUTERS)]
     #[arg(requires = "cluster")]
     pub advertise: Option<String>,

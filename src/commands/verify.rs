@@ -32,7 +32,8 @@ struct Verified {
     file: String,
     /// Whether the file is undamaged.
     whole: bool,
-    /// Whether everything recorded can be used, if necessary from the previous generation of the file.
+    /// Whether everything recorded can be used, if necessary from the previous version of the file, which is kept
+    /// beside it.
     exact: bool,
     /// Number of the last record that the usable snapshot includes. `None` if no snapshot is usable.
     snapshot: Option<u64>,

@@ -16,7 +16,7 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Pause between two tries.
+/// Pause between two checks of the conditions.
 const PAUSE: Duration = Duration::from_millis(250);
 
 /// The result of waiting.

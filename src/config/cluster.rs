@@ -25,7 +25,7 @@ pub struct ClusterConfig {
     pub robot: String,
     /// This computer's name, unique within the robot.
     pub name: String,
-    /// The host name, if it is part of the computer's name. `None` if the name was given.
+    /// The host name, if it is part of the computer's name. `None` if the user chose the name.
     pub(super) hostname: Option<String>,
     /// Address at which other computers reach this rosrescue.
     pub advertised: MasterUri,

@@ -3,7 +3,8 @@
 //!
 //! In the protocol, LISTEN_PID is the process that the sockets are meant for. A guardian cannot know its worker's
 //! process id before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. Its last socket is not a listener
-//! but one end of a pair, the *link*. Through it the worker reports its progress and notices the end of the guardian.
+//! but one end of a pair, the *link*. Through it the worker reports that it handles signals, and later that it answers
+//! calls, and notices the end of the guardian.
 
 use std::{
     io::{self, Write},

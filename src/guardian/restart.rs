@@ -6,8 +6,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Number of workers in a row that are replaced at once although they failed before they answered a call. Also the most
-/// deaths within [`SPAN`] that are not reported as repeated.
+/// Number of workers in a row that are replaced at once although they failed before they answered a call. Also the
+/// maximum number of deaths within [`SPAN`] that are not reported as repeated.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
 /// The first pause. Each following pause is twice as long.

@@ -132,7 +132,8 @@ async fn collect(mut visits: JoinSet<CheckResult>) -> HealthCheck {
     check
 }
 
-/// Asks the node behind `port` until its answers allow a verdict on each name there.
+/// Asks the node behind `port` until its answers tell, for each node name registered there, whether that node is alive
+/// and its registrations are right.
 pub(crate) fn visit(
     nodes: &Arc<Nodes>,
     port: String,
@@ -236,7 +237,8 @@ impl Drop for Waiting {
     }
 }
 
-/// The names at an address when the question was asked, each with its last calls.
+/// The node names registered at an address when the node there was asked, each with the numbers of its last
+/// registration and unregistration.
 #[derive(Default)]
 struct Asked {
     api: String,
@@ -252,7 +254,7 @@ struct Findings {
 }
 
 impl Asked {
-    /// All addresses with this port.
+    /// The names registered at this port, for each address that has it.
     fn all(nodes: &Nodes, port: &str) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
             let mut all = BTreeMap::<_, Self>::new();
@@ -275,7 +277,7 @@ impl Asked {
         })
     }
 
-    /// Each name with its last calls.
+    /// Each name with the numbers of its last registration and unregistration.
     fn calls(&self) -> impl Iterator<Item = (String, LastCalls)> {
         let calls = self.names.iter().zip(&self.unregistered);
         calls.map(|(name, unregistered)| {
@@ -287,7 +289,7 @@ impl Asked {
         })
     }
 
-    /// What the answers in `interview` mean for the names that have registered nothing since the question.
+    /// What the answers in `interview` mean for the names that have registered nothing since the node was asked.
     fn findings(&self, nodes: &Nodes, interview: &Interview) -> Findings {
         let api = self.api.as_str();
         let Interview { pid, claims, .. } = interview;
@@ -379,9 +381,9 @@ impl Findings {
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
-    /// Carries out the findings that are certain. A removal is certain only if the previous question led to it too.
-    /// Removals come first, because a registration that rosrescue makes for a node counts as the node's own, and voids
-    /// the other findings about that node.
+    /// Carries out the findings that are certain. A removal is certain only if it is also among the findings of the
+    /// previous question, `before`. Removals come first, because a registration that rosrescue makes for a node counts
+    /// as the node's own, and voids the other findings about that node.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.others {
             let mut earlier = before.others.iter();

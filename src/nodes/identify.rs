@@ -30,7 +30,7 @@ impl New {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether names still wait at `port`. If none do, the next name needs a new task.
+    /// Whether names at `port` still wait to be identified. If none do, the next name there needs a new task.
     fn go_on(&self, port: &str) -> bool {
         let mut new = self.lock();
         let waiting = new.get(port).is_some_and(|names| !names.is_empty());
@@ -41,7 +41,7 @@ impl New {
     }
 }
 
-/// Asks the nodes whose turn it is.
+/// Asks the nodes whose last registration was at least [`IDENTIFY_AFTER`] ago.
 pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
     let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
         return;

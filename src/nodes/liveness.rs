@@ -33,7 +33,7 @@ const LOOK_AGAIN: Duration = Duration::from_secs(2);
 /// Number of nodes asked at the same time.
 const AT_ONCE: usize = 8;
 
-/// The evidence collected so far.
+/// What is known about which nodes are alive.
 #[derive(Debug)]
 pub(super) struct LivenessEvidence {
     known: Mutex<Known>,
@@ -51,7 +51,7 @@ struct Known {
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub(crate) health: Health,
-    /// Time of the latest evidence. `None` if there has been no evidence.
+    /// When rosrescue last found out whether the node is alive. `None` if it never has.
     pub(crate) checked: Option<Instant>,
 }
 

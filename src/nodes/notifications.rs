@@ -82,7 +82,8 @@ pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
     send_waiting(nodes);
 }
 
-/// Tells the node at `api` the present state of `subject`.
+/// Tells the node at `api` the present publishers of a topic, or the present value of a parameter, which `subject`
+/// names.
 pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     let port = port_of(api);
     let tell = |order: &mut Order, _: &Master| order.tell_state(port, subject);
@@ -90,7 +91,8 @@ pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     send_waiting(nodes);
 }
 
-/// Sends all waiting notifications. An unreachable node gets everything once it answers.
+/// Sends all waiting notifications. An unreachable node gets the present state of all its topics and parameters once it
+/// answers.
 pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     let ports = nodes.ledger.with_order(|order, _| order.take_idle_ports());
     for port in ports {
@@ -211,7 +213,8 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     });
 }
 
-/// Waits until no answer to the node at `port` about `subject` is on its way.
+/// Waits until each answer to the node at `port` about `subject`, a topic, parameter or node name, has been written or
+/// has taken too long.
 async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
     let mut changed = nodes.ledger.order_changed();
     loop {
@@ -236,7 +239,7 @@ fn is_taken(nodes: &Nodes, api: &str) -> bool {
         .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
 }
 
-/// Whether the node that answers is the displaced one. Without evidence the result is false.
+/// Whether the node that answers is the displaced one. False if neither its process id nor its topics tell.
 fn is_itself(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
     match (displaced.pid, pid) {
         (Some(known), Some(pid)) => known == pid,

@@ -16,7 +16,7 @@ use crate::health::Rates;
 /// Number of nodes that are asked at the same time. Each takes two file descriptors, at most until its deadline.
 const AT_ONCE: usize = 64;
 
-/// The visits that wait or are in progress.
+/// The questions to nodes that wait or are in progress.
 #[derive(Debug)]
 pub(super) struct Visits {
     turns: Mutex<HashMap<String, Weak<Turn<()>>>>,
@@ -24,7 +24,7 @@ pub(super) struct Visits {
     permits: Semaphore,
 }
 
-/// Permission for one visit with up to three connections.
+/// Permission to ask the node at one port, over up to three connections.
 #[derive(Debug)]
 pub(super) struct Admitted<'a> {
     _turn: OwnedMutexGuard<()>,

@@ -42,7 +42,7 @@ pub(crate) enum Who {
         /// Start time. Together with the id it identifies the process.
         started: u64,
     },
-    /// A process of the user with this id. rosrescue may not inspect it.
+    /// A process of the user with this id, which rosrescue has no permission to inspect.
     User(u32),
     /// Another computer.
     Host(IpAddr),

@@ -8,8 +8,8 @@ use crate::lifecycle::evidence::Effort;
 /// Maximum number of processes that are counted together.
 const FAMILY_MOST: usize = 64;
 
-/// The effort of the process `pid` and its descendants: a wrapper may have started the master. `None` if there is no
-/// such process.
+/// What the threads of the process `pid` and its descendants do: a wrapper may have started the master. `None` if there
+/// is no such process.
 pub(crate) fn of(pid: u32) -> Option<Effort> {
     let mut threads = Threads::default();
     let mut family = vec![pid.to_string()];

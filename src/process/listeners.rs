@@ -35,7 +35,8 @@ impl Holder {
     }
 }
 
-/// Judges the listeners that were found. `taken` says that a process other than the child listens.
+/// Tells from the listeners that were `seen` who has the port. `taken` says that a process other than the child
+/// listens.
 fn judge(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
     match seen.first() {
         _ if !taken => Holder::Unknown,

@@ -33,9 +33,9 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 /// A rosmaster that an earlier rosrescue left running.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Orphan {
-    /// The rosmaster listens at the expected port.
+    /// The rosmaster listens at the port of the session's last master.
     Serving(u32),
-    /// The rosmaster was given that port but does not listen yet, so it has no state.
+    /// The rosmaster was given the port of the session's last master but does not listen yet, so it has no state.
     Starting(u32),
 }
 
@@ -70,7 +70,7 @@ impl Rosmaster {
         for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
             tracing::info!(
                 pid,
-                "killing a useless rosmaster that an earlier rosrescue left running"
+                "killing a rosmaster that an earlier rosrescue left running: it does not listen at the port of this session's last master"
             );
             signal_process(pid, Signal::KILL);
         }

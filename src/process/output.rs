@@ -67,7 +67,7 @@ impl Output {
             warn,
             file = %self.path.display(),
             error,
-            "cannot create the output file of a child process; it starts without one"
+            "cannot create the output file of a child process; the process starts without it"
         );
     }
 

@@ -21,7 +21,7 @@ pub(crate) struct Rosout {
     output: Output,
     /// PID file of the last rosout.
     pid_file: PidFile,
-    /// The checkpoint that marks the rosouts of this rosrescue.
+    /// The checkpoint's path, which marks the rosouts of this rosrescue in their environment.
     owner: OsString,
 }
 

@@ -59,7 +59,7 @@ impl From<CallError> for ExamineError {
 }
 
 impl ExamineError {
-    /// The lifecycle's input for this error.
+    /// The [`Input`] that reports this error to the lifecycle.
     pub(crate) fn as_input(&self) -> Input {
         match self {
             Self::Silent { .. } | Self::Connect(ConnectError::Unreachable { .. }) => {
@@ -75,7 +75,7 @@ impl ExamineError {
     }
 }
 
-/// The result of an examination.
+/// The result of [`Examiner::examine`].
 #[derive(Debug)]
 pub(crate) struct Examination {
     /// How the master got its state.
@@ -87,7 +87,7 @@ pub(crate) struct Examination {
     /// How rosrescue makes sure that calls reach this master.
     pub verification: Verification,
     pub counts: Counts,
-    /// Parts of the state that were not injected, with the reasons.
+    /// Parts of the state that the master was not given, with the reasons.
     pub skipped: Vec<String>,
     /// Differences that remain after the last repair.
     pub mismatches: Vec<String>,
@@ -97,15 +97,15 @@ pub(crate) struct Examination {
     pub injection: Duration,
 }
 
-/// The parameters of an examination.
+/// The parameters of [`Examiner::examine`].
 #[derive(Debug)]
 pub(crate) struct Manner {
     pub known: KnownMaster,
-    /// The injection into an empty master, if it was prepared in advance.
+    /// The call that gives an empty master the mirror's state, if it was prepared in advance.
     pub prepared: Option<JoinHandle<Prepared>>,
 }
 
-/// An injection that was prepared in advance.
+/// An *injection*: the call that gives a master the mirror's state.
 #[derive(Debug)]
 pub(crate) struct Prepared {
     /// The mirror's version and the next token when this injection was prepared. `None` if it was not prepared in
@@ -140,7 +140,7 @@ struct Target {
 enum Change {
     /// Add what the master lacks.
     Add,
-    /// The master holds the state already, and only gets a new token in place of this one.
+    /// The master holds the state already, and only gets a new [`Token`] in place of this one.
     Renew(Token),
     /// Replace everything that the master holds, including this token.
     Replace(Token),
@@ -156,7 +156,7 @@ impl Change {
     }
 }
 
-/// Examines masters, and opens the gate to one that holds the mirror's state.
+/// Examines masters, and lets calls pass to one that holds the mirror's state.
 #[derive(Clone)]
 pub(crate) struct Examiner {
     pub ledger: Arc<Ledger>,
@@ -182,7 +182,7 @@ impl Examiner {
         }
     }
 
-    /// Lets calls pass to the present incarnation.
+    /// Lets calls pass to the present master.
     pub(super) fn open_gate(&self) {
         let incarnation = self.ledger.serve();
         self.gate.set(State::Open { incarnation });
@@ -451,7 +451,7 @@ impl Examiner {
                 error,
                 round,
                 mismatches = ?examination.mismatches,
-                "the master does not hold what was restored to it; restoring again; please report this line"
+                "the master does not hold the state that it was given; giving it the missing part again; please report this line"
             );
             // What the master holds now replaces what was expected, and the missing part is injected again.
             let first = self.first_look(connection).await?;
@@ -492,8 +492,8 @@ impl Examiner {
     }
 }
 
-/// Whether a master has answered as planned. Decodes the reply only if its bytes differ from the prediction, because
-/// the reply is long and calls are waiting.
+/// Whether a master's reply is the one that `plan` predicts; if not, the differences. Decodes the reply only if its
+/// bytes differ from the prediction, because the reply is long and calls are waiting.
 fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
     Ok(match raw.body == plan.answer() {
         true => Ok(()),

@@ -28,10 +28,10 @@ pub(crate) struct MasterProcess {
     /// Process id of a master that an earlier rosrescue had just started. It has no state, so it is used instead of a
     /// new master.
     starting: Option<u32>,
-    /// Process id of a new child until it is called for the first time.
+    /// Process id of a new child, until rosrescue begins to examine it.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
-    /// How the last master ended, until it is reported.
+    /// How the last master ended, until a report has taken it.
     end: Option<String>,
     /// Whether rosrescue killed the present master.
     killed: bool,
@@ -154,7 +154,7 @@ impl MasterProcess {
         self.port = None;
     }
 
-    /// Takes the process id of a master that was started since the last call.
+    /// Takes the process id of a master that was started since this function was last called.
     pub(crate) fn take_new(&mut self) -> Option<i32> {
         self.new.take()
     }

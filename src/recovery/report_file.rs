@@ -30,7 +30,7 @@ static LIMIT: Limit = Limit::new();
 pub(crate) struct ReportRecord {
     /// Id of the session.
     session: String,
-    /// Totals of the session at that time, as in [`Facts`](crate::status::Facts).
+    /// Totals of the session when the report was made, as in [`Facts`](crate::status::Facts).
     rescues: u64,
     deaths: u64,
     worker_restarts: u64,
@@ -133,7 +133,7 @@ fn read_one(file: &Path) -> Option<ReportRecord> {
 }
 
 /// The facts about the session with this id in the files next to the checkpoint at `checkpoint`. `died` says whether
-/// its last process crashed. `states` is the highest number of a kept rescue state.
+/// its last process crashed. `states` is the highest rescue number among the checkpoints that are kept there.
 pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64) -> Earlier {
     let all = read(checkpoint);
     let last = all.last().map_or(0, |kept| kept.report.number);

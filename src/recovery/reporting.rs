@@ -108,7 +108,8 @@ pub(super) struct LastMessage {
 }
 
 impl Driver {
-    /// Reports an examination. The health check and the reconciliation add to the report when they end.
+    /// Reports what an examination of a master found and did, in the log, the status and the recovery report. The
+    /// health check adds its results when it ends.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.lifecycle.begins() && examination.outcome == RecoveryOutcome::Injected {
             // The master holds only the session's initial state.

@@ -222,7 +222,8 @@ impl Answers {
         now + Duration::from_millis(1)
     }
 
-    /// Returns `reply`, which keeps `room` until `reader` has read all of it.
+    /// Returns `reply` in a form that keeps `room`, its share of the memory for large answers, until `reader` has read
+    /// all of the reply.
     pub(crate) async fn count(
         self: &Arc<Self>,
         reply: HttpReply,

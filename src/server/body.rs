@@ -20,8 +20,8 @@ pub(crate) const SMALL: usize = 64 << 10;
 const TIME: Duration = Duration::from_secs(10);
 /// The slowest accepted link, in bytes per second.
 const RATE: u64 = 64 << 10;
-/// Permit that breaks deadlocks: its holder may exceed the budget. Without it, several bodies that each hold a part of
-/// the budget could wait for each other forever.
+/// Permit that breaks deadlocks: its holder may use more memory than [`budget`] allows. Without it, several bodies that
+/// each hold a part of that memory could wait for each other forever.
 static LAST: Semaphore = Semaphore::const_new(1);
 
 /// Number of bodies of the largest size that fit into memory at the same time.
@@ -49,7 +49,7 @@ pub(crate) enum BodyError {
 /// length reserves nothing.
 #[derive(Debug)]
 pub(crate) struct Room<'a> {
-    /// The budget, in KiB.
+    /// The memory for all large bodies, in KiB; see [`budget`].
     pool: &'a Semaphore,
     held: Option<SemaphorePermit<'a>>,
     last: Option<SemaphorePermit<'static>>,

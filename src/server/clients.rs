@@ -30,7 +30,7 @@ const CALLERS: usize = 256;
 #[derive(Debug, Default)]
 pub struct Clients {
     present: DashMap<SocketAddr, Seen>,
-    /// Times of callers whose connections have ended or are now used by another caller.
+    /// How long the calls took of callers whose connections have ended or are now used by another caller.
     past: Mutex<HashMap<String, Times>>,
 }
 
@@ -38,7 +38,7 @@ pub struct Clients {
 struct Seen {
     caller_id: String,
     calls: u64,
-    /// Times of the present caller.
+    /// How long the calls of the present caller took.
     times: Times,
 }
 
@@ -111,8 +111,7 @@ impl Clients {
         self.past.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps the times of a caller. If there are too many, callers without a long call are dropped
-    /// first.
+    /// Keeps how long the calls of a caller took. If there are too many, callers without a long call are dropped first.
     fn keep(&self, caller: String, times: Times) {
         if times.calls == 0 {
             return;

@@ -62,9 +62,10 @@ pub(crate) struct Others {
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
-    /// How far the mirror follows the journal.
+    /// The last place in the journal of all computers that the mirror includes.
     pub(crate) followed: watch::Receiver<Place>,
-    /// The latest journal position in a leader's answer.
+    /// The latest place in the journal that a leader's answer has reported. The mirror must not answer before it has
+    /// reached that place.
     pub(crate) told: Arc<Mutex<Place>>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,

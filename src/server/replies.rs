@@ -39,7 +39,8 @@ impl UntilWritten {
     }
 }
 
-/// Returns `reply`, which is now ready to be written.
+/// Returns `reply`, which is now ready to be written. `delivery`, which tracks the answer, learns that, and ends once
+/// the reply has been written.
 pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> HttpReply {
     if let Some(delivery) = delivery {
         delivery.ready();
@@ -95,7 +96,8 @@ impl Body for ReplyBody {
     }
 }
 
-/// A reply of the mirror, or a result out of the master's batch, with rosrescue's address in place of the master's.
+/// A reply of the mirror, or one result from the master's answer to several calls at once, with rosrescue's address in
+/// place of the master's.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
     match call.filter(|call| batch::asks_uri(call)) {
         Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),

@@ -37,7 +37,7 @@ const UNDECODED: &str = "rosrescue cannot decode this request, and accepts such 
 
 /// The reason if a large answer finds no memory and cannot be made again later.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
-/// How often an answer is made again because it has grown.
+/// How often an answer is made at most. It is made again if it has grown meanwhile.
 const ATTEMPTS: u32 = 4;
 
 /// Answers one request.
@@ -153,7 +153,7 @@ async fn post(
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
             server.stats.requests_refused.count();
-            rarely!(warn, %peer, "refused a request from another computer that cannot be decoded");
+            rarely!(warn, %peer, "refused a request that cannot be decoded, from another computer");
             return Ok(xml(&Reply::Fault {
                 code: 1,
                 text: UNDECODED.to_owned(),

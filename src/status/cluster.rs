@@ -10,7 +10,7 @@ pub struct ClusterFacts {
     /// This computer's name.
     pub name: String,
     pub role: Role,
-    /// Since when this computer has this role.
+    /// Since when this computer has its present role.
     pub since: Instant,
     /// The present leader as far as this computer knows. If there is none, the last one.
     pub leader: Option<LeaderFacts>,
@@ -21,7 +21,7 @@ pub struct ClusterFacts {
     pub seq: u64,
     /// Number of journal records that this computer's mirror lacks.
     pub behind: u64,
-    /// Number of writes made here that etcd does not have yet.
+    /// Number of writes by this computer that etcd does not have yet.
     pub uncommitted: u64,
     /// Since when etcd does not answer, and why. `None` if it answers.
     pub etcd: Option<(Instant, String)>,
@@ -30,8 +30,8 @@ pub struct ClusterFacts {
     /// Number of takeovers by this computer.
     pub takeovers: u64,
     pub last_takeover: Option<Takeover>,
-    /// Number of writes that were answered while cut off and then lost, because other computers had changed the same
-    /// data.
+    /// Number of writes that this computer answered while it was cut off and that were then lost, because other
+    /// computers had changed the same data.
     pub lost_writes: u64,
 }
 

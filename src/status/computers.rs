@@ -13,7 +13,7 @@ pub(crate) struct Computers {
     /// This computer's name.
     pub(crate) name: String,
     pub(crate) role: Role,
-    /// Since when this computer has this role.
+    /// Since when this computer has its present role.
     pub(crate) since: f64,
     /// The present leader. If there is none, the last one.
     pub(crate) leader: Option<LeaderStatus>,
@@ -23,7 +23,7 @@ pub(crate) struct Computers {
     pub(crate) seq: u64,
     /// Number of journal records that this computer's mirror lacks.
     pub(crate) behind: u64,
-    /// Number of writes made here that etcd does not have yet.
+    /// Number of writes by this computer that etcd does not have yet.
     pub(crate) uncommitted: u64,
     /// Why etcd does not answer. `None` if it answers.
     pub(crate) etcd_trouble: Option<Trouble>,
@@ -33,7 +33,7 @@ pub(crate) struct Computers {
     pub(crate) takeovers: u64,
     /// The last takeover by this computer.
     pub(crate) last_takeover: Option<Taken>,
-    /// Number of writes that were answered while cut off and then lost.
+    /// Number of writes that this computer answered while it was cut off and that were then lost.
     pub(crate) lost_writes: u64,
 }
 

@@ -120,7 +120,7 @@ impl Condition {
 #[derive(Debug)]
 pub(crate) struct Situation {
     pub(crate) gate: State,
-    /// When the gate last opened or shut.
+    /// When calls last began or stopped passing to the master.
     pub(crate) gate_since: Instant,
     /// Why changes are not recorded. `None` if they are recorded.
     pub(crate) unprotected: Option<String>,

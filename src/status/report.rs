@@ -36,7 +36,7 @@ pub enum RecoveryOutcome {
 }
 
 impl RecoveryOutcome {
-    /// Whether the present master counts as a new incarnation. False if the same master as before continues.
+    /// False if the same master as before continues. Otherwise the present master counts as a new one.
     pub fn is_new(self) -> bool {
         !matches!(self, Self::Reconciled | Self::Resumed)
     }
@@ -57,13 +57,13 @@ impl fmt::Display for RecoveryOutcome {
 /// Durations in milliseconds.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Phases {
-    /// From the moment calls stopped passing until the master's port was open.
+    /// From the moment calls stopped passing to the master until a master's port was open.
     pub absence_ms: f64,
     /// Time to read the master's state.
     pub inspection_ms: f64,
     /// Time to give the master the state and to read it back.
     pub injection_ms: f64,
-    /// From the moment calls stopped passing until they passed again.
+    /// From the moment calls stopped passing to the master until they passed again.
     pub total_ms: f64,
 }
 
@@ -73,12 +73,11 @@ pub struct Phases {
 pub struct Report {
     /// The rescue's number, as in the names of its files; 0 for an ordinary start.
     pub number: u64,
-    /// Why calls stopped passing.
+    /// Why calls stopped passing to the master.
     pub cause: String,
     /// How the previous master's process ended. `None` if rosrescue did not see its end.
     pub ended: Option<String>,
-    /// When calls stopped passing, in seconds since 1970 by the wall clock, for comparison with
-    /// logs.
+    /// When calls stopped passing to the master, in seconds since 1970 by the wall clock, for comparison with logs.
     pub detected_at: f64,
     /// How the master got its state.
     pub outcome: RecoveryOutcome,
@@ -92,9 +91,10 @@ pub struct Report {
     pub answered: u64,
     /// Number of calls that timed out during the outage, because only a master could answer them.
     pub unanswered: u64,
-    /// Time from the open gate to the end of the health check, in milliseconds. `None` until it ends.
+    /// Time from when calls passed to the master again to the end of the health check, in milliseconds. `None` until it
+    /// ends.
     pub health_check_ms: Option<f64>,
-    /// Number of items of each kind that the master holds now.
+    /// Number of items of each kind that the master holds after the recovery.
     pub restored: Counts,
     /// Parts of the state that could not be given to the master, with the reasons.
     pub not_restored: Vec<String>,
@@ -256,7 +256,7 @@ pub(crate) fn ms(duration: Duration) -> f64 {
 /// Results of the health check after a recovery.
 #[derive(Debug, Default)]
 pub(crate) struct HealthCheck {
-    /// Time from the open gate to the end of the health check.
+    /// Time from when calls passed to the master again to the end of the health check.
     pub duration: Duration,
     /// Dead nodes that were unregistered with the master, so that it notifies other nodes.
     pub removed: Vec<String>,

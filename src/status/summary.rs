@@ -86,7 +86,7 @@ pub(crate) struct Status {
     /// Whether another computer has the master and calls go there.
     #[serde(default)]
     pub(crate) elsewhere: bool,
-    /// Since when the mirror stands in. `None` if calls pass.
+    /// Since when the mirror has answered in the master's place. `None` if calls pass to a master.
     pub(crate) standing_in_since: Option<f64>,
     /// Number of writes that the mirror answered and the master has not run yet.
     pub(crate) pending_writes: usize,

@@ -41,7 +41,7 @@ type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 /// of the connection between two calls goes unnoticed; [`Self::is_closed`] checks for it.
 ///
 /// If the server closes the connection after one answer, as HTTP/1.0 servers do, the next call gets a new connection.
-/// Another process may listen there by then.
+/// Another process may listen at the address when that call is made.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,

@@ -27,12 +27,12 @@ pub(crate) fn term_of(path: &str) -> Option<u64> {
 /// Status of an answer by a computer that does not lead in that term.
 pub(crate) const NOT_LEADING: StatusCode = StatusCode::MISDIRECTED_REQUEST;
 
-/// Header in a leader's answer: the number of the last record that was acknowledged then. The caller may know of that
-/// record, so it must not be shown an older state.
+/// Header in a leader's answer: the number of the last journal record that the other computers had or did not need when
+/// the leader answered. The caller may know of that record, so it must not be shown an older state.
 pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
 
-/// Header in a leader's answer: the answer's number. Its follower reports the number when the caller has the answer.
-/// Some notifications must not be sent before that.
+/// Header in a leader's answer: the answer's number. The follower that passes the answer on reports the number once the
+/// caller has the answer. Some notifications must not be sent earlier.
 pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
 /// Why another computer did not answer.

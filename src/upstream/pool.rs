@@ -28,7 +28,7 @@ pub enum ReadError {
     Connect(#[from] VerifyError),
     #[error(transparent)]
     Call(#[from] CallError),
-    /// The gate has shut since the read began.
+    /// Calls have stopped passing to the master since the read began.
     #[error("the master went away during the read")]
     Shut,
 }
@@ -39,7 +39,7 @@ pub struct Pool {
     ledger: Arc<Ledger>,
     gate: gate::Rx,
     permits: Semaphore,
-    /// Idle connections, each with the number of the incarnation that it leads to.
+    /// Idle connections, each with the incarnation number of the master that it leads to.
     idle: Mutex<Vec<(u64, NextConnection)>>,
     /// Number of reads that are waiting too long for the master.
     stalled: AtomicUsize,
@@ -55,8 +55,8 @@ impl Drop for Stalled<'_> {
 }
 
 impl Pool {
-    /// Creates a pool of at most `size` connections to `upstream`, each verified to reach the
-    /// incarnation of `ledger`.
+    /// Creates a pool of at most `size` connections to `upstream`, each verified to reach the master that holds the
+    /// state of `ledger`.
     pub fn new(size: usize, upstream: Arc<Upstream>, ledger: Arc<Ledger>, gate: gate::Rx) -> Self {
         Self {
             upstream,

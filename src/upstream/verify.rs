@@ -8,7 +8,7 @@ use thiserror::Error;
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream, sentinel::Sentinel};
 use crate::replay::Token;
 
-/// Why it is unknown whether a connection leads to the present incarnation.
+/// Why it is unknown whether a connection leads to the master process that holds the present state.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum VerifyError {
@@ -16,24 +16,25 @@ pub enum VerifyError {
     Connect(#[from] ConnectError),
     #[error(transparent)]
     Call(#[from] CallError),
-    /// Another incarnation answered. That master does not hold the state yet.
+    /// Another master process answered. It does not hold the present state yet.
     #[error("the master behind a new connection does not have the present incarnation's token")]
     OtherIncarnation,
-    /// The present incarnation has ended.
+    /// The master process that held the present state has ended.
     #[error("the master's sentinel has ended")]
     Ended,
 }
 
-/// How calls are verified to reach the present incarnation.
+/// How rosrescue verifies that a call reaches the master process that holds the present state.
 #[derive(Clone, Debug)]
 pub(crate) enum Verification {
-    /// The master keeps connections open (HTTP/1.1). Each connection is checked for the token before its first call.
+    /// The master keeps connections open (HTTP/1.1). Before the first call on a connection, rosrescue checks that this
+    /// master has the present [`Token`].
     TokenFirst,
     /// The master closes each connection after one answer (HTTP/1.0), and the sentinel is connected to the process that
     /// listens. While the sentinel is open, no other process can have accepted a connection.
     Sentinel(Arc<Sentinel>),
-    /// The master closes each connection after one answer, and runs elsewhere or cannot be seen. The token is checked
-    /// after each answer.
+    /// The master closes each connection after one answer, and runs on another computer or its process cannot be seen.
+    /// After each answer, rosrescue checks that the master has the present [`Token`].
     TokenAfterwards,
 }
 
@@ -49,7 +50,7 @@ impl Verification {
     }
 }
 
-/// A connection to the present incarnation, as far as that can be known before a call.
+/// A connection to the master process that holds the present state, as far as that can be known before a call.
 #[derive(Debug)]
 pub(crate) struct Verified {
     pub(crate) connection: Connection,
@@ -57,13 +58,13 @@ pub(crate) struct Verified {
 }
 
 impl Verified {
-    /// Whether the connection, once verified, leads to the same incarnation as long as it is open. A tunnel may lead an
-    /// unused connection elsewhere.
+    /// Whether the connection, once verified, leads to the same master process as long as it is open. A tunnel may lead
+    /// an unused connection elsewhere.
     pub(crate) fn stays_verified(&self) -> bool {
         !matches!(self.by, Verification::TokenAfterwards)
     }
 
-    /// Sends `body` unchanged, and returns the reply unchanged if it comes from the incarnation with `token`.
+    /// Sends `body` unchanged, and returns the reply unchanged if it comes from the master that has `token`.
     pub(crate) async fn forward(
         &mut self,
         upstream: &Upstream,
@@ -76,7 +77,7 @@ impl Verified {
         Ok(reply)
     }
 
-    /// Checks that answers since the verification come from the incarnation with `token`.
+    /// Checks that answers since the verification come from the master that has `token`.
     pub(crate) async fn confirm(
         &self,
         upstream: &Upstream,

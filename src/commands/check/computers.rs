@@ -21,7 +21,7 @@ pub(in crate::commands::check) struct Cluster {
     /// This computer's name and address.
     pub(super) name: String,
     pub(super) uri: String,
-    /// How each endpoint answered.
+    /// How each etcd server answered.
     pub(super) tried: Vec<Tried>,
     /// The present or last leader. `None` if etcd does not know the robot.
     pub(super) leader: Option<String>,

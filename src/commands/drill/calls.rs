@@ -137,7 +137,7 @@ pub(super) struct Callers {
 }
 
 impl Callers {
-    /// Calls until `stop`.
+    /// Makes calls of all kinds until `stop`.
     pub(super) async fn run(self, stop: CancellationToken) -> CallResults {
         let (reads, (written, read_back, notifications), registered) =
             tokio::join!(self.read(&stop), self.write(&stop), self.register(&stop));

@@ -29,7 +29,7 @@ pub(super) struct RobotState {
     nodes: BTreeMap<String, Option<i32>>,
 }
 
-/// The difference between two moments.
+/// How the robot's state differs between two moments.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct DrillDifference {
     /// Facts that are gone or changed.

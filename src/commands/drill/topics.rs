@@ -17,7 +17,7 @@ const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 const FEWEST: u64 = 10;
 /// Shorter pauses never count as failures: any computer may be busy for that long.
 const SHORTEST_GAP: Duration = Duration::from_secs(1);
-/// How much longer than normal a pause must be to count as a failure.
+/// A pause counts as a failure if it is more than this many times as long as the longest normal one.
 const LONGER: u32 = 10;
 /// Maximum number of topics that are tried when none is named.
 const CANDIDATES: usize = 12;

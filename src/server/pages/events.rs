@@ -36,7 +36,7 @@ const LISTENERS: usize = 16;
 const TURN: Duration = Duration::from_secs(15);
 /// Pause between two checks for changes.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Pause between two checks after the gate has changed.
+/// Pause between two checks if another side answers calls now: the master, the mirror or another computer.
 const SHORT_PAUSE: Duration = Duration::from_millis(50);
 /// Time without changes after which the last events are sent again, so that both sides know that the other is alive.
 const SILENCE: Duration = Duration::from_secs(15);
@@ -195,7 +195,7 @@ async fn look(server: Arc<Server>) {
     }
 }
 
-/// The result of the last check.
+/// What the last check for changes has found.
 #[derive(Default)]
 struct Known {
     version: Option<u64>,

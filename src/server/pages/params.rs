@@ -8,7 +8,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Maximum number of entries in one answer. The answer says what it leaves out, and a page can ask for that.
+/// Maximum number of entries in one answer. The answer says where entries are left out, and the page can ask for them.
 const ENTRIES: usize = 1000;
 /// Maximum number of characters of a value. A robot description may have a million.
 const TEXT: usize = 2000;

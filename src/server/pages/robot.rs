@@ -86,7 +86,7 @@ impl Robot {
         robot
     }
 
-    /// The content of a snapshot, without rosrescue's own token.
+    /// The content of a snapshot, without the [`Token`](crate::replay::Token) by which rosrescue recognises a master.
     pub(super) fn of(snapshot: Snapshot) -> Self {
         let mut nodes: BTreeMap<String, NodeRow> = BTreeMap::new();
         for (name, node) in snapshot.nodes {

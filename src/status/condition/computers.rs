@@ -121,7 +121,7 @@ fn alone(gate: State, of: &ClusterFacts) -> ClusterCondition {
     }
 }
 
-/// What the leader's status adds about the other computers: sentences, and what to do.
+/// What the leader's status says about the other computers: sentences, and what the operator should do, if anything.
 pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     let others = of.members.iter().filter(|member| member.name != of.name);
     let (away, here): (Vec<_>, Vec<_>) = others.partition(|member| member.is_away());
