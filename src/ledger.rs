@@ -50,8 +50,8 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Refuses an outdated result: another incarnation has begun, the mirror has changed since, or the master is on another
-/// computer than the caller assumed.
+/// Refuses an outdated result: another incarnation (see [`Token`]) has begun, the mirror has changed since, or the
+/// master is on another computer than the caller assumed.
 #[derive(Debug)]
 pub struct Superseded;
 
@@ -69,7 +69,7 @@ pub(crate) struct Recorded {
 pub struct Basis {
     pub mirror: Master,
     pub version: u64,
-    /// Writes that the present incarnation may not have run.
+    /// Writes that the mirror has answered and the present master may not have run.
     pub pending: Vec<Request>,
 }
 
@@ -80,7 +80,7 @@ pub struct Ledger {
     stats: &'static Stats,
     /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
-    /// Whether the disk is late with a sync.
+    /// Whether a sync of the checkpoint takes longer than 5 s.
     sync_is_late: AtomicBool,
     /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
@@ -118,11 +118,11 @@ struct Inner {
     injecting: bool,
     /// Whether the present master may differ from the mirror and must be read again.
     doubted: bool,
-    /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
+    /// Whether the present master may still run a batch whose reply is no longer awaited.
     abandoned: bool,
     /// The state that a late master will have once it has answered its outstanding calls.
     behind: Option<LateState>,
-    /// The last incarnation to which calls have passed.
+    /// The number of the last master to which calls have passed.
     served: Option<u64>,
     /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
     /// be newer than the mirror.
@@ -226,12 +226,12 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// The number of the present incarnation.
+    /// The number in the present master's [`Token`].
     pub fn incarnation(&self) -> u64 {
         self.lock().session.incarnation
     }
 
-    /// The token of the present incarnation.
+    /// The [`Token`] that identifies the present master.
     pub fn token(&self) -> Token {
         self.lock().token()
     }
@@ -329,12 +329,12 @@ impl Ledger {
         self.shared.notify_one();
     }
 
-    /// Number of writes that the present incarnation may not have run.
+    /// Number of writes that the mirror has answered and the present master may not have run.
     pub fn pending(&self) -> usize {
         self.lock().pending.calls().len()
     }
 
-    /// The parameter subscriptions that the present incarnation may hold. They follow from the mirror and the pending
+    /// The parameter subscriptions that the present master may hold. They follow from the mirror and the pending
     /// writes, because they cannot be read from a master.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
@@ -517,7 +517,7 @@ impl Inner {
         self.journal.as_ref().map(Journal::seq)
     }
 
-    /// Mark of the last record.
+    /// Identifies the last record, so that an answer can wait for it.
     fn mark(&self) -> Mark {
         Mark {
             disk: self.last_seq(),

@@ -54,7 +54,7 @@ use crate::{
     xmlrpc,
 };
 
-/// Time limit for work in the background.
+/// Time limit of one request to etcd that is sent in the background.
 const LIMIT: Duration = Duration::from_secs(5);
 /// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
@@ -79,13 +79,13 @@ pub(super) struct ClusterDriver {
     handovers: mpsc::Receiver<Handover>,
     /// The caller that waits for a handover.
     handover: Option<oneshot::Sender<Result<String, String>>>,
-    /// The next inputs.
+    /// Inputs to pass to the [`Member`] before any new ones.
     inbox: VecDeque<Input>,
     work: Work,
     /// Background tasks without a result.
     beside: JoinSet<()>,
     watch: Option<Watching>,
-    /// The leader's keys as the watch delivered them.
+    /// The keys `leader` and `alive` as the watch on etcd delivered them.
     watched: View,
     duties: Option<MasterDuties>,
     /// Processes that are being stopped.
@@ -368,7 +368,7 @@ impl ClusterDriver {
         });
     }
 
-    /// The next input.
+    /// Waits for the next input of the [`Member`].
     async fn next(&mut self) -> Result<Input, ProcessError> {
         let wake = self.member.deadline();
         // Inputs may be ready all the time, so this thread's other tasks get a turn here.

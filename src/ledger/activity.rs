@@ -46,7 +46,7 @@ pub struct Owed {
     pub displaced: Vec<Displaced>,
 }
 
-/// Notifications collected since the outbox was last taken.
+/// Notifications for rosrescue to send, collected since the last ones were taken.
 #[derive(Debug, Default)]
 pub struct OwedNotifications {
     /// Nodes that must shut down because another node has their name.
@@ -112,12 +112,13 @@ pub struct Activity {
     lately: Vec<(Instant, Displaced)>,
     /// Displaced nodes from a checkpoint. They may not have been told to shut down.
     restored: Vec<Displaced>,
-    /// Whether the changes that a master notifies nodes of are collected in the outbox.
+    /// Whether changes that a master notifies nodes of are also collected in `outbox`.
     notifying: bool,
     outbox: OwedNotifications,
 }
 
-/// A notification that rosrescue must send because there is no master: receiver, subject, and call.
+/// A notification that rosrescue must send because there is no master: the receiver's address, the topic or parameter,
+/// and the call.
 type Unsent = (String, Subject, Arc<Call>);
 
 /// Collects what one call changes, and which nodes must be notified of the changes.
@@ -159,7 +160,7 @@ impl Noticed {
         self.standing_in.then(|| std::mem::take(&mut self.calls))
     }
 
-    /// The subjects of the notifications, each with its number of nodes.
+    /// The topics and parameters of the notifications, each with the number of nodes to notify.
     pub(super) fn subjects(&self) -> impl Iterator<Item = (Subject, usize)> {
         let topics = self.topics.iter().cloned().map(Subject::Topic);
         let topics = topics.map(|topic| (topic, self.subscribers));
@@ -191,7 +192,7 @@ impl NoticeSink for Noticed {
 
 impl Activity {
     /// Notes an applied call and its notifications. `registered` says whether the mirror knows a node. Returns whether
-    /// the outbox has grown.
+    /// the task that notifies nodes has new work.
     pub(super) fn applied(
         &mut self,
         now: Instant,

@@ -12,7 +12,8 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// While fewer writes than this are pending, an unregistration that changes nothing in the mirror becomes pending, too.
+/// An unregistration that changes nothing in the mirror is added to the pending writes only while there are fewer than
+/// this.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
 /// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
@@ -116,8 +117,9 @@ impl Ledger {
         Some((reply, mark))
     }
 
-    /// Like [`Self::stand_in`], for a client's call from `source`. The answer counts as on its way to the client, with
-    /// the subjects in `concern`, until the returned [`Delivery`] is dropped.
+    /// Like [`Self::stand_in`], for a client's call from `source`. `concern` says which topics, parameters and node
+    /// names the call concerns. The answer counts as on its way to the client until the returned [`Delivery`] is
+    /// dropped.
     pub(crate) fn stand_in_for(
         self: &Arc<Self>,
         now: Instant,

@@ -45,9 +45,9 @@ impl Mark {
 pub(super) struct Whole {
     /// The version after the last change that has no record, so only a complete checkpoint holds it.
     pub(super) unrecorded: u64,
-    /// The version of the last checkpoint that was taken.
+    /// The mirror's version in the last complete checkpoint that the store was told to write.
     taken: u64,
-    /// The version of the last checkpoint that was written.
+    /// The mirror's version in the last complete checkpoint that was written.
     written: u64,
     /// Why the last checkpoint could not be written.
     failure: Option<String>,
@@ -60,7 +60,7 @@ impl Whole {
 }
 
 impl Ledger {
-    /// Mark of the last record.
+    /// Identifies the last record, so that an answer can wait for it.
     pub fn mark(&self) -> Mark {
         self.lock().mark()
     }
@@ -121,7 +121,7 @@ impl Ledger {
         self.disk_silent.notify_one();
     }
 
-    /// Notes whether the disk is late with a sync.
+    /// Notes whether a sync takes longer than [`DISK_PATIENCE`].
     pub(super) fn set_sync_is_late(&self, late: bool) {
         self.sync_is_late.store(late, Ordering::Relaxed);
         self.disk_silent.notify_one();

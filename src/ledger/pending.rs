@@ -1,4 +1,4 @@
-//! Writes that the mirror has answered and that the present incarnation may not have run.
+//! Writes that the mirror has answered and that the present master may not have run.
 
 use crate::{master::Request, xmlrpc::Value};
 

@@ -40,9 +40,10 @@ pub(crate) struct Item {
     /// The call. `None` if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
     answer: oneshot::Sender<AnswerAndDelivery>,
-    /// The subjects of the call, for the order in which nodes hear of them.
+    /// The topics, parameters and node names that the call concerns, for the order in which nodes hear of them.
     concern: Concern,
-    /// The answer's place in the order. Set once the call is on its way to the master, or the mirror has answered it.
+    /// Tracks the answer on its way to the caller. Set once the call is on its way to the master, or the mirror has
+    /// answered it.
     pub delivery: Option<Delivery>,
     /// For a call made by rosrescue: the condition under which the call is still wanted.
     pub condition: Option<Precondition>,
@@ -100,7 +101,7 @@ impl Item {
         &self.concern
     }
 
-    /// Treats the call as if no node were notified of anything.
+    /// Treats the call as if no node were notified because of it.
     #[cfg(test)]
     pub(super) fn forget_concern(&mut self) {
         self.concern = Concern::default();
@@ -157,8 +158,8 @@ pub(crate) struct Batch {
     pub(crate) until: Option<Instant>,
 }
 
-/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over
-/// calls that have to [wait](Order::must_wait), and over later ones about the same subjects.
+/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over calls that have to
+/// [wait](Order::must_wait), and over later ones about the same topics, parameters or node names.
 pub(crate) fn pack(
     queue: &mut VecDeque<Item>,
     order: &mut Order,

@@ -31,7 +31,7 @@ pub(super) enum Received {
 /// Why a round trip failed.
 #[derive(Debug, Error)]
 pub(super) enum RoundTripError {
-    /// There is no connection to the right incarnation.
+    /// There is no connection to the right master.
     #[error(transparent)]
     Connect(#[from] VerifyError),
     #[error(transparent)]

@@ -50,7 +50,7 @@ impl Kept {
             }
             Some(opened)
         });
-        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent");
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent to the leader");
         let (store, loaded) = match opened.await {
             Some(Some(Ok((store, Some(loaded))))) => (store, loaded),
             Some(None | Some(Ok((_, None)))) => return Default::default(),
@@ -166,7 +166,7 @@ fn remove_files(path: PathBuf) {
             tracing::warn!(
                 path = %path.display(),
                 %error,
-                "cannot delete the file of writes that have been sent; delete it, or they will be sent again"
+                "cannot delete the file of writes that have been sent; delete it, or its writes will be sent again"
             );
         }
     }

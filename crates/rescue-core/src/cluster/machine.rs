@@ -250,7 +250,7 @@ impl Machine {
         self.flight.take_if(|flight| flight.number == number);
     }
 
-    /// The keys after `op` has succeeded.
+    /// The keys `leader` and `alive` after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
@@ -298,7 +298,7 @@ impl Machine {
         }
     }
 
-    /// Starts over with `view`, because etcd has lost its data.
+    /// Starts over with the keys in `view`, because etcd has lost its data.
     fn start_over(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
         self.flight = None;
         self.deposed(actions);
@@ -319,7 +319,7 @@ impl Machine {
         self.claim_not_before = Some(until);
     }
 
-    /// Handles keys that etcd shows.
+    /// Handles the keys `leader` and `alive` as etcd shows them.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         self.heard = Some(now);
         if view.revision < self.view.revision {
@@ -444,7 +444,7 @@ impl Machine {
         !self.stale && self.followed >= self.view.seq()
     }
 
-    /// Gives up, because another computer leads or could lead.
+    /// Stops leading, because another computer leads or could lead.
     fn deposed(&mut self, actions: &mut Vec<Action>) {
         (self.leadership, self.releasing) = (None, None);
         self.flight.take_if(|flight| flight.op != Op::Read);

@@ -358,7 +358,8 @@ impl Member {
         self.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
-    /// Updates everything that depends on several parts.
+    /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and
+    /// so on.
     fn update(&mut self, now: Instant) {
         self.update_lost(now);
         self.update_master();

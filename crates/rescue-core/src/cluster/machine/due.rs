@@ -20,7 +20,7 @@ impl Machine {
             .min()
     }
 
-    /// Does what is due at `now`.
+    /// Carries out what is due at `now`: a change of this computer's role, or a request to etcd.
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()

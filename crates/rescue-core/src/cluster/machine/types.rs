@@ -111,17 +111,17 @@ pub struct RevisionGuard {
 /// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read both keys. The answer must not come from a member of etcd that may be behind.
+    /// Read the keys `leader` and `alive`. The answer must not come from a member of etcd that may be behind.
     Read,
-    /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
+    /// Write `leader` with this claim, and `alive` with heartbeat number 0 and the journal's last record `seq`.
     Claim {
         guard: RevisionGuard,
         claim: u64,
         seq: u64,
         settled: bool,
     },
-    /// Write `alive`, and the records after the last beat up to `seq`, or fewer if they are too many. A repeated beat
-    /// may carry other records; at most one of them succeeds.
+    /// Write `alive`, and the records after the last heartbeat up to `seq`, or fewer if they are too many. A repeated
+    /// heartbeat may carry other records; at most one of the two succeeds.
     Beat {
         guard: RevisionGuard,
         beat: u64,
@@ -216,7 +216,7 @@ pub enum Action {
     /// Bring the mirror up to this record of the journal, then pass in [`Input::Followed`].
     CatchUp(u64),
     Become(Role),
-    /// Answer the calls up to this record.
+    /// Let the answers to the calls up to this record go out.
     Acknowledge(u64),
     /// This computer's calls after `committed` are not in the journal. Those up to `acknowledged` were answered, so
     /// they are merged with the journal and sent to the next leader. The others still wait. The mirror must be

@@ -68,7 +68,7 @@ impl Member {
         view.revision < floor && !Mutant::TrustsLostEtcd.lives()
     }
 
-    /// Starts over with the new etcd, which shows `view`, and with this computer's state.
+    /// Starts over with the new etcd, which shows the keys in `view`, and with this computer's state.
     pub(super) fn start_over(&mut self, now: Instant, view: &View) {
         let holds = match self.reading.loaded {
             true => Holds {

@@ -204,7 +204,7 @@ impl Member {
         (!released && !is_own).then_some((&*leader.uri, leader.term))
     }
 
-    /// Updates the standing when the leader changes.
+    /// Notes who leads. If this computer follows, publishes where its calls go.
     pub(super) fn update_standing(&mut self) {
         self.look_at_place();
         let own = &self.settings().id;

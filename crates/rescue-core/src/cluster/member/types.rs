@@ -86,13 +86,13 @@ pub enum Entry {
     Apart(u64),
 }
 
-/// The part of the journal that was not known yet.
+/// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {
     /// The leader's two keys at the same revision.
     pub view: View,
-    /// The state before the records, and the nodes displaced until then. `None` if the records follow the known
-    /// journal.
+    /// The state before the records, and the nodes that lost their names to other nodes shortly before. `None` if the
+    /// records follow the known journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
@@ -210,7 +210,8 @@ pub enum News {
     reason = "few exist at a time, and none is stored"
 )]
 pub enum Action {
-    /// Write `parts`, if any, in `term`; then carry out `op` with the journal's `entry`. Ends with [`Input::Answer`].
+    /// Write `parts`, if any, provided that this computer still leads in `term`; then carry out `op` and add `entry` to
+    /// the journal. Ends with [`Input::Answer`].
     Send {
         number: u64,
         op: Op,
@@ -249,9 +250,10 @@ pub enum Action {
     Follow(Vec<Record>),
     /// Replace the ledger's state by this state of another computer.
     FollowState(Master),
-    /// Answer the calls up to this record.
+    /// Let the answers to the calls up to this record go out.
     Acknowledge(u64),
-    /// Replace the recorded changes that were not handed out yet by the ledger's state.
+    /// Take the changes that the ledger has recorded but not yet handed out as a single one: its state. Ends with
+    /// [`Input::AsState`].
     TakeAsState,
     AskForwarded,
     /// Tell these displaced nodes to shut down again, because they may have missed it.

@@ -1,4 +1,5 @@
-//! Tracks changes by subject, because comparing two states would not show that a parameter was set and set back.
+//! Tracks which parameters, nodes, services and topic registrations others have changed. Comparing two states would not
+//! show that a parameter was set and set back.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},
@@ -11,7 +12,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// The subject of a call, by which two calls can conflict.
+/// What a call changes. Two calls can conflict if they change the same.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum ChangeSubject {
     /// A parameter: its resolved name, with a slash at the end.
@@ -36,7 +37,7 @@ impl ChangeSubject {
             }
     }
 
-    /// The subjects of `call`, which is no multicall. An unregistration conflicts with nothing.
+    /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing.
     pub fn of(call: &Request) -> Vec<Self> {
         let Some(caller) = call.caller() else {
             return Vec::new();
@@ -209,7 +210,7 @@ impl Changes {
 /// Calls of this computer that the others may have run.
 #[derive(Clone, Debug, Default)]
 struct Own {
-    /// The calls, by subject.
+    /// The calls, by method, caller and first argument.
     calls: HashMap<String, Vec<Request>>,
     /// The calls, by their numbers in the journal.
     records: HashMap<u64, Request>,
