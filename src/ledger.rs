@@ -88,7 +88,7 @@ pub struct Ledger {
     agreed: watch::Sender<Agreed>,
     /// The time until which this computer may act as leader. See [`Ledger::set_lease`].
     lease: watch::Sender<Option<Instant>>,
-    /// The mirror's version in the last complete checkpoint that was written or failed.
+    /// The mirror's version in the last complete checkpoint that was written or could not be written.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
@@ -114,7 +114,7 @@ struct Inner {
     activity: Activity,
     order: Order,
     diverged: HashSet<Method>,
-    /// Whether an injection is under way, so that the mirror must not change.
+    /// Whether a master is being brought to the mirror's state (an injection), so that the mirror must not change.
     injecting: bool,
     /// Whether the present master may differ from the mirror and must be read again.
     doubted: bool,
@@ -251,8 +251,8 @@ impl Ledger {
         self.record_from(now, incarnation, &batch)
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in the order in which the master ran
-    /// them.
+    /// Records and applies the calls in `batch`, which the master ran in this order and has answered. `incarnation` is
+    /// the number in the [`Token`] of that master.
     pub(crate) fn record_from(
         &self,
         now: Instant,
@@ -369,8 +369,8 @@ impl Ledger {
         difference
     }
 
-    /// Like [`Self::adopt`], but only if `state` was read from the master of `incarnation` while the mirror was at
-    /// `version`.
+    /// Like [`Self::adopt`], but only if `state` was read from the present master, whose [`Token`] has the number
+    /// `incarnation`, while the mirror was at `version`.
     pub fn adopt_if(
         &self,
         incarnation: u64,

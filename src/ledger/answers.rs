@@ -109,8 +109,8 @@ impl Ledger {
     /// returns the mark of the last record. That is this call's record, or if it changes nothing, the record that made
     /// it redundant.
     ///
-    /// `None` during an injection, if another computer has the master, or if the answers to the reads in a multicall
-    /// are too large. Then the call has to wait.
+    /// `None` while a master is being brought to the mirror's state (an injection), if another computer has the master,
+    /// or if the answers to the reads in a multicall are too large. Then the call has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;

@@ -40,7 +40,7 @@ pub(crate) struct Checkpointer {
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
-    /// The journal's last record in the previous round.
+    /// The number of the journal's last record when the file was last checked.
     seq: u64,
     recorded_at: Instant,
     compacted_at: Option<Instant>,

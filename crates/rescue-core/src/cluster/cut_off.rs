@@ -15,7 +15,7 @@ use crate::{
 
 /// How many periods of being cut off are kept apart.
 const TIMES_MOST: usize = 8;
-/// How many writes of a period can be recognised when they appear in the journal.
+/// How many writes of one period of being cut off can be recognised when they appear in the journal.
 const EXPECTED_MOST: usize = 4_000;
 
 /// One period of being cut off.
@@ -42,7 +42,7 @@ impl Time {
     }
 }
 
-/// The periods whose writes have not all reached a leader, oldest first.
+/// The periods of being cut off whose writes have not all reached a leader, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct CutOff {
     times: VecDeque<Time>,

@@ -104,7 +104,7 @@ impl Machine {
         &self.settings
     }
 
-    /// When the leader's keys were first seen in their present state.
+    /// When the keys `leader` and `alive` were first seen with their present values.
     pub fn observed(&self) -> Option<Instant> {
         self.observed
     }
@@ -114,7 +114,7 @@ impl Machine {
         self.heard
     }
 
-    /// The leader's keys as this computer knows them.
+    /// The keys `leader` and `alive` as this computer knows them.
     pub fn view(&self) -> &View {
         &self.view
     }

@@ -239,7 +239,7 @@ impl Member {
         self.machine.settings()
     }
 
-    /// The leader's keys as etcd showed them last.
+    /// The keys `leader` and `alive` as etcd showed them last.
     pub fn view(&self) -> &View {
         let (seen, known) = (self.reading.view(), self.machine.view());
         match seen.revision > known.revision {
@@ -342,7 +342,7 @@ impl Member {
         self.standing.records()
     }
 
-    /// Whether the ledger's state is the journal's.
+    /// Whether the ledger must hold the journal's state, because this computer does not record calls itself.
     fn follows(&self) -> bool {
         self.reading.loaded && !self.own_wins && !self.records()
     }

@@ -149,7 +149,7 @@ pub enum Input {
     Start(u64),
     /// The answer to request `number`.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch on etcd has delivered the leader's keys.
+    /// The watch on etcd has delivered the keys `leader` and `alive`.
     View(View),
     /// The mirror contains the journal up to this record.
     Followed(u64),

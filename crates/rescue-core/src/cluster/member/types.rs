@@ -110,13 +110,13 @@ pub enum Input {
     Begin,
     /// The answer to request `number` of the machine.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch delivers the leader's keys, new journal entries, and changed member entries.
+    /// The watch on etcd delivers the keys `leader` and `alive`, new journal entries, and changed member entries.
     Watched {
         view: View,
         entries: Vec<Entry>,
         heard: Vec<Heard>,
     },
-    /// The watch has ended.
+    /// The watch on etcd has ended.
     WatchEnded,
     /// The result of [`Action::Load`]. `None` if etcd could not be read.
     Loaded(Option<Read>),
@@ -219,9 +219,9 @@ pub enum Action {
         term: u64,
         parts: Vec<Put>,
     },
-    /// Read the journal after this place.
+    /// Read the journal after the last record in this progress.
     Load(Progress),
-    /// Watch the leader's keys and the journal from this revision on.
+    /// Watch the keys `leader` and `alive`, the journal and the member entries from this view's revision on.
     Watch(View),
     /// Write the parts of a large change.
     Prepare {
@@ -274,9 +274,9 @@ pub enum Action {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Add these writes to the kept ones.
+    /// Keep these writes, too, until a leader has them.
     Keep(Vec<Request>),
-    /// Delete the kept writes.
+    /// Delete the kept writes, because none is left to send.
     KeepNothing,
     /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
     Merge {

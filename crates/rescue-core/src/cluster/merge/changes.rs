@@ -111,7 +111,7 @@ impl Changes {
         self.own.records.insert(seq, call);
     }
 
-    /// Notes record `seq` of the journal.
+    /// Notes what record `seq` of the journal, a `call`, has changed, unless the call was expected.
     pub fn note(&mut self, seq: u64, call: &Request) {
         if self
             .own

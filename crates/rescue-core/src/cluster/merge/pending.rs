@@ -29,10 +29,10 @@ struct Registered {
 pub struct WritesToSend {
     calls: BTreeMap<u64, Request>,
     last: u64,
-    /// Parameters by path, and whether they are set or deleted.
+    /// The numbers of the writes to parameters, by path and by whether they set the parameter or delete it.
     params: BTreeMap<(String, bool), u64>,
     registered: HashMap<Place, Registered>,
-    /// Other calls, in encoded form.
+    /// The numbers of other calls, by their encoded form.
     others: HashMap<String, u64>,
 }
 
