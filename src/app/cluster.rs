@@ -406,7 +406,7 @@ impl ClusterDriver {
         self.setup.context.ledger.end_injection();
     }
 
-    /// Turns the watch's changes, or its end, into an input.
+    /// Turns what the watch on etcd delivered, or its end, into an input for the [`Member`].
     fn changed(&mut self, changes: Option<Vec<KeyChange>>) -> Input {
         let Some(changes) = changes else {
             self.watch = None;

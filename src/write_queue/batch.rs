@@ -154,7 +154,7 @@ impl Item {
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
     pub(crate) items: Vec<Item>,
-    /// When to try again because calls were passed over. `None` if a change will wake the queue.
+    /// When to look again at calls that were passed over. `None` if another event will wake the queue.
     pub(crate) until: Option<Instant>,
 }
 

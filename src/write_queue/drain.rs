@@ -610,7 +610,7 @@ impl Drain {
 #[derive(Default)]
 struct Answers {
     made: Vec<(Item, CallAnswer)>,
-    /// Identifies the mirror's last record.
+    /// Identifies the last record that these answers may have to wait for.
     mark: Mark,
 }
 

@@ -70,8 +70,8 @@ fn set_call(item: &mut Item, call: Request) {
     item.call = Some(call);
 }
 
-/// Leaves out writes that conflict with changes by other computers. `None` if no write remains. Then the item is
-/// answered.
+/// Leaves out writes that conflict with changes by other computers. If no write remains, answers the item and returns
+/// `None`.
 pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);

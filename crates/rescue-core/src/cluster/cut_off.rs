@@ -130,7 +130,7 @@ impl CutOff {
         }
     }
 
-    /// Returns the others' `state` plus the kept writes.
+    /// Returns the others' `state`, changed by those kept writes that conflict with no change by others.
     pub fn on(&self, state: &Master) -> Master {
         let mut state = state.clone();
         for time in &self.times {

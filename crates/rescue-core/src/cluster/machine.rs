@@ -27,8 +27,8 @@ pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 const RETRY: Duration = Duration::from_millis(100);
 /// How often the leader writes the key `alive` per time to live ([`Settings::ttl`]).
 const BEATS: u32 = 4;
-/// A leader stops this part of the time to live (a fifth) before another may begin: a tenth for a slow clock, and a
-/// tenth for a fast one.
+/// Divisor of the time to live: a leader stops a fifth of it before another computer may begin to lead. A tenth is for
+/// a slow clock, and a tenth for a fast one.
 const MARGIN: u32 = 5;
 /// How long after the time to live a computer waits for the next leader before it counts as cut off. A claim takes
 /// three network delays, but etcd may have to elect its own leader first, which takes up to 2.6 s.

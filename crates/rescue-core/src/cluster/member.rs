@@ -230,7 +230,7 @@ impl Member {
         &self.machine
     }
 
-    /// The role that was carried out last.
+    /// The machine's role after the actions that were returned last.
     pub fn role(&self) -> Role {
         self.role
     }

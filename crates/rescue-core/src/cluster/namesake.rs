@@ -1,4 +1,4 @@
-//! Detects another living computer with this one's name, before this one takes part. Pure.
+//! Detects another living computer with this one's name, before this one joins the cluster. Pure.
 //!
 //! Keys in etcd may name a computer with the same name and another address. That computer is alive if the keys change:
 //! `alive` several times per time to live, the entry among the members every five seconds. If they do not change, they
@@ -26,7 +26,7 @@ pub enum Key {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sign {
     pub key: Key,
-    /// The address of that computer.
+    /// The address of the computer that wrote the key.
     pub uri: String,
     /// The revision of the key's last change.
     pub revision: u64,

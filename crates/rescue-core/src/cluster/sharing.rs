@@ -62,7 +62,8 @@ impl Recent {
         }
     }
 
-    /// The changes after record `seq` that `merge` did not make. `None` if the list does not reach back so far.
+    /// The changes after record `seq`, except those that were sent under the name `merge`. `None` if the list does not
+    /// reach back so far.
     fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
         if seq < self.after {
             return None;

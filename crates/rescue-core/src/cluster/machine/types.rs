@@ -87,7 +87,7 @@ pub struct View {
 }
 
 impl View {
-    /// The revisions that a transaction expects.
+    /// The revisions of the keys `leader` and `alive`, for a transaction that succeeds only if both are unchanged.
     pub fn guard(&self) -> RevisionGuard {
         RevisionGuard {
             leader: self.leader.as_ref().map_or(0, |leader| leader.term),
@@ -136,7 +136,7 @@ pub enum Op {
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The keys, as the answer to a read or to a transaction that failed.
+    /// The keys `leader` and `alive`, as the answer to a read or to a transaction that failed.
     Is(View),
     /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,

@@ -24,7 +24,7 @@ pub(super) struct Reading {
     reported: u64,
     /// Whether a read is under way.
     loading: bool,
-    /// The newest revision that was known when the read under way began.
+    /// The newest revision of etcd that was known when the read under way began.
     floor: u64,
     /// When the next read is due.
     load_at: Option<Instant>,

@@ -232,7 +232,7 @@ impl Member {
         self.stand(standing);
     }
 
-    /// Probes the leader's rosrescue regularly.
+    /// Asks the leader's rosrescue regularly whether it leads.
     pub(super) fn update_probes(&mut self, now: Instant) {
         let asks = matches!(self.machine.role(), Role::Following | Role::Alone);
         let leader = self.leader().filter(|_| asks);

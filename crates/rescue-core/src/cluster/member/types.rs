@@ -137,7 +137,8 @@ pub enum Input {
         number: u64,
         answer: Option<wire::MergeAnswer>,
     },
-    /// The result of [`Action::WriteSnapshot`]: its place and its size in bytes. `None` if it was not written.
+    /// The result of [`Action::WriteSnapshot`]: how much of the journal the snapshot contains, and its size in bytes.
+    /// `None` if it was not written.
     SnapshotWritten(Option<(Progress, usize)>),
     /// Someone asks for a handover to the computer `to`, or to any if `to` is empty. `refused` says why that computer
     /// cannot lead.
@@ -223,7 +224,7 @@ pub enum Action {
     Load(Progress),
     /// Watch the keys `leader` and `alive`, the journal and the member entries from this view's revision on.
     Watch(View),
-    /// Write the parts of a large change.
+    /// Write the parts of a large change to etcd.
     Prepare {
         term: u64,
         parts: Vec<Put>,
@@ -237,7 +238,7 @@ pub enum Action {
     },
     /// Publish who has the master and where calls go.
     Stand(Standing),
-    /// Stop recording, acknowledging and notifying.
+    /// Stop recording and acknowledging calls, and stop notifying nodes.
     Leave,
     /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
     /// the ledger's state, if set.
