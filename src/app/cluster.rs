@@ -555,7 +555,7 @@ async fn merge(
     }
 }
 
-/// Writes this computer's entry among the members.
+/// Writes this computer's entry among the members to etcd.
 async fn say(client: Etcd, put: Put) {
     let said = async {
         let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;

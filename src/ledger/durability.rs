@@ -94,7 +94,7 @@ impl Ledger {
         }
     }
 
-    /// Writes the queued records. Other tasks continue meanwhile, however long the disk takes.
+    /// Writes the queued records to the checkpoint. Other tasks continue meanwhile, however long the disk takes.
     fn write(&self) {
         if let Some(worker) = self.worker() {
             block_in_place(|| worker.work());

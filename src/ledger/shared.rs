@@ -101,9 +101,9 @@ impl Ledger {
         }
     }
 
-    /// Judges whether each of `calls`, which another computer answered while it was cut off, conflicts with a change
-    /// after record `seq`. That computer sends them under the name `merge`, so changes of this name are no conflict.
-    /// `None` if this computer does not lead, or no longer knows all changes after `seq`.
+    /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
+    /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
+    /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
         match &inner.shared {

@@ -33,7 +33,7 @@ impl DisplacedLately {
         }
     }
 
-    /// The nodes displaced in the minute before `now`, one per address.
+    /// The nodes that lost their names to other nodes in the minute before `now`, one per address.
     pub fn at(&self, now: Instant) -> Vec<Displaced> {
         let lately = self.0.iter();
         let lately = lately.filter(|(at, _)| now.duration_since(*at) < TELLING);

@@ -107,7 +107,7 @@ impl Change {
 /// The changes that a computer records while it leads or is cut off, numbered as in the journal.
 #[derive(Debug)]
 pub struct Sharing {
-    /// The number of the last record.
+    /// The number of the last recorded change.
     last: u64,
     changes: Vec<Change>,
     recent: Recent,
@@ -123,7 +123,7 @@ impl Sharing {
         }
     }
 
-    /// The number of the last record.
+    /// The number of the last recorded change.
     pub fn last(&self) -> u64 {
         self.last
     }
@@ -162,9 +162,9 @@ impl Sharing {
         Change::State { seq, state }
     }
 
-    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. That computer sends
-    /// them under the name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the
-    /// changes after that record are no longer known.
+    /// Decides what happens to `calls`, which a computer answered while it was cut off, in the state `mirror`. That
+    /// computer sends them under the name `merge`, and has taken the others' changes up to record `seq` into account.
+    /// `None` if the changes after that record are no longer known.
     pub fn judge(
         &self,
         mirror: &Master,

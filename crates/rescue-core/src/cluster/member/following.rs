@@ -302,7 +302,7 @@ impl Member {
         self.place = Place { epoch, term, seq };
     }
 
-    /// Handles entries of members.
+    /// Handles what computers have written into their entries among the members.
     pub(super) fn hear(&mut self, heard: &[Heard]) {
         let own = self.machine.settings();
         for heard in heard.iter().filter(|heard| heard.name == own.name) {

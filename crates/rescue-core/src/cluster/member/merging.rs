@@ -40,8 +40,8 @@ enum Step {
     Reading,
     /// Waits for the answer to this request, from the leader at this address and of this term, or from this computer.
     Asked(Ask, Option<(String, u64)>),
-    /// Waits until this time, then sends this request again. Without one, decides again which of the remaining writes
-    /// to send.
+    /// Waits until this time, then sends this request again or, if there is none, decides again which of the remaining
+    /// writes to send.
     Pause(Instant, Option<Ask>),
 }
 

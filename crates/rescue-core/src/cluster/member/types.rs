@@ -63,7 +63,8 @@ pub struct Heard {
 }
 
 impl Heard {
-    /// Returns evidence of a namesake if this entry, which has the name in `own`, belongs to another computer.
+    /// Returns evidence of another computer with this one's name, if this entry, which has the name in `own`, belongs
+    /// to another computer.
     pub(super) fn sign_of_namesake(&self, own: &Settings) -> Option<Sign> {
         let said = self.said.as_ref()?;
         let is_own = own.is_of_this_computer(&self.name, &said.uri, &said.boot);
@@ -89,7 +90,7 @@ pub enum Entry {
 /// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {
-    /// The leader's two keys at the same revision.
+    /// The keys `leader` and `alive` at the same revision.
     pub view: View,
     /// The state before the records, and the nodes that lost their names to other nodes shortly before. `None` if the
     /// records follow the known journal.
@@ -257,9 +258,9 @@ pub enum Action {
     /// [`Input::AsState`].
     TakeAsState,
     AskForwarded,
-    /// Tell these displaced nodes to shut down again, because they may have missed it.
+    /// Tell these nodes, which lost their names to other nodes, to shut down again, because they may have missed it.
     TellDisplaced(Vec<Displaced>),
-    /// Note this term in the checkpoint.
+    /// Note in the checkpoint that this computer leads in this term.
     Term(u64),
     BeginMaster(Cause),
     /// Kill the master at once.
@@ -293,7 +294,7 @@ pub enum Action {
         uri: String,
         term: u64,
     },
-    /// Write this computer's entry among the members.
+    /// Write this computer's entry among the members to etcd.
     Say,
     WriteSnapshot {
         term: u64,

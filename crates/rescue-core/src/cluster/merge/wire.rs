@@ -73,7 +73,8 @@ impl From<&Lost> for WriteOutcome {
 /// The leader's answer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum MergeAnswer {
-    /// The leader no longer knows all changes after the record, so the writes must be judged again.
+    /// The leader no longer knows all changes after the record [`Ask::seq`], so the sender must decide again which
+    /// writes to send.
     Again,
     /// The outcome of each write.
     Done(Vec<WriteOutcome>),
