@@ -282,7 +282,8 @@ enum Begun {
 }
 
 impl Begun {
-    /// Manages the master until rosrescue stops. Returns the master's process, if it is ours and still runs.
+    /// Manages the master until rosrescue stops. Returns the master's process, if rosrescue started it and it still
+    /// runs.
     async fn run(
         self,
         stop: CancellationToken,

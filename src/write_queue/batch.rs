@@ -18,7 +18,7 @@ use crate::{
 /// Maximum number of calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a
 /// few milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
-/// Maximum number of bytes of bodies in a batch.
+/// Maximum size of the bodies of all calls in a batch, in bytes.
 pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]

@@ -576,9 +576,8 @@ impl Drain {
         }
     }
 
-    /// Sends answers once their effects are safe (see
-    /// [`Ledger::durable`](crate::ledger::Ledger::durable)) and a whole checkpoint includes this
-    /// `version` of the mirror.
+    /// Sends answers once the effects of their calls are safe (see [`Ledger::durable`](crate::ledger::Ledger::durable))
+    /// and a whole checkpoint includes this `version` of the mirror.
     fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, CallAnswer)>) {
         let mark = self.link.ledger.to_await(mark);
         let send = move |is_safe: bool| {

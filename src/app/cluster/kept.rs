@@ -19,7 +19,7 @@ use crate::{
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
 const FILE_BYTES: u64 = 64 << 10;
 
-/// The file `CHECKPOINT.alone`.
+/// The file `CHECKPOINT.alone`, which holds the writes that were answered while this computer was cut off.
 #[derive(Default)]
 pub(super) struct Kept {
     /// `None` while there is nothing to keep, or while the disk hangs.

@@ -16,7 +16,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// The alarm that this computer is cut off, and its all-clear.
+/// Limits the log lines that this computer is cut off, and that it is no longer.
 static ALONE: Pair = Pair::new();
 
 impl ClusterDriver {

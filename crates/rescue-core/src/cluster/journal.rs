@@ -247,7 +247,7 @@ impl Manifest {
 /// The records that one transaction adds to the journal.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct JournalBatch {
-    /// How many of the given records the entry contains.
+    /// How many of the given records `entry` contains.
     pub count: usize,
     pub entry: Option<Put>,
 }

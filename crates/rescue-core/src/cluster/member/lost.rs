@@ -14,7 +14,7 @@ use crate::cluster::{
     standing::Place,
 };
 
-/// How long a computer that holds less waits for the one that holds the most, in times to live.
+/// How long a computer that knows less of the lost journal waits for the one that knows the most, in times to live.
 const PATIENCE: u32 = 3;
 
 #[derive(Debug, Default)]

@@ -165,7 +165,7 @@ impl Member {
         }
     }
 
-    /// Stops recording and answering for the other computers.
+    /// Stops recording calls and ends this computer's master, because another computer may lead.
     fn give_up(&mut self) {
         self.act(Action::Leave);
         let known = self.knows();

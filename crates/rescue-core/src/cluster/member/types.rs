@@ -52,7 +52,7 @@ pub struct Holds {
     pub seq: u64,
 }
 
-/// An entry among the members.
+/// What a computer has written about itself: its entry among the members.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     pub name: String,
