@@ -31,7 +31,7 @@ pub struct Mark {
 }
 
 impl Mark {
-    /// The later of two marks.
+    /// The mark of the later of two records.
     pub fn max(self, other: Self) -> Self {
         Self {
             disk: self.disk.max(other.disk),
@@ -101,7 +101,7 @@ impl Ledger {
         }
     }
 
-    /// Writes the records in another thread.
+    /// Writes the queued records to the checkpoint, in another thread.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
             spawn_blocking(move || worker.work());

@@ -40,7 +40,7 @@ struct InFlight {
     /// The mirror's version when the batch was sent.
     version: u64,
     items: Vec<Item>,
-    /// Whether the mirror can answer these items.
+    /// Whether the mirror can answer all calls of the batch.
     answerable: bool,
     /// Whether the recovery has been told that the master is late with the batch.
     told_late: bool,

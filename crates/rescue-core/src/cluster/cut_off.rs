@@ -110,7 +110,7 @@ impl CutOff {
         }
     }
 
-    /// Notes new records of the journal.
+    /// Notes new records of the journal. They count as others' changes, unless they were expected.
     pub fn note(&mut self, records: &[Record]) {
         for time in &mut self.times {
             for record in records {

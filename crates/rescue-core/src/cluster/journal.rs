@@ -211,7 +211,7 @@ impl Manifest {
         format!("{} seq={seq} bytes={bytes} crc32c={crc:08x}\n", kind.word()).into_bytes()
     }
 
-    /// Reads a value that may be a manifest.
+    /// Reads `value` as a manifest. `None` if it is something else.
     pub fn read(value: &[u8]) -> Option<Self> {
         let line = std::str::from_utf8(value).ok()?.strip_suffix('\n')?;
         let mut words = line.split(' ');
@@ -227,7 +227,7 @@ impl Manifest {
         })
     }
 
-    /// Joins the parts, which are sorted by key.
+    /// Joins the value's `parts`, which are sorted by key, and checks their size and checksum.
     pub fn assemble(&self, keys: &Keys, parts: &[Vec<u8>]) -> Result<Vec<u8>, JournalError> {
         let whole = parts.concat();
         if whole.len() == self.bytes && crc32c::crc32c(&whole) == self.crc {
@@ -333,7 +333,7 @@ pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
 /// How far a mirror has followed the journal, and the journal's size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
-    /// The last record that the mirror contains.
+    /// The number of the last record that the mirror contains.
     pub seq: u64,
     entries: usize,
     bytes: usize,

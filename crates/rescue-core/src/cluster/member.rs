@@ -56,7 +56,7 @@ struct Journal {
 }
 
 impl Journal {
-    /// Applies `records`, which follow the last known one.
+    /// Applies `records` to the journal's state. They follow the last record that was applied.
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
             if let JournalEntry::Call { call, .. } = &record.entry {

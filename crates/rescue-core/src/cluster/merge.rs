@@ -29,7 +29,7 @@ pub struct Merged {
     pub lost: Vec<Lost>,
 }
 
-/// A write that is lost.
+/// A write that was answered while its computer was cut off, and that is lost because of a conflict.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lost {
     pub call: Request,

@@ -150,7 +150,7 @@ impl Sharing {
         self.changes.push(Change::State { seq, state });
     }
 
-    /// Takes the changes recorded since the last call.
+    /// Takes the changes recorded since they were last taken.
     pub fn take(&mut self) -> Vec<Change> {
         std::mem::take(&mut self.changes)
     }

@@ -52,7 +52,7 @@ pub struct Place {
     pub epoch: u64,
     /// The leader's term.
     pub term: u64,
-    /// The number of a record.
+    /// The number of a record in the journal.
     pub seq: u64,
 }
 

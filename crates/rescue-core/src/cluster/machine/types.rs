@@ -52,7 +52,7 @@ impl Settings {
 /// The content of the key `leader`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Leader {
-    /// The revision of the key.
+    /// The term: the revision of the key `leader`.
     pub term: u64,
     pub name: String,
     /// The id of the process, and the number of its claim.
@@ -66,11 +66,11 @@ pub struct Leader {
 /// The content of the key `alive`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Alive {
-    /// The revision of the key.
+    /// The revision of the key `alive`.
     pub revision: u64,
     /// The number of the leader's transaction that wrote this key.
     pub beat: u64,
-    /// The journal's last record.
+    /// The number of the journal's last record.
     pub seq: u64,
     /// Set if the leader has given up leadership: the computer that should lead next, or empty for any.
     pub released: Option<String>,
@@ -95,7 +95,7 @@ impl View {
         }
     }
 
-    /// The journal's last record.
+    /// The number of the journal's last record.
     pub fn seq(&self) -> u64 {
         self.alive.as_ref().map_or(0, |alive| alive.seq)
     }

@@ -114,7 +114,7 @@ impl Member {
         self.act(Action::Decide { seq, state, closed });
     }
 
-    /// Handles keys and journal entries from the watch.
+    /// Handles the keys `leader` and `alive` and the journal entries that the watch on etcd delivered.
     pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
         self.see(now, view);
@@ -271,7 +271,7 @@ impl Member {
         self.yield_to_others();
     }
 
-    /// Starts the machine, once.
+    /// Starts the machine, unless it has started already.
     pub(super) fn start(&mut self, now: Instant) {
         if self.queue.start_by.take().is_some() {
             self.drive(now, machine::Input::Start(0));

@@ -20,7 +20,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Pause before unanswered calls are sent again.
+/// Pause before a request that the leader did not answer is sent again.
 const AGAIN: Duration = Duration::from_millis(100);
 /// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 const TELLER: &str = "/rosrescue";

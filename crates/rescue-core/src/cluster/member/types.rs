@@ -76,7 +76,7 @@ impl Heard {
     }
 }
 
-/// A journal entry as the watch delivers it.
+/// A journal entry as the watch on etcd delivers it.
 #[derive(Clone, Debug)]
 pub enum Entry {
     Records {

@@ -17,7 +17,7 @@ use crate::{
 pub enum ChangeSubject {
     /// A parameter: its resolved name, with a slash at the end.
     Param(String),
-    /// A registration by this node.
+    /// A registration by the node with this name.
     Node(String),
     Service(String),
     Topic {
@@ -28,7 +28,7 @@ pub enum ChangeSubject {
 }
 
 impl ChangeSubject {
-    /// The approximate size in bytes.
+    /// The approximate memory for this value, in bytes.
     pub fn size(&self) -> usize {
         size_of::<Self>()
             + match self {

@@ -8,7 +8,7 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The name of the XML-RPC method.
+/// The name of the XML-RPC method by which a computer sends its writes to the leader.
 pub const METHOD: &str = "rosrescue/merge";
 /// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
@@ -70,7 +70,7 @@ impl From<&Lost> for WriteOutcome {
     }
 }
 
-/// The leader's answer.
+/// The leader's answer to an [`Ask`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum MergeAnswer {
     /// The leader no longer knows all changes after the record [`Ask::seq`], so the sender must decide again which
