@@ -91,7 +91,7 @@ impl Outgoing {
         self.ready
     }
 
-    /// Raises [`Self::ready()`] to the last change without writing parts, because this computer is cut off from etcd.
+    /// Raises [`Self::ready()`] to the last change without writing parts, because this computer is cut off.
     pub fn all_ready(&mut self) {
         self.preparing = false;
         self.ready = self.changes.back().map_or(self.ready, Change::seq);
