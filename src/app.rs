@@ -211,7 +211,7 @@ fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
 
 /// Whether this is the only computer that may have the master, or one of several.
 enum Runs {
-    /// The only computer. `None` for an external master.
+    /// This is the only computer. `None` if the master is external.
     Single(Option<Supervised>),
     /// One of several computers.
     Member(Box<ClusterDriver>),
@@ -282,7 +282,8 @@ enum Begun {
 }
 
 impl Begun {
-    /// Manages the master until rosrescue stops. Returns the master's process, if it is ours and still runs.
+    /// Manages the master until rosrescue stops. Returns the master's process, if rosrescue started it and it still
+    /// runs.
     async fn run(
         self,
         stop: CancellationToken,

@@ -50,8 +50,8 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Refuses an outdated result: another incarnation has begun, the mirror has changed since, or the master is on another
-/// computer than the caller assumed.
+/// Refuses an outdated result: another incarnation (see [`Token`]) has begun, the mirror has changed since, or the
+/// master is on another computer than the caller assumed.
 #[derive(Debug)]
 pub struct Superseded;
 
@@ -69,7 +69,7 @@ pub(crate) struct Recorded {
 pub struct Basis {
     pub mirror: Master,
     pub version: u64,
-    /// Writes that the present incarnation may not have run.
+    /// Writes that the mirror has answered and the present master may not have run.
     pub pending: Vec<Request>,
 }
 
@@ -80,7 +80,7 @@ pub struct Ledger {
     stats: &'static Stats,
     /// Answers to calls up to this record need not wait for the disk.
     durable: watch::Sender<u64>,
-    /// Whether the disk is late with a sync.
+    /// Whether a sync of the checkpoint takes longer than 5 s.
     sync_is_late: AtomicBool,
     /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
@@ -88,7 +88,7 @@ pub struct Ledger {
     agreed: watch::Sender<Agreed>,
     /// The time until which this computer may act as leader. See [`Ledger::set_lease`].
     lease: watch::Sender<Option<Instant>>,
-    /// The mirror's version in the last complete checkpoint that was written or failed.
+    /// The mirror's version in the last complete checkpoint that was written or could not be written.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
@@ -114,15 +114,15 @@ struct Inner {
     activity: Activity,
     order: Order,
     diverged: HashSet<Method>,
-    /// Whether an injection is under way, so that the mirror must not change.
+    /// Whether a master is being brought to the mirror's state (an injection), so that the mirror must not change.
     injecting: bool,
     /// Whether the present master may differ from the mirror and must be read again.
     doubted: bool,
-    /// Whether the present incarnation may still run a batch whose reply is no longer awaited.
+    /// Whether the present master may still run a batch whose reply is no longer awaited.
     abandoned: bool,
     /// The state that a late master will have once it has answered its outstanding calls.
     behind: Option<LateState>,
-    /// The last incarnation to which calls have passed.
+    /// The number of the last master to which calls have passed.
     served: Option<u64>,
     /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
     /// be newer than the mirror.
@@ -226,12 +226,12 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// The number of the present incarnation.
+    /// The number in the present master's [`Token`].
     pub fn incarnation(&self) -> u64 {
         self.lock().session.incarnation
     }
 
-    /// The token of the present incarnation.
+    /// The [`Token`] that identifies the present master.
     pub fn token(&self) -> Token {
         self.lock().token()
     }
@@ -251,8 +251,8 @@ impl Ledger {
         self.record_from(now, incarnation, &batch)
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in the order in which the master ran
-    /// them.
+    /// Records and applies the calls in `batch`, which the master ran in this order and has answered. `incarnation` is
+    /// the number in the [`Token`] of that master.
     pub(crate) fn record_from(
         &self,
         now: Instant,
@@ -329,12 +329,12 @@ impl Ledger {
         self.shared.notify_one();
     }
 
-    /// Number of writes that the present incarnation may not have run.
+    /// Number of writes that the mirror has answered and the present master may not have run.
     pub fn pending(&self) -> usize {
         self.lock().pending.calls().len()
     }
 
-    /// The parameter subscriptions that the present incarnation may hold. They follow from the mirror and the pending
+    /// The parameter subscriptions that the present master may hold. They follow from the mirror and the pending
     /// writes, because they cannot be read from a master.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
@@ -369,8 +369,8 @@ impl Ledger {
         difference
     }
 
-    /// Like [`Self::adopt`], but only if `state` was read from the master of `incarnation` while the mirror was at
-    /// `version`.
+    /// Like [`Self::adopt`], but only if `state` was read from the present master, whose [`Token`] has the number
+    /// `incarnation`, while the mirror was at `version`.
     pub fn adopt_if(
         &self,
         incarnation: u64,
@@ -517,7 +517,7 @@ impl Inner {
         self.journal.as_ref().map(Journal::seq)
     }
 
-    /// Mark of the last record.
+    /// Identifies the last record, so that an answer can wait for it.
     fn mark(&self) -> Mark {
         Mark {
             disk: self.last_seq(),

@@ -91,7 +91,7 @@ impl WriteQueue {
     }
 
     /// Waits until a batch is lost: its connection ended before the answer. The master may have run the batch, and may
-    /// be dead. Nothing is sent until the gate has changed, so the caller must set the gate.
+    /// be dead. Nothing is sent until the caller changes the gate, which says whether calls pass to the master.
     pub async fn lost(&self) {
         self.signals.lost.notified().await;
     }

@@ -54,7 +54,7 @@ use crate::{
     xmlrpc,
 };
 
-/// Time limit for work in the background.
+/// Time limit of one request to etcd that is sent in the background.
 const LIMIT: Duration = Duration::from_secs(5);
 /// Pause before a large write is retried.
 const AGAIN: Duration = Duration::from_millis(200);
@@ -79,13 +79,13 @@ pub(super) struct ClusterDriver {
     handovers: mpsc::Receiver<Handover>,
     /// The caller that waits for a handover.
     handover: Option<oneshot::Sender<Result<String, String>>>,
-    /// The next inputs.
+    /// Inputs to pass to the [`Member`] before any new ones.
     inbox: VecDeque<Input>,
     work: Work,
     /// Background tasks without a result.
     beside: JoinSet<()>,
     watch: Option<Watching>,
-    /// The leader's keys as the watch delivered them.
+    /// The keys `leader` and `alive` as the watch on etcd delivered them.
     watched: View,
     duties: Option<MasterDuties>,
     /// Processes that are being stopped.
@@ -368,7 +368,7 @@ impl ClusterDriver {
         });
     }
 
-    /// The next input.
+    /// Waits for the next input of the [`Member`].
     async fn next(&mut self) -> Result<Input, ProcessError> {
         let wake = self.member.deadline();
         // Inputs may be ready all the time, so this thread's other tasks get a turn here.
@@ -406,7 +406,7 @@ impl ClusterDriver {
         self.setup.context.ledger.end_injection();
     }
 
-    /// Turns the watch's changes, or its end, into an input.
+    /// Turns what the watch on etcd delivered, or its end, into an input for the [`Member`].
     fn changed(&mut self, changes: Option<Vec<KeyChange>>) -> Input {
         let Some(changes) = changes else {
             self.watch = None;
@@ -555,7 +555,7 @@ async fn merge(
     }
 }
 
-/// Writes this computer's entry among the members.
+/// Writes this computer's entry among the members to etcd.
 async fn say(client: Etcd, put: Put) {
     let said = async {
         let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;

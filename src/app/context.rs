@@ -156,7 +156,8 @@ impl Context {
     }
 }
 
-/// Recovery and roscore's other duties while this computer of several has the master.
+/// Runs recovery and roscore's other duties (rosout and the run id) while this computer, one of several, has the
+/// master.
 pub(super) struct MasterDuties {
     driver: JoinHandle<Result<Option<MasterProcess>, ProcessError>>,
     roscore: Option<JoinHandle<()>>,
@@ -175,7 +176,7 @@ impl MasterDuties {
         }
     }
 
-    /// Stops roscore's other duties while calls still pass to the master, because rosout unregisters there when it
+    /// Stops roscore's other duties while calls still pass to the master, because rosout unregisters itself when it
     /// stops.
     pub(super) fn end_roscore(&mut self) -> impl Future<Output = ()> + Send + 'static {
         self.roscore_stop.cancel();
@@ -188,8 +189,8 @@ impl MasterDuties {
         }
     }
 
-    /// Stops everything and kills the master at once: another computer may lead, and no node may hear from this
-    /// computer's master any more. The returned future waits for the processes.
+    /// Stops recovery and roscore's other duties, and kills the master at once: another computer may lead, and no node
+    /// may hear from this computer's master any more. The returned future waits for the processes.
     pub(super) async fn end(self) -> impl Future<Output = ()> + Send + 'static {
         self.stop.cancel();
         let process = match self.driver.await {

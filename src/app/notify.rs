@@ -110,7 +110,7 @@ impl Context {
         }
     }
 
-    /// Returns when calls are answered by the master, the mirror, or another computer.
+    /// Waits until calls are answered by the master, the mirror, or another computer.
     async fn answers(&self) {
         let mut gate = self.gate.clone();
         loop {

@@ -32,7 +32,7 @@ pub(super) struct Beginning {
     pub(super) pending: Vec<Request>,
     /// Replaced nodes that may still need a `shutdown`.
     pub(super) displaced: Vec<Displaced>,
-    /// The store, with no generation written yet.
+    /// The store, to which no checkpoint has been written yet.
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
     /// Whether the session continues after its last process died, without a reboot of this computer.

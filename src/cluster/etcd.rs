@@ -67,7 +67,8 @@ impl Etcd {
         view(keys, done.revision, done.gets.iter().flatten()).map(EtcdAnswer::Is)
     }
 
-    /// Writes `puts` one after the other, each only if `leader` still has this term. Returns whether it had.
+    /// Writes `puts` one after the other, each only if `leader` still has this term. Returns whether `leader` had it
+    /// each time.
     ///
     /// # Errors
     ///
@@ -88,7 +89,7 @@ impl Etcd {
         Ok(true)
     }
 
-    /// Deletes `ranges` if `leader` still has this term. Returns whether it had.
+    /// Deletes `ranges` if `leader` still has this term. Returns whether they were deleted.
     ///
     /// # Errors
     ///

@@ -30,7 +30,7 @@ pub enum ReplicaError {
     Short { found: u64, expected: u64 },
 }
 
-/// The part of the state in etcd that was not known yet.
+/// What [`Replica::load`] has read: the part of the state in etcd that its caller did not know yet.
 #[derive(Debug)]
 pub struct LoadedState {
     /// The keys `leader` and `alive`, read at the same moment.

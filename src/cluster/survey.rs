@@ -13,9 +13,9 @@ pub const LIMIT: Duration = Duration::from_secs(3);
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Complaint {
     pub what: String,
-    /// How to correct it.
+    /// How to correct the problem.
     pub todo: String,
-    /// Whether it may pass by itself: an etcd that does not answer may be starting.
+    /// Whether the problem may pass by itself: an etcd that does not answer may be starting.
     pub may_pass: bool,
 }
 

@@ -46,7 +46,7 @@ pub struct Owed {
     pub displaced: Vec<Displaced>,
 }
 
-/// Notifications collected since the outbox was last taken.
+/// Notifications for rosrescue to send, collected since the last ones were taken.
 #[derive(Debug, Default)]
 pub struct OwedNotifications {
     /// Nodes that must shut down because another node has their name.
@@ -107,17 +107,18 @@ pub struct Activity {
     lost: VecDeque<Lost>,
     /// Nodes that a master had to tell to shut down, with the time.
     displaced: Vec<(Instant, Displaced)>,
-    /// All nodes that were displaced recently, with the time. The next start cannot know whether they were told to shut
-    /// down.
+    /// All nodes that lost their names to other nodes recently, with the time. The next start cannot know whether they
+    /// were told to shut down.
     lately: Vec<(Instant, Displaced)>,
-    /// Displaced nodes from a checkpoint. They may not have been told to shut down.
+    /// Nodes that lost their names to other nodes, from a checkpoint. They may not have been told to shut down.
     restored: Vec<Displaced>,
-    /// Whether the changes that a master notifies nodes of are collected in the outbox.
+    /// Whether changes that a master notifies nodes of are also collected in `outbox`.
     notifying: bool,
     outbox: OwedNotifications,
 }
 
-/// A notification that rosrescue must send because there is no master: receiver, subject, and call.
+/// A notification that rosrescue must send because there is no master: the receiver's address, the topic or parameter,
+/// and the call.
 type Unsent = (String, Subject, Arc<Call>);
 
 /// Collects what one call changes, and which nodes must be notified of the changes.
@@ -128,9 +129,9 @@ pub(super) struct Noticed {
     subscribers: usize,
     /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,
-    /// Whether the mirror stands in, so that rosrescue sends the notifications.
+    /// Whether the mirror answers in a master's place, so that rosrescue sends the notifications.
     standing_in: bool,
-    /// The notifications to send while the mirror stands in.
+    /// The notifications to send while the mirror answers in a master's place.
     calls: Vec<Unsent>,
     pub(super) displaced: Vec<Displaced>,
 }
@@ -159,7 +160,7 @@ impl Noticed {
         self.standing_in.then(|| std::mem::take(&mut self.calls))
     }
 
-    /// The subjects of the notifications, each with its number of nodes.
+    /// The topics and parameters of the notifications, each with the number of nodes to notify.
     pub(super) fn subjects(&self) -> impl Iterator<Item = (Subject, usize)> {
         let topics = self.topics.iter().cloned().map(Subject::Topic);
         let topics = topics.map(|topic| (topic, self.subscribers));
@@ -191,7 +192,7 @@ impl NoticeSink for Noticed {
 
 impl Activity {
     /// Notes an applied call and its notifications. `registered` says whether the mirror knows a node. Returns whether
-    /// the outbox has grown.
+    /// the task that notifies nodes has new work.
     pub(super) fn applied(
         &mut self,
         now: Instant,
@@ -374,7 +375,7 @@ impl Activity {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Keeps the `displaced` nodes of a checkpoint until [`Self::notice_all`].
+    /// Keeps the nodes of a checkpoint that lost their names to other nodes (`displaced`) until [`Self::notice_all`].
     pub fn restore_displaced(&mut self, displaced: Vec<Displaced>) {
         self.restored = displaced;
     }
@@ -388,8 +389,9 @@ impl Activity {
         all.into_values().cloned().collect()
     }
 
-    /// Treats all that nodes subscribe to as changed now, and the checkpoint's displaced nodes as displaced now.
-    /// `mirror` must equal the master, because a node that has taken its name back is not displaced.
+    /// Treats everything that nodes subscribe to as changed at `now`, and the checkpoint's displaced nodes as having
+    /// lost their names at `now`. `mirror` must equal the master, because a node that has taken its name back is left
+    /// out.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,

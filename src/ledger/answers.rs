@@ -12,7 +12,8 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// While fewer writes than this are pending, an unregistration that changes nothing in the mirror becomes pending, too.
+/// An unregistration that changes nothing in the mirror is added to the pending writes only while there are fewer than
+/// this.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
 /// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
@@ -108,16 +109,17 @@ impl Ledger {
     /// returns the mark of the last record. That is this call's record, or if it changes nothing, the record that made
     /// it redundant.
     ///
-    /// `None` during an injection, if another computer has the master, or if the answers to the reads in a multicall
-    /// are too large. Then the call has to wait.
+    /// `None` while a master is being brought to the mirror's state (an injection), if another computer has the master,
+    /// or if the answers to the reads in a multicall are too large. Then the call has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
         Some((reply, mark))
     }
 
-    /// Like [`Self::stand_in`], for a client's call from `source`. The answer counts as on its way to the client, with
-    /// the subjects in `concern`, until the returned [`Delivery`] is dropped.
+    /// Like [`Self::stand_in`], for a client's call from `source`. `concern` says which topics, parameters and node
+    /// names the call concerns. The answer counts as on its way to the client until the returned [`Delivery`] is
+    /// dropped.
     pub(crate) fn stand_in_for(
         self: &Arc<Self>,
         now: Instant,

@@ -1,5 +1,5 @@
-//! Maintains the checkpoint: syncs the journal, checks that the file is unchanged, and writes new generations. It
-//! starts recording again after a disk failure, and after another process has moved or changed the file. It runs in
+//! Maintains the checkpoint: syncs the journal, checks that the file is unchanged, and writes new complete checkpoints.
+//! It starts recording again after a disk failure, and after another process has moved or changed the file. It runs in
 //! parallel with traffic. A call waits for it only with `--sync always`, or if no journal has the call's effect.
 
 use std::{
@@ -40,7 +40,7 @@ pub(crate) struct Checkpointer {
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
-    /// The journal's last record in the previous round.
+    /// The number of the journal's last record when the file was last checked.
     seq: u64,
     recorded_at: Instant,
     compacted_at: Option<Instant>,
@@ -48,9 +48,9 @@ pub(crate) struct Checkpointer {
 }
 
 impl Checkpointer {
-    /// Writes the first generation of the checkpoint of `ledger` at `path`. Before that, no write may be answered,
-    /// because no journal would have it. Later the file is synced every `sync_interval`, unless the ledger's sync
-    /// policy says otherwise. Waits for the disk for [`DISK_PATIENCE`] at most.
+    /// Writes the first complete checkpoint of `ledger` at `path`. Before that, no write may be answered, because no
+    /// journal would have it. Later the file is synced every `sync_interval`, unless the ledger's sync policy says
+    /// otherwise. Waits for the disk for [`DISK_PATIENCE`] at most.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,

@@ -65,7 +65,7 @@ impl Drop for Delivery {
 pub(crate) struct MustWait;
 
 impl Ledger {
-    /// Runs `work` on the order and the mirror.
+    /// Runs `work` on the [`Order`] and the mirror.
     pub(crate) fn with_order<T>(&self, work: impl FnOnce(&mut Order, &Master) -> T) -> T {
         let mut inner = self.lock();
         let Inner { mirror, order, .. } = &mut *inner;

@@ -31,7 +31,7 @@ pub struct Mark {
 }
 
 impl Mark {
-    /// The later of two marks.
+    /// The mark of the later of two records.
     pub fn max(self, other: Self) -> Self {
         Self {
             disk: self.disk.max(other.disk),
@@ -45,9 +45,9 @@ impl Mark {
 pub(super) struct Whole {
     /// The version after the last change that has no record, so only a complete checkpoint holds it.
     pub(super) unrecorded: u64,
-    /// The version of the last checkpoint that was taken.
+    /// The mirror's version in the last complete checkpoint that the store was told to write.
     taken: u64,
-    /// The version of the last checkpoint that was written.
+    /// The mirror's version in the last complete checkpoint that was written.
     written: u64,
     /// Why the last checkpoint could not be written.
     failure: Option<String>,
@@ -60,7 +60,7 @@ impl Whole {
 }
 
 impl Ledger {
-    /// Mark of the last record.
+    /// Identifies the last record, so that an answer can wait for it.
     pub fn mark(&self) -> Mark {
         self.lock().mark()
     }
@@ -94,14 +94,14 @@ impl Ledger {
         }
     }
 
-    /// Writes the queued records. Other tasks continue meanwhile, however long the disk takes.
+    /// Writes the queued records to the checkpoint. Other tasks continue meanwhile, however long the disk takes.
     fn write(&self) {
         if let Some(worker) = self.worker() {
             block_in_place(|| worker.work());
         }
     }
 
-    /// Writes the records in another thread.
+    /// Writes the queued records to the checkpoint, in another thread.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
             spawn_blocking(move || worker.work());
@@ -121,7 +121,7 @@ impl Ledger {
         self.disk_silent.notify_one();
     }
 
-    /// Notes whether the disk is late with a sync.
+    /// Notes whether a sync takes longer than [`DISK_PATIENCE`].
     pub(super) fn set_sync_is_late(&self, late: bool) {
         self.sync_is_late.store(late, Ordering::Relaxed);
         self.disk_silent.notify_one();

@@ -23,8 +23,8 @@ impl Rescues {
         }
     }
 
-    /// Keeps the present state, which a new master now holds, as that of rescue `number`. The file is written in
-    /// parallel with traffic.
+    /// Keeps the present state, which a new master now holds, as the state after rescue `number`. The file is written
+    /// in parallel with traffic.
     pub(crate) fn keep(&self, number: u64, now: Instant) {
         let bytes_most = self.bytes_most;
         if bytes_most == 0 || self.limit.pass(now).is_none() {

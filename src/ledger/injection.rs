@@ -1,5 +1,5 @@
 //! The ledger's part in an injection: freezes the mirror while a master is brought to its state, and starts the new
-//! incarnation.
+//! incarnation (see [`Token`]).
 
 use super::{Basis, Ledger};
 use crate::{master::Master, replay::Token};
@@ -26,14 +26,14 @@ impl Ledger {
         self.lock().mirror.set_old(old);
     }
 
-    /// The mirror's version and state, and the next incarnation's token.
+    /// The mirror's version and state, and the [`Token`] for the next master.
     pub fn next(&self) -> (u64, Master, Token) {
         let inner = self.lock();
         let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
         (inner.version, inner.mirror.clone(), token)
     }
 
-    /// Notes that the checkpoint is older than the master, which is incarnation `number`. So a master has run the
+    /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. So a master has run the
     /// checkpoint's pending writes.
     pub fn catch_up(&self, number: u64) {
         let mut inner = self.lock();
@@ -42,10 +42,11 @@ impl Ledger {
         inner.session_unwritten = true;
     }
 
-    /// Starts the next incarnation, so that replies of the previous one no longer count. Returns the new token.
+    /// Starts the next incarnation (see [`Token`]), so that replies of the previous one no longer count. Returns the
+    /// new token.
     ///
-    /// The journal records the new number once the master has it. A rosrescue that starts before that finds either a
-    /// master with a higher number than the recorded one, or a master without the pending writes.
+    /// The journal records the new token's number once the master has it. A rosrescue that starts before that finds
+    /// either a master with a higher number than the recorded one, or a master without the pending writes.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.raise_incarnation();
@@ -54,7 +55,7 @@ impl Ledger {
         inner.token()
     }
 
-    /// Notes that the present incarnation holds the mirror's state, so no write is pending.
+    /// Notes that the present master holds the mirror's state, so no write is pending.
     pub fn delivered(&self) {
         let mut inner = self.lock();
         if !inner.pending.calls().is_empty() {
@@ -68,8 +69,8 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// Lets calls pass to the present incarnation and allows the mirror to change again. Returns the incarnation's
-    /// number.
+    /// Lets calls pass to the present master and allows the mirror to change again. Returns the number in the master's
+    /// [`Token`].
     pub fn serve(&self) -> u64 {
         let mut inner = self.lock();
         inner.injecting = false;
@@ -79,7 +80,7 @@ impl Ledger {
         incarnation
     }
 
-    /// Whether calls have passed to the present incarnation. `None` if calls have never passed.
+    /// Whether calls have passed to the present master. `None` if calls have never passed to a master.
     pub fn has_served_present(&self) -> Option<bool> {
         let inner = self.lock();
         inner.served.map(|of| of == inner.session.incarnation)
@@ -90,20 +91,20 @@ impl Ledger {
         self.lock().injecting = false;
     }
 
-    /// Notes that the connection to the present incarnation ended before the answer to a batch. The master may still
-    /// run that batch.
+    /// Notes that the connection to the present master ended before the answer to a batch. The master may still run
+    /// that batch.
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
     }
 
-    /// Notes that the present incarnation can no longer be running a batch of an ended connection.
+    /// Notes that the present master can no longer be running a batch of an ended connection.
     pub fn settled(&self) {
         self.lock().abandoned = false;
     }
 
-    /// Whether the present incarnation can continue unchanged: no write is pending, and it runs no
-    /// abandoned batch. If so, the mirror is frozen until [`Self::end_injection`].
+    /// Whether the present master can continue unchanged: no write is pending, and it runs no batch of an ended
+    /// connection. If so, the mirror is frozen until [`Self::end_injection`].
     pub fn resume(&self) -> bool {
         let mut inner = self.lock();
         let whole = inner.pending.calls().is_empty() && !inner.abandoned;

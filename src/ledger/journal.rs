@@ -33,7 +33,7 @@ type Job = Box<dyn FnOnce(&mut Store) + Send>;
 /// The ledger's access to the store. No method waits for the disk.
 pub(super) struct Journal {
     shared: Arc<StoreQueue>,
-    /// Number of the last entry, recorded or not.
+    /// Number of the journal's last entry, whether or not it was written.
     seq: u64,
     /// Whether entries are passed to the store. False after the disk was silent, until the next complete checkpoint.
     gives: bool,
@@ -53,13 +53,13 @@ pub(super) struct StoreQueue {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct StoreState {
     pub path: PathBuf,
-    /// Number of the last entry, recorded or not.
+    /// Number of the journal's last entry, whether or not it was written.
     pub seq: u64,
     pub journal_bytes: u64,
     pub snapshot_bytes: u64,
     /// Why nothing is recorded. `None` if records are written.
     pub unprotected: Option<String>,
-    /// Whether the journal has grown enough for a new generation.
+    /// Whether the journal has grown so much that a new complete checkpoint should replace it.
     pub outgrown: bool,
     /// The name under which a foreign file at the checkpoint's path was kept.
     kept: Option<PathBuf>,
@@ -160,7 +160,7 @@ impl Journal {
         Arc::clone(&self.shared)
     }
 
-    /// Number of the last entry, recorded or not.
+    /// Number of the journal's last entry, whether or not it was written.
     pub(super) fn seq(&self) -> u64 {
         self.seq
     }

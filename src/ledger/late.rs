@@ -13,9 +13,10 @@ use crate::{
 /// The state of a late master once it has answered its outstanding calls.
 pub(super) struct LateState {
     state: Master,
-    /// How many of the pending writes the master will have run by then.
+    /// The number of pending writes that the master will have run when it has answered its outstanding calls. It must
+    /// still get the later ones.
     ran: usize,
-    /// Subjects of the notifications that the outstanding writes may cause.
+    /// The topics, parameters and node names about which the outstanding calls may make the master notify nodes.
     tells: Vec<Subject>,
     answered: bool,
 }
@@ -42,8 +43,8 @@ pub(crate) struct Missed {
 }
 
 impl Ledger {
-    /// Notes that the mirror has answered the calls that the present incarnation is late with, and nothing after them.
-    /// `tells` are the subjects that these calls may notify nodes of.
+    /// Notes that the mirror has answered the calls that the present master is late with, and no later calls. `tells`
+    /// are the topics, parameters and node names about which these calls may make the master notify nodes.
     pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
         let mut inner = self.lock();
         inner.behind = Some(LateState {
@@ -54,7 +55,7 @@ impl Ledger {
         });
     }
 
-    /// Notes that the present incarnation has answered its outstanding calls. So that master may notify nodes of them
+    /// Notes that the late master has answered its outstanding calls. It may notify nodes of the changes by these calls
     /// only now.
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
@@ -80,11 +81,12 @@ impl Ledger {
         self.outbox_changed.notify_one();
     }
 
-    /// Decides what the present incarnation needs after it was late and has answered. Freezes the mirror until
-    /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation if the master gets any writes.
+    /// Decides what the present master needs after it was late and has answered. Freezes the mirror until
+    /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation (see [`Token`]) if the master must run
+    /// writes.
     ///
     /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
-    /// shut down, or a node would be notified twice of one subject and could get the older value last.
+    /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
     pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
         let mut inner = self.lock();
         let behind = inner.behind.take().filter(|behind| behind.answered)?;
@@ -113,8 +115,8 @@ impl Ledger {
     }
 }
 
-/// The subjects that the master notifies nodes of when it runs `writes`, each with its number of nodes. `None` if it
-/// would notify nodes of one subject more than once.
+/// The topics and parameters of which the master notifies nodes when it runs `writes`, each with the number of these
+/// nodes. `None` if a node would have to shut down, or if nodes would be notified of one of them more than once.
 fn once(behind: &LateState, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
     let mut heard = BySubject::default();
     for subject in &behind.tells {
@@ -136,7 +138,7 @@ fn once(behind: &LateState, writes: &[Request]) -> Option<Vec<(Subject, usize)>>
     Some(told)
 }
 
-/// The subjects that one call notifies nodes of, each with its number of nodes.
+/// The topics and parameters of which one call notifies nodes, each with the number of these nodes.
 #[derive(Default)]
 struct Tells {
     told: Vec<(Subject, usize)>,

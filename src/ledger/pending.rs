@@ -1,4 +1,4 @@
-//! Writes that the mirror has answered and that the present incarnation may not have run.
+//! Writes that the mirror has answered and that the present master may not have run.
 
 use crate::{master::Request, xmlrpc::Value};
 
@@ -11,7 +11,8 @@ const BYTES_MAX: usize = 16 << 20;
 #[derive(Debug)]
 pub(super) struct TooMany;
 
-/// Pending writes, in the order in which they were answered. Bounded.
+/// Writes that the mirror has answered and the present master may not have run, in the order in which they were
+/// answered. Bounded.
 #[derive(Debug, Default)]
 pub(super) struct PendingWrites {
     calls: Vec<Request>,

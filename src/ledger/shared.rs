@@ -101,9 +101,9 @@ impl Ledger {
         }
     }
 
-    /// Judges whether each of `calls`, which another computer answered while it was cut off, conflicts with a change
-    /// after record `seq`. That computer sends them under the name `merge`, so changes of this name are no conflict.
-    /// `None` if this computer does not lead, or no longer knows all changes after `seq`.
+    /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
+    /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
+    /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
         match &inner.shared {
@@ -139,19 +139,19 @@ impl Ledger {
         });
     }
 
-    /// Whether the lease is valid now.
+    /// Whether this computer may act as leader now; see [`Self::set_lease`].
     pub fn has_lease(&self) -> bool {
         self.lease
             .borrow()
             .is_none_or(|until| Instant::now() < until)
     }
 
-    /// Signals each new lease.
+    /// Signals when this computer may act as leader again.
     pub(crate) fn lease_changed(&self) -> watch::Receiver<Option<Instant>> {
         self.lease.subscribe()
     }
 
-    /// Waits until the lease is valid.
+    /// Waits until this computer may act as leader.
     pub(crate) async fn await_lease(&self) {
         let mut changed = self.lease_changed();
         while !self.has_lease() {
@@ -419,7 +419,7 @@ mod tests {
         Request::new(Method::SetParam, params)
     }
 
-    /// The verdicts on setting these parameters to -1.
+    /// Whether a computer that was cut off may set each of these parameters to -1.
     fn judged(ledger: &Ledger, seq: u64, keys: &[&str]) -> Option<Vec<bool>> {
         let calls: Vec<_> = keys.iter().map(|key| set_of(key, -1)).collect();
         let calls: Vec<_> = calls.iter().collect();

@@ -18,7 +18,7 @@ use crate::{
 /// Maximum number of calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a
 /// few milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
-/// Maximum number of bytes of bodies in a batch.
+/// Maximum size of the bodies of all calls in a batch, in bytes.
 pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]
@@ -40,9 +40,10 @@ pub(crate) struct Item {
     /// The call. `None` if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
     answer: oneshot::Sender<AnswerAndDelivery>,
-    /// The subjects of the call, for the order in which nodes hear of them.
+    /// The topics, parameters and node names that the call concerns, for the order in which nodes hear of them.
     concern: Concern,
-    /// The answer's place in the order. Set once the call is on its way to the master, or the mirror has answered it.
+    /// Tracks the answer on its way to the caller. Set once the call is on its way to the master, or the mirror has
+    /// answered it.
     pub delivery: Option<Delivery>,
     /// For a call made by rosrescue: the condition under which the call is still wanted.
     pub condition: Option<Precondition>,
@@ -100,7 +101,7 @@ impl Item {
         &self.concern
     }
 
-    /// Treats the call as if no node were notified of anything.
+    /// Treats the call as if no node were notified because of it.
     #[cfg(test)]
     pub(super) fn forget_concern(&mut self) {
         self.concern = Concern::default();
@@ -153,12 +154,12 @@ impl Item {
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
     pub(crate) items: Vec<Item>,
-    /// When to try again because calls were passed over. `None` if a change will wake the queue.
+    /// When to look again at calls that were passed over. `None` if another event will wake the queue.
     pub(crate) until: Option<Instant>,
 }
 
-/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over
-/// calls that have to [wait](Order::must_wait), and over later ones about the same subjects.
+/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over calls that have to
+/// [wait](Order::must_wait), and over later ones about the same topics, parameters or node names.
 pub(crate) fn pack(
     queue: &mut VecDeque<Item>,
     order: &mut Order,

@@ -28,10 +28,10 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Pause before an unsent batch is retried while the gate stays open.
+/// Pause before an unsent batch is retried while calls still pass to the master.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master closes its
-/// connections within milliseconds. A master that only closed an idle connection still answers.
+/// How long a batch may continue after calls no longer pass to the master, before the mirror answers it. A killed
+/// master closes its connections within milliseconds. A master that only closed an idle connection still answers.
 const GRACE: Duration = Duration::from_millis(5);
 
 /// A batch on its way to the master. Without items, the master's state is being read.
@@ -40,9 +40,9 @@ struct InFlight {
     /// The mirror's version when the batch was sent.
     version: u64,
     items: Vec<Item>,
-    /// Whether the mirror can answer these items.
+    /// Whether the mirror can answer all calls of the batch.
     answerable: bool,
-    /// Whether the batch has been reported as late.
+    /// Whether the recovery has been told that the master is late with the batch.
     told_late: bool,
     /// Whether the mirror has answered the items and the master has not.
     late: bool,
@@ -59,17 +59,20 @@ pub(crate) struct Drain {
     pub(super) queue: VecDeque<Item>,
     connection: Option<(u64, NextConnection)>,
     in_flight: Option<InFlight>,
-    /// Until when the batch in flight may continue behind a shut gate.
+    /// Until when the batch on its way to the master may continue, although calls no longer pass. Then the mirror
+    /// answers it.
     grace: Option<tokio::time::Instant>,
-    /// Whether a batch was lost and the gate has not changed since.
+    /// Whether the connection of a batch ended before its answer, and the recovery has not changed the gate ([`State`])
+    /// since.
     lost: bool,
     signals: Arc<Signals>,
-    /// When the batch in flight becomes late.
+    /// When the master counts as late with the batch that it has not answered yet.
     late_at: Option<tokio::time::Instant>,
-    /// Whether the late batch has ended, although the gate is still [`State::Late`].
+    /// Whether the batch that the master was late with has ended, although the recovery still waits for that
+    /// ([`State::Late`]).
     late_over: bool,
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
-    /// The incarnation for which the gate was last open.
+    /// The number of the last master to which calls passed.
     incarnation: u64,
     resync: ResyncSchedule,
     retry_at: Option<tokio::time::Instant>,
@@ -573,9 +576,8 @@ impl Drain {
         }
     }
 
-    /// Sends answers once their effects are safe (see
-    /// [`Ledger::durable`](crate::ledger::Ledger::durable)) and a whole checkpoint includes this
-    /// `version` of the mirror.
+    /// Sends answers once the effects of their calls are safe (see [`Ledger::durable`](crate::ledger::Ledger::durable))
+    /// and a whole checkpoint includes this `version` of the mirror.
     fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, CallAnswer)>) {
         let mark = self.link.ledger.to_await(mark);
         let send = move |is_safe: bool| {
@@ -607,7 +609,7 @@ impl Drain {
 #[derive(Default)]
 struct Answers {
     made: Vec<(Item, CallAnswer)>,
-    /// Mark of the last record.
+    /// Identifies the last record that these answers may have to wait for.
     mark: Mark,
 }
 

@@ -68,7 +68,7 @@ fn eviction(ledger: &Ledger, call: &Request) -> Option<Eviction> {
     ledger.with_mirror(|mirror| Eviction::before(mirror, call))
 }
 
-/// Unregisters the nodes whose port `call` takes, while the mirror stands in.
+/// Unregisters the nodes whose port `call` takes, while the mirror answers in a master's place.
 pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     if let Some(eviction) = eviction(ledger, call)
         && ledger.stand_in(Instant::now(), &eviction.call).is_some()

@@ -20,7 +20,7 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// The last verdicts on the writes of an item.
+/// Whether each write of an item conflicts with changes by other computers, as decided last.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Judged(Arc<Mutex<Option<Vec<Verdict>>>>);
 
@@ -38,14 +38,15 @@ impl Judged {
     }
 }
 
-/// The writes to merge, and the verdicts on them.
+/// The writes to merge, and whether each of them conflicts with changes by other computers.
 #[derive(Debug)]
 pub(crate) struct Merge {
     ask: Ask,
     judged: Judged,
 }
 
-/// Makes an item for the queue. Also returns the receiver of its answer, and the verdicts on its writes.
+/// Makes an item for the write queue. Also returns the receiver of its answer, and a handle that shows which of its
+/// writes conflict with changes by other computers.
 pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Judged) {
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
@@ -69,8 +70,8 @@ fn set_call(item: &mut Item, call: Request) {
     item.call = Some(call);
 }
 
-/// Leaves out writes that conflict with changes by other computers. `None` if no write remains. Then the item is
-/// answered.
+/// Leaves out writes that conflict with changes by other computers. If no write remains, answers the item and returns
+/// `None`.
 pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);

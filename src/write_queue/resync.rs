@@ -17,7 +17,7 @@ const SPACING_MOST: Duration = Duration::from_secs(30);
 #[derive(Debug, Default)]
 pub(super) struct ResyncSchedule {
     due: bool,
-    /// When to repeat an inspection that failed or came too early.
+    /// When to repeat an inspection that failed or was requested during a pause.
     retry_at: Option<Instant>,
     not_before: Option<Instant>,
 }
@@ -42,7 +42,7 @@ impl ResyncSchedule {
         (self.due, self.retry_at) = (true, None);
     }
 
-    /// Drops all requests, because they concerned the previous incarnation.
+    /// Drops all requests, because they concerned the previous master.
     pub(super) fn reset(&mut self) {
         (self.due, self.retry_at) = (false, None);
     }

@@ -17,7 +17,8 @@ use crate::{
 
 /// The result of a round trip.
 pub(super) struct RoundTripResult {
-    /// The next connection, if there is one already, with its incarnation.
+    /// The next connection, if there is one already, with the number in the [token](crate::replay::Token) of its
+    /// master.
     pub(super) connection: Option<(u64, NextConnection)>,
     pub(super) result: Result<Received, RoundTripError>,
 }
@@ -31,7 +32,7 @@ pub(super) enum Received {
 /// Why a round trip failed.
 #[derive(Debug, Error)]
 pub(super) enum RoundTripError {
-    /// There is no connection to the right incarnation.
+    /// There is no connection to the right master.
     #[error(transparent)]
     Connect(#[from] VerifyError),
     #[error(transparent)]

@@ -19,7 +19,7 @@ pub(super) struct Known {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
     leader: Option<LeaderFacts>,
-    /// The revision of the leader's last sign of life, and when it was seen.
+    /// The revision of the leader's key `alive`, and when it was first seen.
     sign: Option<(u64, Instant)>,
     role: (Role, Instant),
     takeovers: u64,
@@ -41,7 +41,7 @@ impl Known {
         }
     }
 
-    /// Notes the leader's keys.
+    /// Updates the facts from the keys `leader` and `alive`.
     pub(super) fn look(&mut self, view: &View) {
         let now = Instant::now();
         if let Some(leader) = &view.leader
@@ -69,7 +69,7 @@ impl Known {
         }
     }
 
-    /// Notes a member entry.
+    /// Updates the facts from what a computer has written about itself.
     pub(super) fn heard(&mut self, heard: &Heard) {
         let Some(said) = &heard.said else { return };
         let mut roles = Role::ALL.into_iter();

@@ -1,4 +1,4 @@
-//! Creates what a computer needs as one of several.
+//! Creates what this process needs to run as one of several computers.
 
 use std::{
     collections::VecDeque,
@@ -33,7 +33,7 @@ use crate::{
     upstream::peer::Peers,
 };
 
-/// What a computer among several needs.
+/// What this process needs to run as one of several computers.
 pub(in crate::app) struct ClusterSetup {
     pub(in crate::app) config: ClusterConfig,
     pub(in crate::app) context: Arc<Context>,

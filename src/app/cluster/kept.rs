@@ -19,7 +19,7 @@ use crate::{
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
 const FILE_BYTES: u64 = 64 << 10;
 
-/// The file `CHECKPOINT.alone`.
+/// The file `CHECKPOINT.alone`, which holds the writes that were answered while this computer was cut off.
 #[derive(Default)]
 pub(super) struct Kept {
     /// `None` while there is nothing to keep, or while the disk hangs.
@@ -50,7 +50,7 @@ impl Kept {
             }
             Some(opened)
         });
-        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent");
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent to the leader");
         let (store, loaded) = match opened.await {
             Some(Some(Ok((store, Some(loaded))))) => (store, loaded),
             Some(None | Some(Ok((_, None)))) => return Default::default(),
@@ -166,7 +166,7 @@ fn remove_files(path: PathBuf) {
             tracing::warn!(
                 path = %path.display(),
                 %error,
-                "cannot delete the file of writes that have been sent; delete it, or they will be sent again"
+                "cannot delete the file of writes that have been sent; delete it, or its writes will be sent again"
             );
         }
     }

@@ -16,7 +16,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// The alarm that this computer is cut off, and its all-clear.
+/// Limits the log lines that this computer is cut off, and that it is no longer.
 static ALONE: Pair = Pair::new();
 
 impl ClusterDriver {
@@ -106,8 +106,8 @@ pub(super) fn cause(of: Cause) -> &'static str {
     }
 }
 
-/// Logs which of the writes that were answered while cut off are lost. Logs one line per subject, because a node may
-/// have written to the same subject a thousand times.
+/// Logs which of the writes that were answered while cut off are lost. Logs one line per parameter, topic or service,
+/// because a node may have written the same one a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
     for (call, outcome) in &outcomes {

@@ -14,7 +14,7 @@ use crate::{
 #[derive(Debug)]
 pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
 
-/// The alarm that etcd does not answer, and its all-clear.
+/// Limits the log lines that etcd does not answer, and that it answers again.
 static TROUBLE: Pair = Pair::new();
 
 impl Default for Trouble {

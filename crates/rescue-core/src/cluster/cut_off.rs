@@ -15,7 +15,7 @@ use crate::{
 
 /// How many periods of being cut off are kept apart.
 const TIMES_MOST: usize = 8;
-/// How many writes of a period can be recognised when they appear in the journal.
+/// How many writes of one period of being cut off can be recognised when they appear in the journal.
 const EXPECTED_MOST: usize = 4_000;
 
 /// One period of being cut off.
@@ -23,9 +23,9 @@ const EXPECTED_MOST: usize = 4_000;
 pub struct Time {
     /// The state when this computer was cut off.
     pub base: Master,
-    /// The writes answered since then.
+    /// The writes answered since this computer was cut off.
     pub pending: WritesToSend,
-    /// The other computers' changes since then.
+    /// The other computers' changes since this computer was cut off.
     pub changes: Changes,
     /// How many of the writes may also be in the journal.
     expected: usize,
@@ -42,7 +42,7 @@ impl Time {
     }
 }
 
-/// The periods whose writes have not all reached a leader, oldest first.
+/// The periods of being cut off whose writes have not all reached a leader, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct CutOff {
     times: VecDeque<Time>,
@@ -63,7 +63,7 @@ impl CutOff {
         }
     }
 
-    /// Whether a leader has all writes.
+    /// Whether a leader has all writes that were answered while cut off.
     pub fn is_empty(&self) -> bool {
         self.times.is_empty()
     }
@@ -95,21 +95,22 @@ impl CutOff {
         self.times.push_back(time);
     }
 
-    /// Notes that others may run these calls of this computer. They do not count as others' changes.
+    /// Notes that the other computers may make these calls of this computer. The calls do not count as their changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
         if let Some(time) = self.times.back_mut() {
             time.changes.expect(calls);
         }
     }
 
-    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period.
+    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period
+    /// of being cut off.
     pub fn expect_in_all(&mut self, calls: &[Request]) {
         for time in &mut self.times {
             time.changes.expect(calls.iter().cloned());
         }
     }
 
-    /// Notes new records of the journal.
+    /// Notes new records of the journal. They count as others' changes, unless they were expected.
     pub fn note(&mut self, records: &[Record]) {
         for time in &mut self.times {
             for record in records {
@@ -129,7 +130,7 @@ impl CutOff {
         }
     }
 
-    /// Returns the others' `state` plus the kept writes.
+    /// Returns the others' `state`, changed by those kept writes that conflict with no change by others.
     pub fn on(&self, state: &Master) -> Master {
         let mut state = state.clone();
         for time in &self.times {
@@ -140,7 +141,8 @@ impl CutOff {
         state
     }
 
-    /// Keeps answered writes. `given` says whether they may also get into the journal. Returns the new ones.
+    /// Keeps writes that were answered while cut off. `given` says whether they may also get into the journal. Returns
+    /// the writes.
     pub fn add<'a>(
         &mut self,
         changes: impl IntoIterator<Item = &'a Change>,
@@ -170,7 +172,7 @@ impl CutOff {
         calls
     }
 
-    /// The state at the beginning of the oldest period.
+    /// The state at the beginning of the oldest period of being cut off.
     pub fn base(&self) -> Option<&Master> {
         self.times.front().map(|time| &time.base)
     }
@@ -185,17 +187,17 @@ impl CutOff {
         self.times.iter().map(|time| time.pending.len()).sum()
     }
 
-    /// The oldest period whose writes have not all reached a leader.
+    /// The oldest period of being cut off whose writes have not all reached a leader.
     pub fn first_mut(&mut self) -> Option<&mut Time> {
         self.times.front_mut()
     }
 
-    /// Drops the oldest period: its writes have reached the leader, or are lost and reported.
+    /// Drops the oldest period of being cut off: its writes have reached the leader, or are lost and reported.
     pub fn sent(&mut self) {
         self.times.pop_front();
     }
 
-    /// Drops the present period: its writes are in the journal after all.
+    /// Drops the present period of being cut off: its writes are in the journal after all.
     pub fn resumed(&mut self) {
         self.times.pop_back();
     }

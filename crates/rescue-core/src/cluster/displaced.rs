@@ -10,21 +10,21 @@ use crate::master::{Displaced, Master, Request};
 
 /// How long it may take to tell a node to shut down, including retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// How many nodes are remembered.
+/// How many nodes that lost their names are remembered.
 const MOST: usize = 1024;
 
-/// The nodes of the last minute, the oldest first.
+/// The nodes that lost their names to other nodes in the last minute, the oldest first.
 #[derive(Debug, Default)]
 pub struct DisplacedLately(VecDeque<(Instant, Displaced)>);
 
 impl DisplacedLately {
-    /// Notes whom `call` displaces from `state`, the state before the call.
+    /// Notes the nodes that lose their names to other nodes when `call` is applied to `state`.
     pub fn note(&mut self, now: Instant, state: &Master, call: &Request) {
         let calls = call.calls().into_iter();
         self.add(now, calls.filter_map(|call| state.displaced_by(call)));
     }
 
-    /// Adds the nodes in a snapshot.
+    /// Adds nodes that lost their names to other nodes.
     pub fn add(&mut self, now: Instant, displaced: impl IntoIterator<Item = Displaced>) {
         self.0.extend(displaced.into_iter().map(|node| (now, node)));
         let is_old = |at: &Instant| now.duration_since(*at) >= TELLING;
@@ -33,7 +33,7 @@ impl DisplacedLately {
         }
     }
 
-    /// The nodes displaced in the minute before `now`, one per address.
+    /// The nodes that lost their names to other nodes in the minute before `now`, one per address.
     pub fn at(&self, now: Instant) -> Vec<Displaced> {
         let lately = self.0.iter();
         let lately = lately.filter(|(at, _)| now.duration_since(*at) < TELLING);

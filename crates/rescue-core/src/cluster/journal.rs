@@ -2,10 +2,10 @@
 //!
 //! ```text
 //! ROBOT/leader, ROBOT/alive           see `machine`
-//! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large; or
-//!                                     that of a snapshot, if the state was replaced by record N
+//! ROBOT/journal/N                     the records up to number N; or a reference to a blob, if they are large; or
+//!                                     one to a snapshot, if record N replaced the whole state
 //! ROBOT/values/blob/N/PART            a blob's records, in parts, written before the journal names them
-//! ROBOT/snapshot                      the name of the snapshot that is whole, and what it stands for
+//! ROBOT/snapshot                      a reference to the last complete snapshot: its last record, size and checksum
 //! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
 //! ```
 
@@ -103,7 +103,8 @@ impl Keys {
         self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)
     }
 
-    /// The keys to delete once there is a snapshot of record `seq`: the journal up to it, and its blobs.
+    /// The keys to delete once there is a snapshot of the state after record `seq`: the journal up to that record, and
+    /// its blobs.
     pub fn behind(&self, seq: u64) -> [Range<String>; 2] {
         let next = seq.saturating_add(1);
         [
@@ -132,7 +133,7 @@ impl Keys {
         format!("{}values/snapshot/{seq:020}/", self.0)
     }
 
-    /// The parts of snapshots older than that of record `seq`.
+    /// The parts of snapshots that end before record `seq`.
     pub fn snapshots_before(&self, seq: u64) -> Range<String> {
         self.snapshots(0)..self.snapshots(seq)
     }
@@ -210,7 +211,7 @@ impl Manifest {
         format!("{} seq={seq} bytes={bytes} crc32c={crc:08x}\n", kind.word()).into_bytes()
     }
 
-    /// Reads a value that may be a manifest.
+    /// Reads `value` as a manifest. `None` if it is something else.
     pub fn read(value: &[u8]) -> Option<Self> {
         let line = std::str::from_utf8(value).ok()?.strip_suffix('\n')?;
         let mut words = line.split(' ');
@@ -226,7 +227,7 @@ impl Manifest {
         })
     }
 
-    /// Joins the parts, which are sorted by key.
+    /// Joins the value's `parts`, which are sorted by key, and checks their size and checksum.
     pub fn assemble(&self, keys: &Keys, parts: &[Vec<u8>]) -> Result<Vec<u8>, JournalError> {
         let whole = parts.concat();
         if whole.len() == self.bytes && crc32c::crc32c(&whole) == self.crc {
@@ -246,7 +247,7 @@ impl Manifest {
 /// The records that one transaction adds to the journal.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct JournalBatch {
-    /// How many of the given records the entry contains.
+    /// How many of the given records `entry` contains.
     pub count: usize,
     pub entry: Option<Put>,
 }
@@ -321,7 +322,8 @@ pub fn snapshot(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
     (parts, Put { key, value })
 }
 
-/// The parts of a state that replaces the present one as record `seq`, and the journal entry that refers to them.
+/// The parts of the state that replaces the whole previous state as record `seq`, and the journal entry that refers to
+/// these parts.
 pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
     let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
     let (key, value) = (keys.journal(seq), manifest.text());
@@ -331,7 +333,7 @@ pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
 /// How far a mirror has followed the journal, and the journal's size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
-    /// The last record that the mirror contains.
+    /// The number of the last record that the mirror contains.
     pub seq: u64,
     entries: usize,
     bytes: usize,
@@ -348,7 +350,8 @@ impl Progress {
         }
     }
 
-    /// Takes an entry of the journal. Returns those of its records that are new.
+    /// Notes that the mirror follows a journal entry with these `records`, whose size is `bytes`. Returns the records
+    /// that are new.
     ///
     /// # Errors
     ///
@@ -378,14 +381,15 @@ impl Progress {
         Ok(new)
     }
 
-    /// Takes a state that replaces the present one as record `seq`.
+    /// Notes that record `seq`, whose size is `bytes`, replaces the whole state.
     pub fn take_state(&mut self, seq: u64, bytes: usize) {
         self.entries += 1;
         self.bytes += bytes;
         self.seq = seq;
     }
 
-    /// Notes that a snapshot was written. It is `bytes` long and holds the state at progress `then`.
+    /// Notes that a snapshot of this size (`bytes`) was written. It holds the state at progress `then`, so the journal
+    /// up to there no longer counts.
     pub fn snapshot_written(&mut self, then: Self, bytes: usize) {
         self.entries = self.entries.saturating_sub(then.entries);
         self.bytes = self.bytes.saturating_sub(then.bytes);

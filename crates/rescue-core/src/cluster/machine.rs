@@ -27,8 +27,8 @@ pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 const RETRY: Duration = Duration::from_millis(100);
 /// How often the leader writes the key `alive` per time to live ([`Settings::ttl`]).
 const BEATS: u32 = 4;
-/// A leader stops this part of the time to live (a fifth) before another may begin: a tenth for a slow clock, and a
-/// tenth for a fast one.
+/// Divisor of the time to live: a leader stops a fifth of it before another computer may begin to lead. A tenth is for
+/// a slow clock, and a tenth for a fast one.
 const MARGIN: u32 = 5;
 /// How long after the time to live a computer waits for the next leader before it counts as cut off. A claim takes
 /// three network delays, but etcd may have to elect its own leader first, which takes up to 2.6 s.
@@ -104,7 +104,7 @@ impl Machine {
         &self.settings
     }
 
-    /// When the leader's keys were first seen in their present state.
+    /// When the keys `leader` and `alive` were first seen with their present values.
     pub fn observed(&self) -> Option<Instant> {
         self.observed
     }
@@ -114,7 +114,7 @@ impl Machine {
         self.heard
     }
 
-    /// The leader's keys as this computer knows them.
+    /// The keys `leader` and `alive` as this computer knows them.
     pub fn view(&self) -> &View {
         &self.view
     }
@@ -250,7 +250,7 @@ impl Machine {
         self.flight.take_if(|flight| flight.number == number);
     }
 
-    /// The keys after `op` has succeeded.
+    /// The keys `leader` and `alive` after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
@@ -298,7 +298,7 @@ impl Machine {
         }
     }
 
-    /// Starts over with `view`, because etcd has lost its data.
+    /// Starts over with the keys in `view`, because etcd has lost its data.
     fn start_over(&mut self, now: Instant, view: View, until: Instant, actions: &mut Vec<Action>) {
         self.flight = None;
         self.deposed(actions);
@@ -319,7 +319,7 @@ impl Machine {
         self.claim_not_before = Some(until);
     }
 
-    /// Handles keys that etcd shows.
+    /// Handles the keys `leader` and `alive` as etcd shows them.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         self.heard = Some(now);
         if view.revision < self.view.revision {
@@ -444,7 +444,7 @@ impl Machine {
         !self.stale && self.followed >= self.view.seq()
     }
 
-    /// Gives up, because another computer leads or could lead.
+    /// Stops leading, because another computer leads or could lead.
     fn deposed(&mut self, actions: &mut Vec<Action>) {
         (self.leadership, self.releasing) = (None, None);
         self.flight.take_if(|flight| flight.op != Op::Read);

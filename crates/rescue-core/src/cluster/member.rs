@@ -56,7 +56,7 @@ struct Journal {
 }
 
 impl Journal {
-    /// Applies `records`, which follow the last known one.
+    /// Applies `records` to the journal's state. They follow the last record that was applied.
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
             if let JournalEntry::Call { call, .. } = &record.entry {
@@ -230,7 +230,7 @@ impl Member {
         &self.machine
     }
 
-    /// The role that was carried out last.
+    /// The machine's role after the actions that were returned last.
     pub fn role(&self) -> Role {
         self.role
     }
@@ -239,7 +239,7 @@ impl Member {
         self.machine.settings()
     }
 
-    /// The leader's keys as etcd showed them last.
+    /// The keys `leader` and `alive` as etcd showed them last.
     pub fn view(&self) -> &View {
         let (seen, known) = (self.reading.view(), self.machine.view());
         match seen.revision > known.revision {
@@ -342,7 +342,7 @@ impl Member {
         self.standing.records()
     }
 
-    /// Whether the ledger's state is the journal's.
+    /// Whether the ledger must hold the journal's state, because this computer does not record calls itself.
     fn follows(&self) -> bool {
         self.reading.loaded && !self.own_wins && !self.records()
     }
@@ -358,7 +358,8 @@ impl Member {
         self.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
-    /// Updates everything that depends on several parts.
+    /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and
+    /// so on.
     fn update(&mut self, now: Instant) {
         self.update_lost(now);
         self.update_master();

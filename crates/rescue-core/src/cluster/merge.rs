@@ -1,8 +1,8 @@
-//! Decides which of the writes that a computer answered while it was cut off still hold: all, except those whose
-//! subject others have changed since, even if they have changed it back.
+//! Decides which of the writes that a computer answered while it was cut off still hold: all, except those to a
+//! parameter, node, service or topic registration that others have changed since, even if they have changed it back.
 //!
 //! The same rules apply twice: on the computer that was cut off, to the changes that it reads in the journal; and on
-//! the leader, before each portion, to later changes. See decision 42.
+//! the leader, before it makes the writes of each request, to later changes. See decision 42.
 
 mod changes;
 mod pending;
@@ -21,7 +21,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// The result of a merge.
+/// Which writes of a computer that was cut off are sent to the leader, and which are lost.
 #[derive(Debug, Default, PartialEq)]
 pub struct Merged {
     /// The writes to send to the leader, in this order.
@@ -29,7 +29,7 @@ pub struct Merged {
     pub lost: Vec<Lost>,
 }
 
-/// A write that is lost.
+/// A write that was answered while its computer was cut off, and that is lost because of a conflict.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lost {
     pub call: Request,
@@ -38,17 +38,18 @@ pub struct Lost {
     pub present: Option<Value>,
 }
 
-/// The verdict on one write.
+/// What happens to one write of a computer that was cut off; see [`judge`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum Verdict {
-    /// Others have not changed the write's subject.
+    /// The leader makes the write, because others have not changed the same parameter, node, service or topic
+    /// registration.
     Runs,
-    /// Others have changed the write's subject to the same value.
+    /// The write is unnecessary: others have made the same change, or what it unregisters is no longer registered.
     Holds,
     Lost(Lost),
 }
 
-/// What others changed meanwhile.
+/// What others changed while a computer was cut off, so that the computer's own write is lost.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conflict {
     Parameter(String),
@@ -120,7 +121,7 @@ pub fn merge<'a>(
     merged
 }
 
-/// Decides whether `call`, which must not be a multicall, still holds.
+/// Decides what happens to `call`, which must not be a multicall, after `changes` by others, whose state is `now`.
 pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let Some(why) = conflict(changes, now, call) else {
         return Verdict::Runs;

@@ -15,7 +15,7 @@ pub(crate) enum Mutant {
     MergesByState,
     /// A value that equals this computer's own write never counts as another computer's change.
     GuessesByValues,
-    /// Writes made while cut off are judged once, and then sent whatever others write meanwhile.
+    /// Writes made while cut off are checked for conflicts once, and then sent whatever others write meanwhile.
     JudgesOnce,
     /// A leader that is cut off keeps calls that other computers forwarded to it.
     KeepsForwarded,

@@ -1,4 +1,4 @@
-//! Detects another living computer with this one's name, before this one takes part. Pure.
+//! Detects another living computer with this one's name, before this one joins the cluster. Pure.
 //!
 //! Keys in etcd may name a computer with the same name and another address. That computer is alive if the keys change:
 //! `alive` several times per time to live, the entry among the members every five seconds. If they do not change, they
@@ -13,7 +13,7 @@ pub const MEMBER_SAYS: Duration = Duration::from_secs(7);
 /// A namesake that begins to lead within this time after this computer's start counts as started first.
 const YOUNG: Duration = Duration::from_secs(15);
 
-/// The key that shows a namesake.
+/// Which of the keys in etcd another computer with this one's name wrote.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Key {
     /// The keys `leader` and `alive`.
@@ -26,13 +26,13 @@ pub enum Key {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sign {
     pub key: Key,
-    /// The address of that computer.
+    /// The address of the computer that wrote the key.
     pub uri: String,
     /// The revision of the key's last change.
     pub revision: u64,
 }
 
-/// The evidence in `leader` and `alive`, if any.
+/// Evidence in `leader` and `alive` of another computer with this one's name, if there is any.
 pub fn sign_of_leader(own: &Settings, view: &View) -> Option<Sign> {
     let leader = view.leader.as_ref()?;
     let alive = view.alive.as_ref();
@@ -48,7 +48,8 @@ pub fn sign_of_leader(own: &Settings, view: &View) -> Option<Sign> {
     })
 }
 
-/// The evidence at the start, and when it was seen.
+/// Finds out whether another computer with this one's name is alive: compares that computer's keys in etcd with those
+/// that were seen when this one started.
 #[derive(Clone, Debug)]
 pub struct NamesakeWatch {
     first: Vec<Sign>,
@@ -57,7 +58,8 @@ pub struct NamesakeWatch {
 }
 
 impl NamesakeWatch {
-    /// Creates a watch. `first` is the evidence in etcd at `now`, `ttl` the time to live of a leader.
+    /// Creates a watch. `first` are the keys in etcd at `now` that another computer with this one's name wrote; `ttl`
+    /// is the time to live of a leader.
     pub fn new(now: Instant, ttl: Duration, first: Vec<Sign>) -> Self {
         let limits = first.iter().map(|sign| match sign.key {
             Key::Leader => ttl,
@@ -70,23 +72,23 @@ impl NamesakeWatch {
         }
     }
 
-    /// Until when this computer must wait. `None` if it may start at once.
+    /// Until when this computer must wait to see whether these keys change. `None` if it may start at once.
     pub fn hold(&self) -> Option<Instant> {
         self.hold
     }
 
-    /// The address of the suspected namesake.
+    /// The address of the other computer that may have this one's name.
     pub fn suspect(&self) -> Option<&str> {
         self.first.first().map(|sign| sign.uri.as_str())
     }
 
-    /// Whether this computer may write its entry among the members at `now`. Earlier, it would overwrite the
-    /// namesake's entry.
+    /// Whether this computer may write its entry among the members at `now`. Earlier, it would overwrite the entry of
+    /// another computer with its name.
     pub fn is_over(&self, now: Instant) -> bool {
         self.hold.is_none_or(|until| until <= now)
     }
 
-    /// The living namesake that `signs` at `now` prove, if any.
+    /// The living computer with this one's name, if `signs`, its keys in etcd at `now`, prove that there is one.
     pub fn living<'a>(&self, now: Instant, signs: &'a [Sign]) -> Option<&'a Sign> {
         signs.iter().find(|sign| {
             let counts = match sign.key {

@@ -17,11 +17,11 @@ const FIRST: usize = journal::BATCH_RECORDS;
 /// The approximate size limit of the changes after the [`FIRST`] ones while this computer is cut off, in bytes.
 const BYTES_MOST: usize = 16 << 20;
 
-/// The changes, in the order of their numbers.
+/// The changes of this computer that may not be in the journal yet, in the order of their numbers.
 #[derive(Debug, Default)]
 pub struct Outgoing {
     changes: VecDeque<Change>,
-    /// The last change that may be written to the journal.
+    /// The number of the last change whose journal entry may be written.
     ready: u64,
     /// The last change whose parts are all in etcd.
     written: u64,
@@ -30,7 +30,7 @@ pub struct Outgoing {
 }
 
 impl Outgoing {
-    /// Drops everything. The next change has a number after `seq`.
+    /// Drops all changes. The next change has a number after `seq`.
     pub fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
@@ -71,13 +71,13 @@ impl Outgoing {
         self.changes.clear();
     }
 
-    /// Whether so many changes have piled up that one state should replace the later ones.
+    /// Whether so many changes have piled up that the whole state should replace the later ones.
     pub fn has_outgrown(&self) -> bool {
         let later = self.changes.iter().skip(FIRST);
         self.changes.len() > 2 * FIRST || later.map(weight_of).sum::<usize>() > BYTES_MOST
     }
 
-    /// Replaces all changes but the first ones, which may be on their way, by the state `rest`.
+    /// Replaces all changes but the first ones, which may be on their way to etcd, by the state `rest`.
     pub fn replace_rest(&mut self, rest: Option<Change>) {
         if let Some(rest) = rest {
             self.changes.truncate(FIRST);
@@ -85,18 +85,20 @@ impl Outgoing {
         }
     }
 
-    /// The number of the last change that is ready to be written.
+    /// The number of the last change whose journal entry may be written. The parts of a large change must be written
+    /// before its entry.
     pub fn ready(&self) -> u64 {
         self.ready
     }
 
-    /// Marks all changes as ready, because this computer is cut off and writes none of them now.
+    /// Raises [`Self::ready()`] to the last change without writing parts, because this computer is cut off.
     pub fn all_ready(&mut self) {
         self.preparing = false;
         self.ready = self.changes.back().map_or(self.ready, Change::seq);
     }
 
-    /// Marks changes as ready up to the first one that needs parts, and returns its parts.
+    /// Raises [`Self::ready()`] to the last change before a large one, and returns the parts of the large one, which
+    /// must be written first.
     pub fn prepare(&mut self, keys: &Keys) -> Result<Option<Vec<Put>>, JournalError> {
         if self.preparing {
             return Ok(None);
@@ -115,14 +117,14 @@ impl Outgoing {
         Ok(None)
     }
 
-    /// Notes that the parts of the next change have been written.
+    /// Notes that the parts of the change after [`Self::ready()`] have been written.
     pub fn prepared(&mut self) {
         let next = self.changes.iter().find(|of| of.seq() > self.ready);
         self.ready = next.map_or(self.ready, Change::seq);
         self.written = self.ready;
     }
 
-    /// Replaces the next change, which cannot be written, by a call that changes nothing.
+    /// Replaces the change after [`Self::ready()`], which cannot be written, by a call that changes nothing.
     pub fn leave_out_next(&mut self) {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
@@ -131,15 +133,15 @@ impl Outgoing {
         }
     }
 
-    /// The parts of the next beat's entry that are not in etcd, because the change was recorded while this computer was
-    /// cut off.
+    /// The parts that the journal entry of the next heartbeat needs and that are not in etcd, because the change was
+    /// recorded while this computer was cut off.
     pub fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
         let first = self.changes.front().filter(|of| of.seq() > self.written);
         let parts = first.map(|change| parts(keys, change));
         parts.and_then(Result::ok).unwrap_or_default()
     }
 
-    /// The journal entry of the next beat, with the changes up to `seq`.
+    /// The journal entry that the next heartbeat adds, with the changes up to `seq`.
     pub fn entry(&self, keys: &Keys, seq: u64) -> Result<Option<Put>, JournalError> {
         if let Some(first @ Change::State { .. }) =
             self.changes.front().filter(|of| of.seq() <= seq)
@@ -230,7 +232,7 @@ mod tests {
         changes.iter().map(Change::seq).collect()
     }
 
-    /// The numbers of the records in what the next beat adds.
+    /// The numbers of the records that the next heartbeat adds to the journal.
     fn added(outgoing: &Outgoing, keys: &Keys, seq: u64) -> Vec<u64> {
         let entry = outgoing.entry(keys, seq).unwrap();
         let records = entry.map(|put| journal::records(&put.key, &put.value).unwrap());

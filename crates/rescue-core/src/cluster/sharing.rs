@@ -62,7 +62,8 @@ impl Recent {
         }
     }
 
-    /// The changes after record `seq` that `merge` did not make. `None` if the list does not reach back so far.
+    /// The changes after record `seq`, except those that were sent under the name `merge`. `None` if the list does not
+    /// reach back so far.
     fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
         if seq < self.after {
             return None;
@@ -106,7 +107,7 @@ impl Change {
 /// The changes that a computer records while it leads or is cut off, numbered as in the journal.
 #[derive(Debug)]
 pub struct Sharing {
-    /// The number of the last record.
+    /// The number of the last recorded change.
     last: u64,
     changes: Vec<Change>,
     recent: Recent,
@@ -122,7 +123,7 @@ impl Sharing {
         }
     }
 
-    /// The number of the last record.
+    /// The number of the last recorded change.
     pub fn last(&self) -> u64 {
         self.last
     }
@@ -149,7 +150,7 @@ impl Sharing {
         self.changes.push(Change::State { seq, state });
     }
 
-    /// Takes the changes recorded since the last call.
+    /// Takes the changes recorded since they were last taken.
     pub fn take(&mut self) -> Vec<Change> {
         std::mem::take(&mut self.changes)
     }
@@ -161,9 +162,9 @@ impl Sharing {
         Change::State { seq, state }
     }
 
-    /// Judges `calls` that a computer answered while it was cut off, against the state `mirror`. That computer sends
-    /// them under the name `merge`, and has taken the others' changes up to record `seq` into account. `None` if the
-    /// changes after that record are no longer known.
+    /// Decides what happens to `calls`, which a computer answered while it was cut off, in the state `mirror`. That
+    /// computer sends them under the name `merge`, and has taken the others' changes up to record `seq` into account.
+    /// `None` if the changes after that record are no longer known.
     pub fn judge(
         &self,
         mirror: &Master,

@@ -12,7 +12,7 @@ pub enum Pass {
     Nothing,
 }
 
-/// This computer's standing. Only [`Member`](crate::cluster::member::Member) sets it.
+/// Who has the master, and where this computer's calls go. Only [`Member`](crate::cluster::member::Member) sets it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Standing {
     /// This computer leads in `term`, and has the master.
@@ -52,7 +52,7 @@ pub struct Place {
     pub epoch: u64,
     /// The leader's term.
     pub term: u64,
-    /// The number of a record.
+    /// The number of a record in the journal.
     pub seq: u64,
 }
 

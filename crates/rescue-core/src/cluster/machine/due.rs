@@ -20,7 +20,7 @@ impl Machine {
             .min()
     }
 
-    /// Does what is due at `now`.
+    /// Carries out what is due at `now`: a change of this computer's role, or a request to etcd.
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()
@@ -98,7 +98,7 @@ impl Machine {
         }
     }
 
-    /// When the next request is due, unless one is under way.
+    /// When the next request to etcd is due, unless one is under way.
     fn send_at(&self) -> Option<Instant> {
         let due = match self.leadership {
             Some(leadership) => self.beat_at(leadership)?,
@@ -127,7 +127,8 @@ impl Machine {
         })
     }
 
-    /// How long after the keys were first seen in their present state this computer may claim.
+    /// How long after the keys `leader` and `alive` were first seen with their present values this computer may claim
+    /// leadership.
     fn vacant_after(&self) -> Duration {
         let own = &self.settings;
         let Settings { name, id, ttl, .. } = own;

@@ -13,7 +13,7 @@ pub(super) struct Leadership {
     pub(super) beat: u64,
     /// Whether the mirror had the whole journal when the term began.
     pub(super) caught_up: bool,
-    /// Whether records were left over after the last heartbeat.
+    /// Whether the last heartbeat could not contain all recorded calls.
     pub(super) full: bool,
     /// Whether another computer may have led since the last heartbeat.
     pub(super) lapsed: bool,

@@ -52,7 +52,7 @@ impl Settings {
 /// The content of the key `leader`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Leader {
-    /// The revision of the key.
+    /// The term: the revision of the key `leader`.
     pub term: u64,
     pub name: String,
     /// The id of the process, and the number of its claim.
@@ -66,11 +66,11 @@ pub struct Leader {
 /// The content of the key `alive`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Alive {
-    /// The revision of the key.
+    /// The revision of the key `alive`.
     pub revision: u64,
     /// The number of the leader's transaction that wrote this key.
     pub beat: u64,
-    /// The journal's last record.
+    /// The number of the journal's last record.
     pub seq: u64,
     /// Set if the leader has given up leadership: the computer that should lead next, or empty for any.
     pub released: Option<String>,
@@ -87,7 +87,7 @@ pub struct View {
 }
 
 impl View {
-    /// The revisions that a transaction expects.
+    /// The revisions of the keys `leader` and `alive`, for a transaction that succeeds only if both are unchanged.
     pub fn guard(&self) -> RevisionGuard {
         RevisionGuard {
             leader: self.leader.as_ref().map_or(0, |leader| leader.term),
@@ -95,7 +95,7 @@ impl View {
         }
     }
 
-    /// The journal's last record.
+    /// The number of the journal's last record.
     pub fn seq(&self) -> u64 {
         self.alive.as_ref().map_or(0, |alive| alive.seq)
     }
@@ -111,17 +111,17 @@ pub struct RevisionGuard {
 /// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read both keys. The answer must not come from a member of etcd that may be behind.
+    /// Read the keys `leader` and `alive`. The answer must not come from a member of etcd that may be behind.
     Read,
-    /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
+    /// Write `leader` with this claim, and `alive` with heartbeat number 0 and the journal's last record `seq`.
     Claim {
         guard: RevisionGuard,
         claim: u64,
         seq: u64,
         settled: bool,
     },
-    /// Write `alive`, and the records after the last beat up to `seq`, or fewer if they are too many. A repeated beat
-    /// may carry other records; at most one of them succeeds.
+    /// Write `alive`, and the records after the last heartbeat up to `seq`, or fewer if they are too many. A repeated
+    /// heartbeat may carry other records; at most one of the two succeeds.
     Beat {
         guard: RevisionGuard,
         beat: u64,
@@ -136,7 +136,7 @@ pub enum Op {
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The keys, as the answer to a read or to a transaction that failed.
+    /// The keys `leader` and `alive`, as the answer to a read or to a transaction that failed.
     Is(View),
     /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,
@@ -149,7 +149,7 @@ pub enum Input {
     Start(u64),
     /// The answer to request `number`.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch on etcd has delivered the leader's keys.
+    /// The watch on etcd has delivered the keys `leader` and `alive`.
     View(View),
     /// The mirror contains the journal up to this record.
     Followed(u64),
@@ -216,7 +216,7 @@ pub enum Action {
     /// Bring the mirror up to this record of the journal, then pass in [`Input::Followed`].
     CatchUp(u64),
     Become(Role),
-    /// Answer the calls up to this record.
+    /// Let the answers to the calls up to this record go out.
     Acknowledge(u64),
     /// This computer's calls after `committed` are not in the journal. Those up to `acknowledged` were answered, so
     /// they are merged with the journal and sent to the next leader. The others still wait. The mirror must be

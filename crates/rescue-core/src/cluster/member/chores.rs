@@ -37,7 +37,8 @@ impl Chores {
 }
 
 impl Member {
-    /// Starts the work that is due.
+    /// Writes this computer's entry among the members and, if it leads, a snapshot, and compacts etcd, each when it is
+    /// due.
     pub(super) fn update_chores(&mut self, now: Instant) {
         // Before the watch for a namesake is over, the entry could overwrite that of another computer.
         let watch = self.namesake.watch.as_ref();

@@ -18,20 +18,20 @@ use crate::{
 pub(super) struct Reading {
     /// Whether the journal has been read once.
     pub(super) loaded: bool,
-    /// The record up to which the machine waits for the journal.
+    /// The machine waits until the journal has been read up to this record.
     pub(super) wanted: Option<u64>,
-    /// The last record whose reading was reported to the machine.
+    /// The machine knows that the journal has been read up to this record.
     reported: u64,
     /// Whether a read is under way.
     loading: bool,
-    /// The newest revision that was known when the read under way began.
+    /// The newest revision of etcd that was known when the read under way began.
     floor: u64,
     /// When the next read is due.
     load_at: Option<Instant>,
-    /// How many reads must end before the journal is as fresh as [`Self::refresh`] asked.
+    /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
     fresh: Option<u8>,
     watching: bool,
-    /// The leader's keys as etcd showed them last, also before the machine starts.
+    /// The keys `leader` and `alive` as etcd showed them last, also before the machine starts.
     view: View,
 }
 
@@ -41,7 +41,7 @@ impl Reading {
         self.load_at = Some(self.load_at.map_or(at, |before| before.min(at)));
     }
 
-    /// Asks for a read that begins after `now`. What the watch delivers may be much older.
+    /// Asks for a read that begins after `now`. What the watch on etcd delivers may be much older.
     pub(super) fn refresh(&mut self, now: Instant) {
         self.fresh = Some(1 + u8::from(self.loading));
         self.load_by(now);
@@ -56,13 +56,13 @@ impl Reading {
         self.load_at.filter(|_| !self.loading)
     }
 
-    /// Handles the end of the watch.
+    /// Handles the end of the watch on etcd.
     pub(super) fn ended(&mut self, now: Instant) {
         self.watching = false;
         self.load_at = Some(now + AGAIN);
     }
 
-    /// Starts over with `view`, because etcd has lost its data.
+    /// Starts over with the keys in `view`, because etcd has lost its data.
     pub(super) fn forget(&mut self, view: &View) {
         (self.wanted, self.reported) = (None, 0);
         (self.watching, self.view) = (false, view.clone());
@@ -74,7 +74,7 @@ impl Reading {
 }
 
 impl Member {
-    /// Reads the journal if the machine needs more of it than is known.
+    /// Has the journal read if the machine waits for more of it than has been read.
     pub(super) fn catch_up(&mut self, now: Instant) {
         let seq = self.journal.progress.seq;
         let wanted = self.reading.wanted;
@@ -114,7 +114,7 @@ impl Member {
         self.act(Action::Decide { seq, state, closed });
     }
 
-    /// Handles keys and journal entries from the watch.
+    /// Handles the keys `leader` and `alive` and the journal entries that the watch on etcd delivered.
     pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
         self.see(now, view);
@@ -140,7 +140,7 @@ impl Member {
         self.yield_to_others();
     }
 
-    /// Shows the leader's keys to the machine.
+    /// Passes the keys `leader` and `alive` to the machine.
     fn see(&mut self, now: Instant, view: View) {
         if view.revision >= self.reading.view.revision {
             self.reading.view = view.clone();
@@ -271,7 +271,7 @@ impl Member {
         self.yield_to_others();
     }
 
-    /// Starts the machine, once.
+    /// Starts the machine, unless it has started already.
     pub(super) fn start(&mut self, now: Instant) {
         if self.queue.start_by.take().is_some() {
             self.drive(now, machine::Input::Start(0));
@@ -302,7 +302,7 @@ impl Member {
         self.place = Place { epoch, term, seq };
     }
 
-    /// Handles entries of members.
+    /// Handles what computers have written into their entries among the members.
     pub(super) fn hear(&mut self, heard: &[Heard]) {
         let own = self.machine.settings();
         for heard in heard.iter().filter(|heard| heard.name == own.name) {

@@ -12,7 +12,7 @@ use crate::{
 };
 
 impl Member {
-    /// Carries out a request of the machine.
+    /// Sends a request of the machine to etcd.
     pub(super) fn send(&mut self, number: u64, op: Op) {
         let term = self.machine.term().unwrap_or_default();
         let entry = match &op {

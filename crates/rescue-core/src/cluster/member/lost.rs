@@ -14,14 +14,15 @@ use crate::cluster::{
     standing::Place,
 };
 
-/// How long a computer that holds less waits for the one that holds the most, in times to live.
+/// How long a computer that knows less of the lost journal waits for the one that knows the most, in times to live.
 const PATIENCE: u32 = 3;
 
 #[derive(Debug, Default)]
 pub(super) struct Lost {
-    /// When the loss was noticed, what this computer holds, and the last record of the new journal at that time.
+    /// When the loss was noticed, how much of the lost journal this computer knows, and the last record of the new
+    /// journal at that time.
     now: Option<(Instant, Holds, u64)>,
-    /// What the other computers hold, by name.
+    /// How much of the lost journal the other computers know, by their names.
     others: BTreeMap<String, Holds>,
     /// Whether another computer is known to hold more of the lost journal.
     second: bool,
@@ -68,7 +69,7 @@ impl Member {
         view.revision < floor && !Mutant::TrustsLostEtcd.lives()
     }
 
-    /// Starts over with the new etcd, which shows `view`, and with this computer's state.
+    /// Starts over with the new etcd, which shows the keys in `view`, and with this computer's state.
     pub(super) fn start_over(&mut self, now: Instant, view: &View) {
         let holds = match self.reading.loaded {
             true => Holds {
@@ -112,7 +113,7 @@ impl Member {
         self.lost.now.is_some()
     }
 
-    /// Lets a computer that holds more claim first.
+    /// Lets a computer that knows more of the lost journal claim leadership first.
     pub(super) fn update_lost(&mut self, now: Instant) {
         let Some((since, holds, _)) = self.lost.now else {
             return;

@@ -20,16 +20,16 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Pause before unanswered calls are sent again.
+/// Pause before a request that the leader did not answer is sent again.
 const AGAIN: Duration = Duration::from_millis(100);
 /// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 const TELLER: &str = "/rosrescue";
 /// How often the merge sets parameters again that others keep changing. The limit is low, because calls wait for the
 /// end of the merge, and each change by others notifies the nodes, too.
 const ROUNDS_MAX: u32 = 3;
-/// The largest number of calls in one portion. Other writes pass between portions.
+/// The largest number of calls in one request to the leader ([`Ask`]). Other writes pass between two requests.
 const CALLS_MOST: usize = 100;
-/// The approximate largest size of one portion, in bytes.
+/// The approximate size limit of one request to the leader ([`Ask`]), in bytes.
 const BYTES_MOST: usize = 512 << 10;
 
 #[derive(Debug, Default)]
@@ -38,33 +38,35 @@ enum Step {
     Idle,
     /// Waits until the journal has been read as it is now.
     Reading,
-    /// Waits for the answer to this portion, from the leader at this address and of this term, or from this computer.
+    /// Waits for the answer to this request, from the leader at this address and of this term, or from this computer.
     Asked(Ask, Option<(String, u64)>),
-    /// Waits until this time, then sends the same portion again, or judges everything again.
+    /// Waits until this time, then sends this request again or, if there is none, decides again which of the remaining
+    /// writes to send.
     Pause(Instant, Option<Ask>),
 }
 
-/// The state of sending the writes of the oldest period of being cut off.
+/// The state of sending the writes of the oldest period of being cut off to the leader.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The prefix of the name under which the portions of one period are sent.
+    /// The prefix of the name under which the writes of one period of being cut off are sent.
     id: String,
-    /// How many periods were sent before.
+    /// For how many periods of being cut off all writes were sent before.
     times: u64,
     step: Step,
-    /// The number of the last portion. Answers to earlier ones are ignored.
+    /// The number of the last request to the leader. Answers to earlier ones are ignored.
     asked: u64,
-    /// The writes still to be sent. `None` before they have been judged.
+    /// The writes still to be sent. `None` until it is decided which of them conflict with others' changes.
     left: Option<Vec<Request>>,
     /// Parameters of which nodes here heard a value that was lost. These nodes must hear the present value.
     untold: BTreeSet<String>,
-    /// Whether the portion under way sets the parameters in [`Self::untold`] again.
+    /// Whether the present request to the leader sets the parameters in [`Self::untold`] again, instead of sending
+    /// writes.
     telling: bool,
-    /// How often a portion that sets parameters again failed, because others changed one meanwhile.
+    /// How often a request that sets parameters again failed, because others changed one of them meanwhile.
     rounds: u32,
-    /// Whether a portion was answered since the journal was read, so that the mirror lacks it.
+    /// Whether the leader has answered a request since the journal was read, so that the mirror lacks the writes in it.
     unread: bool,
-    /// The writes in `left` conflict with no change up to this record.
+    /// The writes in `left` conflict with no change up to this record of the journal.
     judged: u64,
     sent: u64,
     lost: u64,
@@ -149,7 +151,7 @@ impl Member {
         self.reading.refresh(now);
     }
 
-    /// Judges the remaining writes by the others' changes up to the journal's last record.
+    /// Decides which of the remaining writes conflict with others' changes, up to the journal's last record.
     fn judge(&mut self, now: Instant) {
         let Some(time) = self.cut_off.first_mut() else {
             self.merging.step = Step::Idle;
@@ -209,7 +211,7 @@ impl Member {
         self.act(Action::Merge { number, ask, to });
     }
 
-    /// Handles the answer to a portion. `None` if the leader did not answer.
+    /// Handles the answer to request `number` to the leader. `None` if the leader did not answer.
     pub(super) fn portion_answered(
         &mut self,
         now: Instant,
@@ -245,7 +247,7 @@ impl Member {
         }
     }
 
-    /// Handles the answer to a portion that set parameters again.
+    /// Handles the answer to a request that set parameters again.
     fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
         let is_last = self.merging.rounds >= ROUNDS_MAX;
         let untold = &mut self.merging.untold;
@@ -279,7 +281,7 @@ impl Member {
         }
     }
 
-    /// Finishes the oldest period: all its writes have been sent.
+    /// Finishes the oldest period of being cut off: all its writes have been sent.
     fn merged(&mut self) {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
         self.tell(News::Merged { sent, lost });
@@ -321,7 +323,7 @@ fn set_again(state: &Master, keys: &BTreeSet<String>) -> Vec<Request> {
     calls.collect()
 }
 
-/// How many of the calls fit into the next portion.
+/// How many of the calls fit into the next request to the leader.
 fn portion(calls: &[Request]) -> usize {
     let (mut count, mut bytes) = (0, 0);
     for call in calls.iter().take(CALLS_MOST) {

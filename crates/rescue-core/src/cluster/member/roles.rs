@@ -165,7 +165,7 @@ impl Member {
         }
     }
 
-    /// Stops recording and answering for the other computers.
+    /// Stops recording calls and ends this computer's master, because another computer may lead.
     fn give_up(&mut self) {
         self.act(Action::Leave);
         let known = self.knows();
@@ -204,7 +204,7 @@ impl Member {
         (!released && !is_own).then_some((&*leader.uri, leader.term))
     }
 
-    /// Updates the standing when the leader changes.
+    /// Notes who leads. If this computer follows, publishes where its calls go.
     pub(super) fn update_standing(&mut self) {
         self.look_at_place();
         let own = &self.settings().id;
@@ -232,7 +232,7 @@ impl Member {
         self.stand(standing);
     }
 
-    /// Probes the leader's rosrescue regularly.
+    /// Asks the leader's rosrescue regularly whether it leads.
     pub(super) fn update_probes(&mut self, now: Instant) {
         let asks = matches!(self.machine.role(), Role::Following | Role::Alone);
         let leader = self.leader().filter(|_| asks);

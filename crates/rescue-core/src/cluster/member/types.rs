@@ -52,7 +52,7 @@ pub struct Holds {
     pub seq: u64,
 }
 
-/// An entry among the members.
+/// What a computer has written about itself: its entry among the members.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     pub name: String,
@@ -63,7 +63,8 @@ pub struct Heard {
 }
 
 impl Heard {
-    /// Returns evidence of a namesake if this entry, which has the name in `own`, belongs to another computer.
+    /// Returns evidence of another computer with this one's name, if this entry, which has the name in `own`, belongs
+    /// to another computer.
     pub(super) fn sign_of_namesake(&self, own: &Settings) -> Option<Sign> {
         let said = self.said.as_ref()?;
         let is_own = own.is_of_this_computer(&self.name, &said.uri, &said.boot);
@@ -75,7 +76,7 @@ impl Heard {
     }
 }
 
-/// A journal entry as the watch delivers it.
+/// A journal entry as the watch on etcd delivers it.
 #[derive(Clone, Debug)]
 pub enum Entry {
     Records {
@@ -86,13 +87,13 @@ pub enum Entry {
     Apart(u64),
 }
 
-/// The part of the journal that was not known yet.
+/// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {
-    /// The leader's two keys at the same revision.
+    /// The keys `leader` and `alive` at the same revision.
     pub view: View,
-    /// The state before the records, and the nodes displaced until then. `None` if the records follow the known
-    /// journal.
+    /// The state before the records, and the nodes that lost their names to other nodes shortly before. `None` if the
+    /// records follow the known journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
@@ -110,13 +111,13 @@ pub enum Input {
     Begin,
     /// The answer to request `number` of the machine.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch delivers the leader's keys, new journal entries, and changed member entries.
+    /// The watch on etcd delivers the keys `leader` and `alive`, new journal entries, and changed member entries.
     Watched {
         view: View,
         entries: Vec<Entry>,
         heard: Vec<Heard>,
     },
-    /// The watch has ended.
+    /// The watch on etcd has ended.
     WatchEnded,
     /// The result of [`Action::Load`]. `None` if etcd could not be read.
     Loaded(Option<Read>),
@@ -137,7 +138,8 @@ pub enum Input {
         number: u64,
         answer: Option<wire::MergeAnswer>,
     },
-    /// The result of [`Action::WriteSnapshot`]: its place and its size in bytes. `None` if it was not written.
+    /// The result of [`Action::WriteSnapshot`]: how much of the journal the snapshot contains, and its size in bytes.
+    /// `None` if it was not written.
     SnapshotWritten(Option<(Progress, usize)>),
     /// Someone asks for a handover to the computer `to`, or to any if `to` is empty. `refused` says why that computer
     /// cannot lead.
@@ -210,7 +212,8 @@ pub enum News {
     reason = "few exist at a time, and none is stored"
 )]
 pub enum Action {
-    /// Write `parts`, if any, in `term`; then carry out `op` with the journal's `entry`. Ends with [`Input::Answer`].
+    /// Write `parts`, if any, provided that this computer still leads in `term`; then carry out `op` and add `entry` to
+    /// the journal. Ends with [`Input::Answer`].
     Send {
         number: u64,
         op: Op,
@@ -218,11 +221,11 @@ pub enum Action {
         term: u64,
         parts: Vec<Put>,
     },
-    /// Read the journal after this place.
+    /// Read the journal after the last record in this progress.
     Load(Progress),
-    /// Watch the leader's keys and the journal from this revision on.
+    /// Watch the keys `leader` and `alive`, the journal and the member entries from this view's revision on.
     Watch(View),
-    /// Write the parts of a large change.
+    /// Write the parts of a large change to etcd.
     Prepare {
         term: u64,
         parts: Vec<Put>,
@@ -236,7 +239,7 @@ pub enum Action {
     },
     /// Publish who has the master and where calls go.
     Stand(Standing),
-    /// Stop recording, acknowledging and notifying.
+    /// Stop recording and acknowledging calls, and stop notifying nodes.
     Leave,
     /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
     /// the ledger's state, if set.
@@ -249,14 +252,15 @@ pub enum Action {
     Follow(Vec<Record>),
     /// Replace the ledger's state by this state of another computer.
     FollowState(Master),
-    /// Answer the calls up to this record.
+    /// Let the answers to the calls up to this record go out.
     Acknowledge(u64),
-    /// Replace the recorded changes that were not handed out yet by the ledger's state.
+    /// Take the changes that the ledger has recorded but not yet handed out as a single one: its state. Ends with
+    /// [`Input::AsState`].
     TakeAsState,
     AskForwarded,
-    /// Tell these displaced nodes to shut down again, because they may have missed it.
+    /// Tell these nodes, which lost their names to other nodes, to shut down again, because they may have missed it.
     TellDisplaced(Vec<Displaced>),
-    /// Note this term in the checkpoint.
+    /// Note in the checkpoint that this computer leads in this term.
     Term(u64),
     BeginMaster(Cause),
     /// Kill the master at once.
@@ -272,9 +276,9 @@ pub enum Action {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Add these writes to the kept ones.
+    /// Keep these writes, too, until a leader has them.
     Keep(Vec<Request>),
-    /// Delete the kept writes.
+    /// Delete the kept writes, because none is left to send.
     KeepNothing,
     /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
     Merge {
@@ -290,7 +294,7 @@ pub enum Action {
         uri: String,
         term: u64,
     },
-    /// Write this computer's entry among the members.
+    /// Write this computer's entry among the members to etcd.
     Say,
     WriteSnapshot {
         term: u64,

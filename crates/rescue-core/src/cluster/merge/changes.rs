@@ -1,4 +1,5 @@
-//! Tracks changes by subject, because comparing two states would not show that a parameter was set and set back.
+//! Tracks which parameters, nodes, services and topic registrations others have changed. Comparing two states would not
+//! show that a parameter was set and set back.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},
@@ -11,12 +12,12 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// The subject of a call, by which two calls can conflict.
+/// What a call changes. Two calls can conflict if they change the same.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum ChangeSubject {
     /// A parameter: its resolved name, with a slash at the end.
     Param(String),
-    /// A registration by this node.
+    /// A registration by the node with this name.
     Node(String),
     Service(String),
     Topic {
@@ -27,7 +28,7 @@ pub enum ChangeSubject {
 }
 
 impl ChangeSubject {
-    /// The approximate size in bytes.
+    /// The approximate memory for this value, in bytes.
     pub fn size(&self) -> usize {
         size_of::<Self>()
             + match self {
@@ -36,7 +37,7 @@ impl ChangeSubject {
             }
     }
 
-    /// The subjects of `call`, which is no multicall. An unregistration conflicts with nothing.
+    /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing.
     pub fn of(call: &Request) -> Vec<Self> {
         let Some(caller) = call.caller() else {
             return Vec::new();
@@ -110,7 +111,7 @@ impl Changes {
         self.own.records.insert(seq, call);
     }
 
-    /// Notes record `seq` of the journal.
+    /// Notes what record `seq` of the journal, a `call`, has changed, unless the call was expected.
     pub fn note(&mut self, seq: u64, call: &Request) {
         if self
             .own
@@ -209,7 +210,7 @@ impl Changes {
 /// Calls of this computer that the others may have run.
 #[derive(Clone, Debug, Default)]
 struct Own {
-    /// The calls, by subject.
+    /// The calls, by method, caller and first argument.
     calls: HashMap<String, Vec<Request>>,
     /// The calls, by their numbers in the journal.
     records: HashMap<u64, Request>,

@@ -1,4 +1,4 @@
-//! The writes of a period of being cut off, reduced to those that make the last state of each subject.
+//! The writes of one period of being cut off, without those that later writes of the period made superfluous.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -9,7 +9,7 @@ use crate::{
     xmlrpc::{self, Value},
 };
 
-/// The subject of a registration or unregistration.
+/// What a call registers or unregisters: for example, the node `caller` as a publisher of the topic `name`.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Place {
     what: &'static str,
@@ -17,7 +17,7 @@ struct Place {
     caller: String,
 }
 
-/// The last registration of a subject, with its address, and the unregistrations after it.
+/// The last registration of a [`Place`], with its address, and the unregistrations after it.
 #[derive(Clone, Debug, Default)]
 struct Registered {
     registration: Option<(u64, String)>,
@@ -29,10 +29,10 @@ struct Registered {
 pub struct WritesToSend {
     calls: BTreeMap<u64, Request>,
     last: u64,
-    /// Parameters by path, and whether they are set or deleted.
+    /// The numbers of the writes to parameters, by path and by whether they set the parameter or delete it.
     params: BTreeMap<(String, bool), u64>,
     registered: HashMap<Place, Registered>,
-    /// Other calls, in encoded form.
+    /// The numbers of other calls, by their encoded form.
     others: HashMap<String, u64>,
 }
 
@@ -115,7 +115,7 @@ impl WritesToSend {
     }
 }
 
-/// The subject and address of `call`, and whether it registers.
+/// What `call` registers or unregisters, with its address, and whether it registers.
 fn place(call: &Request) -> Option<(Place, String, bool)> {
     let (what, name, api, registers) = match call.method() {
         Method::RegisterPublisher => ("publisher", 1, 3, true),

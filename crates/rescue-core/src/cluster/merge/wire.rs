@@ -8,15 +8,15 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// The name of the XML-RPC method.
+/// The name of the XML-RPC method by which a computer sends its writes to the leader.
 pub const METHOD: &str = "rosrescue/merge";
 /// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
 
-/// A portion of writes that were answered while cut off.
+/// A request to the leader to make some of the writes that were answered while cut off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all portions of one period of being cut off are sent.
+    /// The name under which all writes of one period of being cut off are sent.
     pub id: Arc<str>,
     /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,
@@ -54,7 +54,7 @@ pub enum WriteOutcome {
     Holds,
     /// The master refused the write.
     Refused(String),
-    /// Another computer has changed the subject of the write.
+    /// Another computer has changed the same parameter, node, service or topic registration.
     Lost { why: String, present: Option<Value> },
 }
 
@@ -70,17 +70,18 @@ impl From<&Lost> for WriteOutcome {
     }
 }
 
-/// The leader's answer.
+/// The leader's answer to an [`Ask`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum MergeAnswer {
-    /// The leader no longer knows all changes after the record, so the writes must be judged again.
+    /// The leader no longer knows all changes after the record [`Ask::seq`], so the sender must decide again which
+    /// writes to send.
     Again,
     /// The outcome of each write.
     Done(Vec<WriteOutcome>),
 }
 
 impl MergeAnswer {
-    /// The answer for writes with these verdicts, after the master answered those that ran with `reply`.
+    /// The answer for writes that were decided on as in `verdicts`. `reply` is the master's reply to those that it ran.
     pub fn of(verdicts: &[Verdict], reply: &Reply) -> Self {
         let results = match reply {
             Reply::Value(Value::Array(results)) => results.as_slice(),
