@@ -105,7 +105,8 @@ pub async fn run(
     say(&format!("checkpoint: {}", config.checkpoint.display()));
     say(&beginning.story);
     let restored = beginning.restored;
-    let last = last_master(&config, &beginning.session);
+    let rosmaster = supervised.as_ref().map(|supervised| &supervised.rosmaster);
+    let last = last_master(&config, &beginning, rosmaster).await;
     // This id marks our requests to the master. If such a request comes back, the master's address is our own.
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let mark = HeaderValue::from_str(&instance)?;

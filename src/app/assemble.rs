@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{context::Context, startup::Beginning};
 use crate::{
-    checkpoint::{format::Session, store::history},
+    checkpoint::store::history,
     clock,
     config::{Config, MasterConfig},
     gate,
@@ -19,6 +19,7 @@ use crate::{
     ledger::Ledger,
     lifecycle::{Patience, Supervision},
     nodes::{Nodes, served::Served},
+    process::Rosmaster,
     recovery::report_file,
     ros_env::MasterUri,
     server::{
@@ -41,10 +42,24 @@ use crate::{
 /// How long a start waits for the reports of earlier rescues. Calls wait during this time.
 const REPORTS: Duration = Duration::from_secs(1);
 
-/// Where the last master of `session` was. None if it was at rosrescue's own port, where no master can be.
-pub(super) fn last_master(config: &Config, session: &Session) -> Option<MasterUri> {
-    let uri = MasterUri::parse(session.master_uri.as_deref()?).ok()?;
-    (uri.port != config.advertised.port).then_some(uri)
+/// Where the last master of the session was. `None` if it was at rosrescue's own port, where no master can be.
+///
+/// If the disk does not answer, the session is unknown, and only a master that an earlier rosrescue left running has
+/// the state: then this is where that master listens.
+pub(super) async fn last_master(
+    config: &Config,
+    beginning: &Beginning,
+    rosmaster: Option<&Rosmaster>,
+) -> Option<MasterUri> {
+    if let Some(uri) = &beginning.session.master_uri {
+        let uri = MasterUri::parse(uri).ok()?;
+        return (uri.port != config.advertised.port).then_some(uri);
+    }
+    let is_alone = beginning.store.is_none() && config.cluster.is_none();
+    let rosmaster = rosmaster.filter(|_| is_alone)?.clone();
+    let port = wait::within(REPORTS, move || rosmaster.orphan_port()).await??;
+    let host = "127.0.0.1".to_owned();
+    Some(MasterUri { host, port })
 }
 
 /// Creates what the tasks of this process share, and the task that carries writes to the master.

@@ -47,7 +47,9 @@ impl Rescues {
                 Ok(kept) => {
                     tracing::debug!(path = %kept.display(), "kept the state of this rescue")
                 }
-                Err(error) => tracing::info!(%error, "could not keep the state of this rescue"),
+                Err(error) => {
+                    tracing::info!(%error, "could not keep a copy of the state that this rescue restored")
+                }
             }
         });
     }

@@ -40,6 +40,14 @@ pub(crate) enum Orphan {
 }
 
 impl Rosmaster {
+    /// The port of a rosmaster that an earlier rosrescue with this checkpoint left running. Blocks for long, because it
+    /// searches all processes.
+    pub(crate) fn orphan_port(&self) -> Option<u16> {
+        let all = find(&owner(&self.checkpoint)).into_iter();
+        let mut masters = all.filter(|pid| !runs(*pid, "rosout"));
+        masters.find_map(|pid| listeners::ports(pid).first().copied())
+    }
+
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
     /// rosmasters. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
@@ -62,7 +70,9 @@ impl Rosmaster {
             && let Some(left) = choose(port, &all, &owner, is_told)
         {
             let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
-            self.pid_file.record(pid, port);
+            if !matches!(last, Last::Running { .. }) {
+                self.pid_file.write(pid, port);
+            }
             return Some(left);
         }
         let name = self.program.file_name().unwrap_or_default();

@@ -6,9 +6,9 @@ use std::{
     fs,
     io::{self, Write},
     path::{Path, PathBuf},
+    sync::mpsc,
+    thread,
 };
-
-use tokio::task::spawn_blocking;
 
 use super::{Stat, beside, output};
 use crate::{regular_file, wait};
@@ -24,8 +24,8 @@ pub(super) enum Last {
     Running { pid: u32, port: u16 },
     /// The process has ended.
     Ended,
-    /// There is no complete file: an earlier version wrote none, the disk was full, or rosrescue
-    /// was killed while it started the process.
+    /// There is no complete file: an earlier version wrote none, the disk was full or does not answer, or rosrescue was
+    /// killed while it started the process.
     Unknown,
 }
 
@@ -46,7 +46,7 @@ impl PidFile {
     /// wait for the disk.
     pub(super) fn write(&self, pid: u32, port: u16) {
         let file = self.clone();
-        spawn_blocking(move || file.record(pid, port));
+        thread::spawn(move || file.record(pid, port));
     }
 
     /// Like [`Self::clear`], but waits for the disk.
@@ -66,8 +66,16 @@ impl PidFile {
         }
     }
 
-    /// Reads the file, and checks whether the process still runs.
+    /// Reads the file, and checks whether the process still runs. Waits at most [`output::LIMIT`] for the disk.
     pub(super) fn last(&self) -> Last {
+        let file = self.clone();
+        let (sender, receiver) = mpsc::sync_channel(1);
+        thread::spawn(move || sender.send(file.read()));
+        let last = receiver.recv_timeout(output::LIMIT);
+        last.unwrap_or(Last::Unknown)
+    }
+
+    fn read(&self) -> Last {
         let line = regular_file::open(&self.0).and_then(io::read_to_string);
         let line = line.unwrap_or_default();
         let fields: Vec<_> = line.split(' ').collect();

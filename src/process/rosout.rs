@@ -48,7 +48,7 @@ impl Rosout {
             Last::Unknown => {
                 let mut all = orphan::find(&self.owner).into_iter();
                 let found = all.find(|pid| runs(*pid, "rosout"))?;
-                self.pid_file.record(found, 0);
+                self.pid_file.write(found, 0);
                 Some(found)
             }
         }

@@ -175,6 +175,43 @@ fn rosrescue_serves_calls_when_it_starts_on_a_hung_disk() {
 }
 
 /// The promise of `--sync always` holds again as soon as the disk answers.
+/// The PID file of the last master could not be written either.
+#[test]
+fn a_master_that_was_started_on_a_hung_disk_is_used_after_a_death_of_rosrescue() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let port = free_port();
+    let mut rescue = disk
+        .under(Setup::core(&scratch, port).arg("--no-rosout"))
+        .start();
+    let client = rescue.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    disk.begin(Trouble::Hangs);
+    client.set_param("/during", 1);
+    let dead = client.master_pid().unwrap();
+    signal(dead, Signal::KILL);
+    eventually("another master is there", || {
+        client.master_pid().is_some_and(|pid| pid != dead) && status(&client)["open"] == true
+    });
+    let master = client.master_pid();
+    let wanted = State::read(&client);
+
+    rescue.kill();
+    rescue.start_again();
+    rescue.wait_line("the disk is silent", |line| {
+        line.contains("the disk has not opened the checkpoint")
+    });
+    rescue.wait_serving();
+    assert_eq!(Client::new(port).master_pid(), master);
+    wanted.assert_same(&State::read(&client), "after the death of rosrescue");
+    disk.heal();
+    eventually("rosrescue is protected again", || {
+        unprotected(&client).is_none()
+    });
+    assert_survives(&mut rescue, &wanted);
+}
+
 #[test]
 fn answers_wait_for_the_disk_again_as_soon_as_it_syncs() {
     let scratch = Scratch::new();

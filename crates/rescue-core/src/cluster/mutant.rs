@@ -5,7 +5,8 @@
 pub(crate) enum Mutant {
     /// A former leader trusts its own disk although etcd's journal holds more.
     OwnDiskWins,
-    /// A leader that was paused acts before it knows whether it still leads, and a silent one keeps its master.
+    /// A leader that was paused acts before it knows whether it still leads. A leader that etcd no longer answers does
+    /// not stop its master.
     ActsWithoutLease,
     /// A computer that is cut off runs a master, which notifies nodes on other computers.
     MasterWhileAlone,

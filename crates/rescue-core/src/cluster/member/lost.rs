@@ -39,7 +39,8 @@ impl Lost {
         self.now.map(|(since, ..)| since)
     }
 
-    /// Whether the new journal still lacks another leader's state.
+    /// After etcd lost its data: whether this computer still has to wait, because the new journal, read up to `progress`,
+    /// does not contain the state that a new leader writes into it first.
     pub(super) fn waits_for(&self, progress: Progress) -> bool {
         self.now.is_some_and(|(.., seq)| progress.seq <= seq)
     }

@@ -48,7 +48,8 @@ enum Step {
 /// The state of sending the writes of the oldest period of being cut off to the leader.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The prefix of the name under which the writes of one period of being cut off are sent.
+    /// The first part of the name under which this computer sends the writes that it answered while it was cut off. The
+    /// second part is `times`.
     id: String,
     /// For how many periods of being cut off all writes were sent before.
     times: u64,
@@ -64,7 +65,8 @@ pub(super) struct Merging {
     telling: bool,
     /// How often a request that sets parameters again failed, because others changed one of them meanwhile.
     rounds: u32,
-    /// Whether the leader has answered a request since the journal was read, so that the mirror lacks the writes in it.
+    /// Whether the leader has answered a request since this computer last read the journal. The mirror then lacks the
+    /// writes of that request.
     unread: bool,
     /// The writes in `left` conflict with no change up to this record of the journal.
     judged: u64,

@@ -230,8 +230,8 @@ pub enum Action {
         term: u64,
         parts: Vec<Put>,
     },
-    /// Find out whether the session of the journal, which has `state` at record `seq`, continues. `closed` says whether
-    /// the last leader stopped cleanly.
+    /// Decide whether the session in the journal continues or a new one begins. Its state at record `seq` is `state`.
+    /// `closed` says whether the last leader stopped cleanly.
     Decide {
         seq: u64,
         state: Master,
