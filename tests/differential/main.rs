@@ -247,9 +247,10 @@ fn no_takeover_is_visible_through_several_computers() {
         "{count} sequences, {played} calls, {tally:?}, seeds from {first}, {:?}",
         start.elapsed()
     );
-    // A test without takeovers would prove nothing. A few sequences may have none by chance.
+    // A test without takeovers would prove nothing. A few sequences may have none by chance: as long as there is a value
+    // that a master cannot return, no computer is ended.
     if count * takeovers as u64 >= 24 {
-        assert!(tally.deaths.happened * 2 >= tally.deaths.asked, "{tally:?}");
+        assert!(tally.deaths.happened * 4 >= tally.deaths.asked, "{tally:?}");
         assert!(tally.handovers.happened > 0, "{tally:?}");
     }
 }

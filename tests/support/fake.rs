@@ -11,6 +11,7 @@ use std::thread;
 use rosrescue::xmlrpc::{self, Reply, Value};
 
 use super::params;
+use super::patience::eventually_some;
 use super::rpc::Client;
 use super::scratch::free_port;
 
@@ -376,13 +377,15 @@ impl Server {
         port: u16,
         serve: impl Fn(TcpStream) + Send + Sync + 'static,
     ) -> Self {
-        // Not port 0: the kernel could give the same port to an outgoing connection before we listen.
-        let port = match port {
-            0 => free_port(),
-            port => port,
+        // Not port 0: the kernel could give the same port to an outgoing connection before we listen. A process that is
+        // being started may hold the socket by which the port was found to be free for a moment.
+        let listener = match port {
+            0 => eventually_some("a free port", || {
+                TcpListener::bind((address, free_port())).ok()
+            }),
+            port => TcpListener::bind((address, port))
+                .unwrap_or_else(|error| panic!("port {port}: {error}")),
         };
-        let listener = TcpListener::bind((address, port))
-            .unwrap_or_else(|error| panic!("port {port}: {error}"));
         let port = listener.local_addr().unwrap().port();
         let done = Arc::new(AtomicBool::new(false));
         let open = Arc::new(Mutex::new(Vec::new()));
