@@ -41,6 +41,9 @@ use crate::{
 
 /// How long a start waits for the reports of earlier rescues. Calls wait during this time.
 const REPORTS: Duration = Duration::from_secs(1);
+/// How long a start without a checkpoint searches all processes for a rosmaster. Reading one process's environment can
+/// take 200 ms on a busy computer.
+const SEARCH: Duration = Duration::from_secs(10);
 
 /// Where the last master of the session was. `None` if it was at rosrescue's own port, where no master can be.
 ///
@@ -57,7 +60,7 @@ pub(super) async fn last_master(
     }
     let is_alone = beginning.store.is_none() && config.cluster.is_none();
     let rosmaster = rosmaster.filter(|_| is_alone)?.clone();
-    let port = wait::within(REPORTS, move || rosmaster.orphan_port()).await??;
+    let port = wait::within(SEARCH, move || rosmaster.orphan_port()).await??;
     let host = "127.0.0.1".to_owned();
     Some(MasterUri { host, port })
 }

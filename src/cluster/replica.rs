@@ -62,7 +62,7 @@ impl Replica {
         let mut attempt = 1;
         loop {
             match self.try_load(known).await {
-                Err(ReplicaError::Etcd(EtcdError::Compacted { .. })) if attempt < ATTEMPTS => {
+                Err(ReplicaError::Etcd(EtcdError::Compacted)) if attempt < ATTEMPTS => {
                     attempt += 1;
                 }
                 done => return done,

@@ -87,7 +87,7 @@ impl<S: Storage> Store<S> {
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
-            // The missing bytes are not written again: that write would fail too, only with a clearer error.
+            // The missing bytes are not retried: that write would fail too, only with a clearer error.
             Ok(taken) => Err(io::Error::new(
                 io::ErrorKind::StorageFull,
                 format!("only {taken} of {} bytes were written", self.buffer.len()),

@@ -44,7 +44,7 @@ pub struct Credentials {
 impl std::fmt::Debug for Credentials {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let user = self.user.as_ref().map(|(name, _)| name);
-        f.debug_struct("Access")
+        f.debug_struct("Credentials")
             .field("tls", &self.tls)
             .field("user", &user)
             .finish()

@@ -37,7 +37,7 @@ pub enum EtcdError {
     #[error("etcd refuses a request of this size; its --max-request-bytes is below 1.5 MiB")]
     TooLarge,
     #[error("etcd has discarded a revision that is still needed: the state must be read again")]
-    Compacted { revision: Option<u64> },
+    Compacted,
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },
     #[error(
@@ -84,7 +84,7 @@ impl EtcdError {
         let says = |text: &str| message.contains(text);
         match code {
             _ if says("database space exceeded") => Self::Full,
-            _ if says("has been compacted") => Self::Compacted { revision: None },
+            _ if says("has been compacted") => Self::Compacted,
             _ if says("request is too large") || says("received message larger") => Self::TooLarge,
             _ if says("no leader") || says("request timed out") || says("leader changed") => {
                 Self::NoMajority { endpoint, why }
@@ -114,7 +114,7 @@ impl EtcdError {
             Self::Options(_)
                 | Self::Full
                 | Self::TooLarge
-                | Self::Compacted { .. }
+                | Self::Compacted
                 | Self::Access { .. }
                 | Self::CommonName { .. }
         )

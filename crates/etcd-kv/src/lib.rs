@@ -210,7 +210,7 @@ impl Client {
             .ask::<serde_json::Value>("kv/compaction", &request, limit)
             .await
         {
-            Err(EtcdError::Compacted { .. }) | Ok(_) => Ok(()),
+            Err(EtcdError::Compacted) | Ok(_) => Ok(()),
             Err(error) => Err(error),
         }
     }

@@ -7,11 +7,11 @@ use crate::{
     checkpoint::format::shown,
     cluster::{
         member::{Cause, News},
-        merge::wire::WriteOutcome,
+        merge::{parameter_of, wire::WriteOutcome},
     },
     hide::Hide,
     limit::{Pair, alarm, all_clear, rarely},
-    master::{Method, Request, names},
+    master::Request,
     status::report::{CUT_OFF, STARTED, TAKEN_OVER},
     xmlrpc::Value,
 };
@@ -110,13 +110,12 @@ pub(super) fn cause(of: Cause) -> &'static str {
 /// because a node may have written the same one a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();
-    for (call, outcome) in &outcomes {
+    let losses = outcomes.iter();
+    for (call, outcome) in losses.filter(|(call, outcome)| outcome.is_loss_of(call)) {
         let node = call.caller().unwrap_or_default();
         let method = call.method().name();
         match outcome {
             WriteOutcome::Holds => {}
-            // Others have deleted the parameter, too.
-            WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
             WriteOutcome::Refused(text) => {
                 tracing::warn!(
                     method,
@@ -163,10 +162,5 @@ fn shown_value(hide: &Hide, key: &str, value: Option<&Value>) -> String {
 
 /// The parameter that `call` sets, and its value. `None` for a deletion.
 fn parameter(call: &Request) -> Option<(String, Option<&Value>)> {
-    let key = || Some(names::resolve(call.text(1)?, call.caller()?));
-    match call.method() {
-        Method::SetParam => Some((key()?, call.params().get(2))),
-        Method::DeleteParam => Some((key()?, None)),
-        _ => None,
-    }
+    Some((parameter_of(call)?, call.params().get(2)))
 }

@@ -14,13 +14,13 @@ use crate::{
 };
 
 /// How many periods of being cut off are kept apart.
-const TIMES_MOST: usize = 8;
+const PERIODS_MOST: usize = 8;
 /// How many writes of one period of being cut off can be recognised when they appear in the journal.
 const EXPECTED_MOST: usize = 4_000;
 
 /// One period of being cut off.
 #[derive(Clone, Debug)]
-pub struct Time {
+pub struct Period {
     /// The state when this computer was cut off.
     pub base: Master,
     /// The writes answered since this computer was cut off.
@@ -31,7 +31,7 @@ pub struct Time {
     expected: usize,
 }
 
-impl Time {
+impl Period {
     fn new(base: Master) -> Self {
         Self {
             base,
@@ -45,27 +45,27 @@ impl Time {
 /// The periods of being cut off whose writes have not all reached a leader, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct CutOff {
-    times: VecDeque<Time>,
+    periods: VecDeque<Period>,
 }
 
 impl CutOff {
     /// Restores what an earlier process left: the state when it was cut off, and the writes answered since.
     pub fn left(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
-        let mut time = Time::new(base);
+        let mut period = Period::new(base);
         for call in calls {
             if Mutant::GuessesByValues.lives() {
-                time.changes.expect([call.clone()]);
+                period.changes.expect([call.clone()]);
             }
-            time.pending.add(&call);
+            period.pending.add(&call);
         }
         Self {
-            times: VecDeque::from([time]),
+            periods: VecDeque::from([period]),
         }
     }
 
     /// Whether a leader has all writes that were answered while cut off.
     pub fn is_empty(&self) -> bool {
-        self.times.is_empty()
+        self.periods.is_empty()
     }
 
     /// Begins a period of being cut off, in the state `base`.
@@ -73,16 +73,16 @@ impl CutOff {
         // The writes of earlier periods may still be on their way.
         let earlier: Vec<_> = self.calls().cloned().collect();
         let is_empty = self
-            .times
+            .periods
             .back()
             .is_some_and(|last| last.pending.is_empty());
-        if is_empty && self.times.len() > 1 {
-            self.times.pop_back();
+        if is_empty && self.periods.len() > 1 {
+            self.periods.pop_back();
         }
         // The oldest period stays, because its writes may be on their way. The next two become one.
-        if self.times.len() >= TIMES_MOST
-            && let Some(second) = self.times.remove(2)
-            && let Some(first) = self.times.get_mut(1)
+        if self.periods.len() >= PERIODS_MOST
+            && let Some(second) = self.periods.remove(2)
+            && let Some(first) = self.periods.get_mut(1)
         {
             // The others' changes since the first of the two count for both.
             second
@@ -90,32 +90,34 @@ impl CutOff {
                 .calls()
                 .for_each(|call| first.pending.add(call));
         }
-        let mut time = Time::new(base);
-        time.changes.expect(earlier);
-        self.times.push_back(time);
+        let mut period = Period::new(base);
+        period.changes.expect(earlier);
+        self.periods.push_back(period);
     }
 
     /// Notes that the other computers may make these calls of this computer. The calls do not count as their changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
-        if let Some(time) = self.times.back_mut() {
-            time.changes.expect(calls);
+        if let Some(period) = self.periods.back_mut() {
+            period.changes.expect(calls);
         }
     }
 
     /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period
     /// of being cut off.
     pub fn expect_in_all(&mut self, calls: &[Request]) {
-        for time in &mut self.times {
-            time.changes.expect(calls.iter().cloned());
+        for period in &mut self.periods {
+            period.changes.expect(calls.iter().cloned());
         }
     }
 
     /// Notes new records of the journal. They count as others' changes, unless they were expected.
     pub fn note(&mut self, records: &[Record]) {
-        for time in &mut self.times {
+        for period in &mut self.periods {
             for record in records {
                 if let RecordContent::Call { call, .. } = &record.entry {
-                    time.changes.note(record.seq, &Request::from(call.clone()));
+                    period
+                        .changes
+                        .note(record.seq, &Request::from(call.clone()));
                 }
             }
         }
@@ -124,17 +126,17 @@ impl CutOff {
     /// Notes that the journal's state changed from `was` to `is`, without the records in between. `None` stands for
     /// the state when this computer was cut off.
     pub fn note_difference(&mut self, was: Option<&Master>, is: &Master) {
-        for time in &mut self.times {
-            let was = was.unwrap_or(&time.base);
-            time.changes.note_difference(was, is);
+        for period in &mut self.periods {
+            let was = was.unwrap_or(&period.base);
+            period.changes.note_difference(was, is);
         }
     }
 
     /// Returns the others' `state`, changed by those kept writes that conflict with no change by others.
     pub fn on(&self, state: &Master) -> Master {
         let mut state = state.clone();
-        for time in &self.times {
-            for call in merge::merge(&time.changes, &state, time.pending.calls()).send {
+        for period in &self.periods {
+            for call in merge::merge(&period.changes, &state, period.pending.calls()).send {
                 state.apply_telling(&call, &mut ());
             }
         }
@@ -148,7 +150,7 @@ impl CutOff {
         changes: impl IntoIterator<Item = &'a Change>,
         given: bool,
     ) -> Vec<Request> {
-        let Some(time) = self.times.back_mut() else {
+        let Some(period) = self.periods.back_mut() else {
             return Vec::new();
         };
         let mut calls = Vec::new();
@@ -162,11 +164,11 @@ impl CutOff {
             };
             let call = Request::from(call.clone());
             // No more writes than this can be on their way to etcd at once.
-            if given && time.expected < EXPECTED_MOST {
-                time.expected += 1;
-                time.changes.expect_record(record.seq, call.clone());
+            if given && period.expected < EXPECTED_MOST {
+                period.expected += 1;
+                period.changes.expect_record(record.seq, call.clone());
             }
-            time.pending.add(&call);
+            period.pending.add(&call);
             calls.push(call);
         }
         calls
@@ -174,32 +176,34 @@ impl CutOff {
 
     /// The state at the beginning of the oldest period of being cut off.
     pub fn base(&self) -> Option<&Master> {
-        self.times.front().map(|time| &time.base)
+        self.periods.front().map(|period| &period.base)
     }
 
     /// All kept writes, in the order in which they were answered.
     pub fn calls(&self) -> impl Iterator<Item = &Request> {
-        self.times.iter().flat_map(|time| time.pending.calls())
+        self.periods
+            .iter()
+            .flat_map(|period| period.pending.calls())
     }
 
     /// How many writes are kept.
     pub fn len(&self) -> usize {
-        self.times.iter().map(|time| time.pending.len()).sum()
+        self.periods.iter().map(|period| period.pending.len()).sum()
     }
 
     /// The oldest period of being cut off whose writes have not all reached a leader.
-    pub fn first_mut(&mut self) -> Option<&mut Time> {
-        self.times.front_mut()
+    pub fn first_mut(&mut self) -> Option<&mut Period> {
+        self.periods.front_mut()
     }
 
     /// Drops the oldest period of being cut off: its writes have reached the leader, or are lost and reported.
     pub fn sent(&mut self) {
-        self.times.pop_front();
+        self.periods.pop_front();
     }
 
     /// Drops the present period of being cut off: its writes are in the journal after all.
     pub fn resumed(&mut self) {
-        self.times.pop_back();
+        self.periods.pop_back();
     }
 }
 
@@ -222,12 +226,12 @@ mod tests {
         Change::Call(record(seq, call), Source::Here)
     }
 
-    fn calls_of(time: &Time) -> Vec<Request> {
-        time.pending.calls().cloned().collect()
+    fn calls_of(period: &Period) -> Vec<Request> {
+        period.pending.calls().cloned().collect()
     }
 
     fn first(cut_off: &CutOff) -> Vec<Request> {
-        cut_off.times.front().map(calls_of).unwrap_or_default()
+        cut_off.periods.front().map(calls_of).unwrap_or_default()
     }
 
     fn base() -> Master {
@@ -265,8 +269,8 @@ mod tests {
         cut_off.expect_in_all(&[set("/count", 1)]);
         cut_off.note(&[record(7, set("/count", 1))]);
         cut_off.note(&[record(8, set("/count", 1))]);
-        for time in &cut_off.times {
-            let merged = merge::merge(&time.changes, &base(), time.pending.calls());
+        for period in &cut_off.periods {
+            let merged = merge::merge(&period.changes, &base(), period.pending.calls());
             assert!(merged.lost.is_empty(), "{:?}", merged.lost);
         }
         // The same call by another node is a change.
@@ -275,7 +279,7 @@ mod tests {
             [Value::from("/m"), "/count".into(), 1.into()],
         );
         cut_off.note(&[record(9, of_another)]);
-        let last = cut_off.times.back().unwrap();
+        let last = cut_off.periods.back().unwrap();
         let merged = merge::merge(&last.changes, &base(), last.pending.calls());
         assert_eq!(merged.lost.len(), 1);
     }
@@ -292,7 +296,7 @@ mod tests {
         cut_off.add(&[change(6, set("/count", 2))], false);
         // The others get the first period's write.
         let merged = |cut_off: &CutOff, others: &Master| {
-            let first = cut_off.times.front().unwrap();
+            let first = cut_off.periods.front().unwrap();
             merge::merge(&first.changes, others, first.pending.calls())
         };
         assert_eq!(merged(&cut_off, &others).send, [set("/count", 1)]);
@@ -314,12 +318,12 @@ mod tests {
             cut_off.begin(base());
             cut_off.add(&[change(5, set("/a", value))], false);
         }
-        assert!(cut_off.times.len() <= TIMES_MOST);
-        let last = cut_off.times.back().unwrap();
+        assert!(cut_off.periods.len() <= PERIODS_MOST);
+        let last = cut_off.periods.back().unwrap();
         assert_eq!(calls_of(last), [set("/a", 49)]);
         // The last period's write is in the journal after all.
         cut_off.resumed();
         assert_eq!(first(&cut_off), []);
-        assert_eq!(calls_of(cut_off.times.back().unwrap()), [set("/a", 48)]);
+        assert_eq!(calls_of(cut_off.periods.back().unwrap()), [set("/a", 48)]);
     }
 }

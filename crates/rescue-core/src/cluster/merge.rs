@@ -13,7 +13,7 @@ use std::fmt;
 use self::changes::param_of;
 pub(super) use self::changes::value_at;
 pub use self::{
-    changes::{ChangeSubject, Changes},
+    changes::{ChangeSubject, Changes, parameter_of},
     pending::{WritesToSend, weight},
 };
 use crate::{

@@ -33,8 +33,13 @@ impl Standing {
 
     /// Whether this computer answers its own nodes' calls.
     pub fn answers(&self) -> bool {
-        let pass = Pass::Calls;
-        matches!(self, Self::Leads { pass: of, .. } if *of == pass) || *self == Self::Alone
+        matches!(
+            self,
+            Self::Leads {
+                pass: Pass::Calls,
+                ..
+            } | Self::Alone
+        )
     }
 
     /// Whether this computer answers calls that other computers forward to the leader of `term`.

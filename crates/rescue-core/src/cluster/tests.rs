@@ -74,7 +74,7 @@ fn no_schedule_of_failures_breaks_a_promise() {
     let rate = schedules() as f64 / began.elapsed().as_secs_f64() * 60.0;
     println!("{} schedules, {rate:.0} a minute: {totals:?}", schedules());
     // With fewer events the schedules would test nothing.
-    let enough = totals.reigns > schedules() && totals.alone > schedules() / 4;
+    let enough = totals.leaderships > schedules() && totals.alone > schedules() / 4;
     assert!(enough || schedules() < 20, "{totals:?}");
 }
 

@@ -11,7 +11,7 @@ use crate::{
     cluster::{
         machine::Role,
         merge::{
-            self, Changes, Lost, weight,
+            self, Changes, parameter_of, weight,
             wire::{self, Ask, WriteOutcome},
         },
         mutant::Mutant,
@@ -49,10 +49,10 @@ enum Step {
 #[derive(Debug)]
 pub(super) struct Merging {
     /// The first part of the name under which this computer sends the writes that it answered while it was cut off. The
-    /// second part is `times`.
+    /// second part is `periods`.
     id: String,
     /// For how many periods of being cut off all writes were sent before.
-    times: u64,
+    periods: u64,
     step: Step,
     /// The number of the last request to the leader. Answers to earlier ones are ignored.
     asked: u64,
@@ -78,7 +78,7 @@ impl Merging {
     pub(super) fn new(id: String) -> Self {
         Self {
             id,
-            times: 0,
+            periods: 0,
             step: Step::Idle,
             asked: 0,
             left: None,
@@ -100,7 +100,7 @@ impl Merging {
     }
 
     fn id(&self) -> Arc<str> {
-        format!("{} {}", self.id, self.times).into()
+        format!("{} {}", self.id, self.periods).into()
     }
 }
 
@@ -155,21 +155,22 @@ impl Member {
 
     /// Decides which of the remaining writes conflict with others' changes, up to the journal's last record.
     fn judge(&mut self, now: Instant) {
-        let Some(time) = self.cut_off.first_mut() else {
+        let Some(period) = self.cut_off.first_mut() else {
             self.merging.step = Step::Idle;
             return;
         };
         let left = self.merging.left.take();
-        let left = left.unwrap_or_else(|| time.pending.calls().cloned().collect());
+        let left = left.unwrap_or_else(|| period.pending.calls().cloned().collect());
         if Mutant::MergesByState.lives() {
-            time.changes = Changes::default();
-            time.changes
-                .note_difference(&time.base, &self.journal.state);
+            period.changes = Changes::default();
+            period
+                .changes
+                .note_difference(&period.base, &self.journal.state);
         }
-        let merged = merge::merge(&time.changes, &self.journal.state, &left);
-        self.merging
-            .untold
-            .extend(merged.lost.iter().filter_map(parameter));
+        let merged = merge::merge(&period.changes, &self.journal.state, &left);
+        let parameters = merged.lost.iter();
+        let parameters = parameters.filter_map(|lost| parameter_of(&lost.call));
+        self.merging.untold.extend(parameters);
         let lost = merged.lost.iter();
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
         self.merging.left = Some(merged.send);
@@ -260,7 +261,7 @@ impl Member {
                 call.text(1).map(|key| untold.remove(key));
             }
         }
-        match untold.len() == before - ask.calls.len() {
+        match untold.len() + ask.calls.len() == before {
             true => self.next_portion(now),
             false => {
                 self.merging.rounds += 1;
@@ -271,12 +272,8 @@ impl Member {
 
     fn report(&mut self, outcomes: Vec<(Request, WriteOutcome)>) {
         for (call, outcome) in &outcomes {
-            match outcome {
-                WriteOutcome::Holds => self.merging.sent += 1,
-                // Others have deleted the parameter, too.
-                WriteOutcome::Refused(_) if *call.method() == Method::DeleteParam => {}
-                WriteOutcome::Refused(_) | WriteOutcome::Lost { .. } => self.merging.lost += 1,
-            }
+            self.merging.sent += u64::from(*outcome == WriteOutcome::Holds);
+            self.merging.lost += u64::from(outcome.is_loss_of(call));
         }
         if !outcomes.is_empty() {
             self.act(Action::Report(outcomes));
@@ -288,7 +285,7 @@ impl Member {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
         self.tell(News::Merged { sent, lost });
         self.merging = Merging {
-            times: self.merging.times + 1,
+            periods: self.merging.periods + 1,
             asked: self.merging.asked,
             ..Merging::new(std::mem::take(&mut self.merging.id))
         };
@@ -300,16 +297,6 @@ impl Member {
         }
         self.update_standing();
     }
-}
-
-/// The resolved name of the parameter of a lost write.
-fn parameter(lost: &Lost) -> Option<String> {
-    parameter_of(&lost.call)
-}
-
-fn parameter_of(call: &Request) -> Option<String> {
-    let sets = matches!(call.method(), Method::SetParam | Method::DeleteParam);
-    sets.then(|| Some(names::resolve(call.text(1)?, call.caller()?)))?
 }
 
 /// Calls that set each of these parameters to its value in `state`, so that its subscribers are notified.

@@ -79,14 +79,19 @@ pub(super) fn param_path(key: &str) -> String {
     path
 }
 
-/// The path of the parameter that `call` sets or deletes.
-pub(super) fn param_of(call: &Request) -> Option<String> {
+/// The resolved name of the parameter that `call` sets or deletes.
+pub fn parameter_of(call: &Request) -> Option<String> {
     match call.method() {
         Method::SetParam | Method::DeleteParam => {
-            Some(param_path(&names::resolve(call.text(1)?, call.caller()?)))
+            Some(names::resolve(call.text(1)?, call.caller()?))
         }
         _ => None,
     }
+}
+
+/// The path of the parameter that `call` sets or deletes.
+pub(super) fn param_of(call: &Request) -> Option<String> {
+    parameter_of(call).map(|name| param_path(&name))
 }
 
 /// The changes that others than the cut-off computer have made since some point of the journal.

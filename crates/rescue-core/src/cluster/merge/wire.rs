@@ -58,6 +58,18 @@ pub enum WriteOutcome {
     Lost { why: String, present: Option<Value> },
 }
 
+impl WriteOutcome {
+    /// Whether the write `call` is lost: it was neither made, nor is its result there already.
+    pub fn is_loss_of(&self, call: &Request) -> bool {
+        match self {
+            Self::Holds => false,
+            // Others have deleted the parameter, too.
+            Self::Refused(_) => *call.method() != Method::DeleteParam,
+            Self::Lost { .. } => true,
+        }
+    }
+}
+
 impl From<&Lost> for WriteOutcome {
     fn from(lost: &Lost) -> Self {
         Self::Lost {

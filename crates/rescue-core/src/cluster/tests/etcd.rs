@@ -49,7 +49,7 @@ pub(super) struct Etcd {
     members: BTreeMap<String, (Said, u64)>,
     /// The computers whose claims have succeeded, in order.
     pub(super) claims: Vec<usize>,
-    /// Everything that was ever added to the journal, and when.
+    /// All entries that were added to the journal, and when.
     pub(super) log: Vec<(u64, Held)>,
     pub(super) now: u64,
     /// Whether all data was lost once.

@@ -115,8 +115,8 @@ impl History {
         self.broken.get_or_insert_with(|| what.to_owned());
     }
 
-    /// Records that a node writes. `again` chooses one of the values written before, counted from the last one, to be
-    /// written again.
+    /// Records that a node writes. `again` chooses one of the values written before, counted from the last one, as the
+    /// value.
     pub(super) fn write(
         &mut self,
         computer: usize,
@@ -230,8 +230,6 @@ impl History {
     pub(super) fn heard(&mut self, call: usize, now: u64) {
         self.calls[call].heard.get_or_insert(now);
     }
-
-    pub(super) fn gives_up(&mut self, _call: usize) {}
 
     /// Notes that a computer's power has failed. Its disk holds what it had answered when it was `synced`.
     pub(super) fn loses_power(&mut self, computer: usize, synced: u64, now: u64) {

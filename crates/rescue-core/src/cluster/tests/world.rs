@@ -663,7 +663,7 @@ impl World {
                     self.counts.alone += 1;
                     self.computers[at].times_alone += 1;
                 }
-                News::Leads { .. } => self.counts.reigns += 1,
+                News::Leads { .. } => self.counts.leaderships += 1,
                 // Reads may have shown data that etcd has lost.
                 News::EtcdLost => self.history.forgets(at, self.now),
                 _ => {}

@@ -23,7 +23,7 @@ pub(in super::super) struct Plan {
 
 #[derive(Debug, Default)]
 pub(in super::super) struct Counts {
-    pub(in super::super) reigns: u64,
+    pub(in super::super) leaderships: u64,
     pub(in super::super) alone: u64,
     pub(in super::super) acknowledged: u64,
     pub(in super::super) reads: u64,
@@ -35,7 +35,7 @@ pub(in super::super) struct Counts {
 
 impl Counts {
     pub(in super::super) fn add(&mut self, other: &Self) {
-        self.reigns += other.reigns;
+        self.leaderships += other.leaderships;
         self.alone += other.alone;
         self.acknowledged += other.acknowledged;
         self.reads += other.reads;
@@ -240,9 +240,7 @@ impl World {
         computer.up = false;
         computer.master = None;
         // The calls' connections end with the process, so their callers no longer wait.
-        for (call, _) in std::mem::take(&mut computer.waiting) {
-            self.history.gives_up(call);
-        }
+        computer.waiting.clear();
     }
 
     fn start(&mut self, at: usize) {
