@@ -189,10 +189,12 @@ mod tests {
         let limit = Duration::from_secs(60);
         for host in ["127.0.0.1", "0.0.0.0"] {
             let listener = std::net::TcpListener::bind((host, 0)).unwrap();
-            let api = format!("http://127.0.0.1:{}", listener.local_addr().unwrap().port());
+            let port = listener.local_addr().unwrap().port();
+            let api = format!("http://127.0.0.1:{port}");
             let here = addresses_here(&api, limit).await.unwrap();
             assert!(is_among(&here, &sockets::listening()), "{host}");
             drop(listener);
+            crate::process::listeners::wait_closed(port);
             assert!(!is_among(&here, &sockets::listening()), "{host}");
         }
         // These networks and names are reserved for documentation.

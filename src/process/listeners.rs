@@ -135,6 +135,15 @@ pub(super) fn holds_one(pid: u32, sockets: &HashSet<PathBuf>) -> bool {
     open_files(pid).any(|file| sockets.contains(&file))
 }
 
+/// Waits until no process listens at `port`. A process that another test is starting holds a closed socket until it runs
+/// its program.
+#[cfg(test)]
+pub(crate) fn wait_closed(port: u16) {
+    while !sockets(port).is_empty() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::net::TcpListener;
@@ -167,6 +176,7 @@ mod tests {
         let stranger = Holder::Stranger(Some(own));
         assert_eq!(Holder::of(child.id(), port, true), stranger);
         drop(listener);
+        wait_closed(port);
         assert_eq!(Holder::of(child.id(), port, true), Holder::Unknown);
         child.kill().unwrap();
         child.wait().unwrap();

@@ -272,6 +272,7 @@ mod tests {
         assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
         assert_eq!(choose(port, &[pid]), None, "its port is taken");
         drop(listener);
+        listeners::wait_closed(port);
         assert_eq!(choose(port, &[own, pid]), Some(Orphan::Starting(pid)));
         assert_eq!(choose(1, &[own, pid]), None, "it is for another port");
         starting.kill().unwrap();
