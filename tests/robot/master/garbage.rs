@@ -82,7 +82,10 @@ const FAULT: &str = "<methodResponse><fault><value><struct><member><name>faultCo
 
 fn with_status(status: &str, body: &[u8]) -> Vec<u8> {
     let length = body.len();
-    let head = format!("HTTP/1.1 {status}\r\nContent-Length: {length}\r\n\r\n");
+    // The fake closes the connection after this answer. Without `Connection: close` rosrescue may send the next call on
+    // it before it is closed, and a master that loses a call counts as away.
+    let head =
+        format!("HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: {length}\r\n\r\n");
     [head.as_bytes(), body].concat()
 }
 
