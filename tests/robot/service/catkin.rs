@@ -43,6 +43,20 @@ fn ros(scratch: &Scratch, program: &str, port: u16) -> Command {
     command
 }
 
+/// What roslaunch has written to its log files.
+fn roslaunch_logs(scratch: &Scratch) -> String {
+    let folders = fs::read_dir(scratch.log_dir()).into_iter().flatten();
+    let files = folders
+        .flatten()
+        .flat_map(|folder| fs::read_dir(folder.path()).into_iter().flatten());
+    let is_roslaunch = |name: &str| name.starts_with("roslaunch-") && name.ends_with(".log");
+    let logs = files
+        .flatten()
+        .filter(|file| file.file_name().to_str().is_some_and(is_roslaunch));
+    logs.flat_map(|file| fs::read_to_string(file.path()))
+        .collect()
+}
+
 #[test]
 fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     let scratch = Scratch::new();
@@ -77,14 +91,10 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     eventually("another master", || pid() != first);
     assert!(is_launched());
 
-    // Before roslaunch has started all nodes, Ctrl-C is an error of roslaunch.
-    let started = "process[rosrescue_of_roslaunch-1]: started with pid [";
-    let line = roslaunch.wait_line("that its node runs", |line| line.contains(started));
-    let node = line.split(started).nth(1).unwrap();
-    let node = node.split(']').next().unwrap();
-    let children = format!("/proc/{node}/task/{node}/children");
-    eventually("the node waits for the end of roslaunch", || {
-        fs::read_to_string(&children).is_ok_and(|children| !children.is_empty())
+    // Until it waits for its nodes, Ctrl-C is an error of roslaunch.
+    eventually("roslaunch waits for its nodes", || {
+        let logs = roslaunch_logs(&scratch);
+        logs.lines().any(|line| line.ends_with(": spin"))
     });
 
     let second = pid();
@@ -98,6 +108,38 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     eventually("rosrescue and its rosmaster have ended", || {
         master.connect().is_err() && !Path::new(&format!("/proc/{second}")).exists()
     });
+}
+
+#[test]
+fn rosrescue_ends_with_roslaunch_unless_roslaunch_was_killed() {
+    let scratch = Scratch::new();
+    workspace(&scratch);
+    let start = |port| {
+        let mut roslaunch = ros(&scratch, "roslaunch", port);
+        roslaunch.args(["rosrescue", "core.launch", "args:=--no-rosout"]);
+        Process::start("roslaunch", &mut roslaunch)
+    };
+    // Ctrl-C while roslaunch still reads the launch file.
+    let port = free_port();
+    let master = Client::new(port);
+    let mut roslaunch = start(port);
+    eventually("rosrescue listens", || master.connect().is_ok());
+    roslaunch.signal(Signal::INT);
+    roslaunch.wait();
+    eventually("rosrescue has ended", || master.connect().is_err());
+
+    let port = free_port();
+    let master = Client::new(port);
+    let mut roslaunch = start(port);
+    let started = "process[rosrescue_of_roslaunch-1]: started with pid";
+    roslaunch.wait_line("that its node runs", |line| line.contains(started));
+    let file = scratch.path(&format!("rosrescue-of-roslaunch-{}.pid", roslaunch.pid()));
+    let node = file.with_extension("pid.node");
+    eventually("the node waits", || node.exists());
+    roslaunch.signal(Signal::KILL);
+    roslaunch.wait();
+    eventually("the end of roslaunch was noticed", || !file.exists());
+    assert!(master.param("/rosrescue/pid").is_some());
 }
 
 #[test]
