@@ -34,7 +34,7 @@ else
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 
-# All test programs run, even if one fails.
+# All test programs run, even if one fails. What failed is said again at the end.
 #
 # Tests with real ROS mostly wait for processes, so twice as many as there are cores run at once. Tests that measure
 # times (tests/timing) always run one at a time.
@@ -43,4 +43,11 @@ threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
 if env --default-signal=HUP true 2>/dev/null; then
     set -- env --default-signal=HUP
 fi
-RUST_TEST_THREADS=$threads "$@" cargo test --locked --workspace --no-fail-fast
+log=$(mktemp)
+trap 'rm -f "$log" "$log.failed"' EXIT
+{ RUST_TEST_THREADS=$threads "$@" cargo test --locked --workspace --no-fail-fast 2>&1 || echo $? >"$log.failed"; } | tee "$log"
+if [ -e "$log.failed" ]; then
+    echo "tests/run.sh: cargo test failed. The beginning of the output of each failed test:" >&2
+    awk '/^---- .* stdout ----$/ { left = 12 } /^stack backtrace:/ { left = 0 } left-- > 0' "$log" >&2
+    exit "$(cat "$log.failed")"
+fi
