@@ -15,7 +15,7 @@ struct Base {
   geometry_msgs::Twist speed;
   double x = 0, y = 0, heading = 0, left = 0, right = 0;
   double radius = own.param("wheel_radius", 0.1), track = own.param("track", 0.5);
-  ros::Publisher odometry = node.advertise<nav_msgs::Odometry>("odom", 10);
+  ros::Publisher odometry = node.advertise<nav_msgs::Odometry>("odom", 100);
   ros::Publisher joints = node.advertise<sensor_msgs::JointState>("wheels", 10);
   ros::Publisher transforms = node.advertise<tf2_msgs::TFMessage>("/tf", 10);
   ros::Publisher diagnostics = node.advertise<diagnostic_msgs::DiagnosticArray>("/diagnostics", 1);

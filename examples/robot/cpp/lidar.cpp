@@ -14,7 +14,7 @@ int main(int argc, char **argv) {
   scan.angle_increment = M_PI / 180;
   scan.range_min = 0.05f;
   scan.range_max = own.param("range", 12.0);
-  ros::Publisher publisher = node.advertise<sensor_msgs::LaserScan>("scan", 10);
+  ros::Publisher publisher = node.advertise<sensor_msgs::LaserScan>("scan", 100);
   ros::Rate rate(own.param("rate", 20));
   while (ros::ok()) {
     scan.header.stamp = ros::Time::now();

@@ -13,8 +13,8 @@ namespace robot {
 class Grey : public nodelet::Nodelet {
   void onInit() override {
     ros::NodeHandle &node = getNodeHandle();
-    publisher_ = node.advertise<sensor_msgs::Image>("image_grey", 10);
-    subscriber_ = node.subscribe("image_raw", 10, &Grey::image, this);
+    publisher_ = node.advertise<sensor_msgs::Image>("image_grey", 100);
+    subscriber_ = node.subscribe("image_raw", 100, &Grey::image, this);
   }
 
   void image(const sensor_msgs::ImageConstPtr &colour) {

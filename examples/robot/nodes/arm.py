@@ -19,7 +19,7 @@ def main():
         return SetBoolResponse(True, "folded" if request.data else "unfolded")
 
     rospy.Service("fold", SetBool, fold)
-    states = rospy.Publisher("joint_states", JointState, queue_size=10)
+    states = rospy.Publisher("joint_states", JointState, queue_size=100)
     rate = rospy.Rate(20)
     while not rospy.is_shutdown():
         now = rospy.Time.now()

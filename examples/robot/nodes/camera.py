@@ -37,7 +37,7 @@ def main():
         current.update(config)
         return config
 
-    images = rospy.Publisher("image_raw", Image, queue_size=10)
+    images = rospy.Publisher("image_raw", Image, queue_size=100)
     calibrations = rospy.Publisher("camera_info", CameraInfo, queue_size=10)
     calibration = CameraInfo(width=WIDTH, height=HEIGHT, distortion_model="plumb_bob")
 
