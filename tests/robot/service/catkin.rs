@@ -133,7 +133,7 @@ fn rosrescue_ends_with_roslaunch_unless_roslaunch_was_killed() {
     let mut roslaunch = start(port);
     let started = "process[rosrescue_of_roslaunch-1]: started with pid";
     roslaunch.wait_line("that its node runs", |line| line.contains(started));
-    let file = scratch.path(&format!("rosrescue-of-roslaunch-{}.pid", roslaunch.pid()));
+    let file = scratch.path(format!("rosrescue-of-roslaunch-{}.pid", roslaunch.pid()));
     let node = file.with_extension("pid.node");
     eventually("the node waits", || node.exists());
     roslaunch.signal(Signal::KILL);
