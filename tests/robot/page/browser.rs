@@ -178,7 +178,7 @@ fn paper_robot(client: &Client, count: usize) {
 #[test]
 fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
     // On a busy computer the master may be late. The mirror must not answer for it here, because after that the nodes
-    // are checked. These count as dead then, and the graph is drawn anew while the test looks at it.
+    // are checked. These count as dead then, and the graph is drawn again while the test looks at it.
     let patient = ["--stand-in-after", "30000", "--probe-timeout", "30000"];
     let robot = Robot::start_with(Mode::Core, &[&["--no-rosout"][..], &patient].concat());
     let client = robot.client();
