@@ -204,14 +204,14 @@ impl Others {
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
-        let deletes = call.deletes();
-        let mut sent = false;
+        // The parameter that a leader which gave no answer may have deleted for this call.
+        let mut deleted: Option<String> = None;
         let mut unanswered = None;
         loop {
             // A leader has run this deletion but died before its answer. The next leader would refuse to delete the
             // parameter again.
-            if sent && deletes.is_some() && call.deletes().is_none() {
-                return Ok(deleted(deletes.as_deref().unwrap_or_default()));
+            if let Some(key) = deleted.take_if(|_| call.deletes().is_none()) {
+                return Ok(was_deleted(&key));
             }
             let now = standing.borrow_and_update().clone();
             if let Some(term) = asked_term
@@ -273,9 +273,13 @@ impl Others {
                     if call.hands_over().is_some() {
                         // The request is sent only once, because after a failure the next leader would hand over too.
                         let silent = || handed_over(Err("the leader does not answer".to_owned()));
-                        return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
+                        return Ok(call
+                            .forward(&leader, term)
+                            .await
+                            .unwrap_or_else(|_| silent()));
                     }
-                    sent = true;
+                    let before = deleted.clone();
+                    deleted = deleted.or_else(|| call.deletes());
                     if unanswered.is_none() && call.kind.mutates() {
                         unanswered = call
                             .call
@@ -284,8 +288,13 @@ impl Others {
                     }
                     tokio::select! {
                         answered = call.forward(&leader, term) => match answered {
-                            Some(reply) => return Ok(reply),
-                            None => Some(Instant::now() + RETRY_PAUSE),
+                            Ok(reply) => return Ok(reply),
+                            Err(may_have_run) => {
+                                if !may_have_run {
+                                    deleted = before;
+                                }
+                                Some(Instant::now() + RETRY_PAUSE)
+                            }
                         },
                         // When the leader changes, the old leader's answer never comes or no longer counts.
                         _ = standing.changed(), if call.kind != Kind::Read => continue,
@@ -400,17 +409,26 @@ impl Call<'_> {
         reply
     }
 
-    /// The leader's answer, or the mirror's if the leader is slow to answer a read. `None` if neither can answer now.
-    async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
-        if self.kind != Kind::Read && !self.is_subscribed() {
-            return match leader.forward(term, &self.head, &self.body).await {
-                Ok(raw) => Some(self.pass_on(leader, term, raw)),
-                Err(error) => {
-                    tracing::debug!(%error, "a call to the leader failed");
-                    None
-                }
-            };
+    /// The leader's answer, or the mirror's if the leader is slow to answer a read.
+    ///
+    /// # Errors
+    ///
+    /// If neither can answer now. The error is whether the leader may have run the call.
+    async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Result<HttpReply, bool> {
+        if self.kind == Kind::Read || self.is_subscribed() {
+            return self.forward_read(leader, term).await.ok_or(true);
         }
+        match leader.forward(term, &self.head, &self.body).await {
+            Ok(raw) => Ok(self.pass_on(leader, term, raw)),
+            Err(error) => {
+                tracing::debug!(%error, "a call to the leader failed");
+                Err(error.may_have_run)
+            }
+        }
+    }
+
+    /// The answer to a call that changes nothing. `None` if neither the leader nor the mirror can answer now.
+    async fn forward_read(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
         if leader.is_late()
             && let Some(reply) = self.by_mirror().await
         {
@@ -492,7 +510,7 @@ impl Call<'_> {
 }
 
 /// A master's answer to the deletion of `key`.
-fn deleted(key: &str) -> HttpReply {
+fn was_deleted(key: &str) -> HttpReply {
     let text = format!("parameter {key} deleted");
     let reply: [Value; 3] = [1.into(), text.as_str().into(), 0.into()];
     xml(&Reply::Value(reply.to_vec().into()))

@@ -37,8 +37,15 @@ pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
 /// Why another computer did not answer.
 #[derive(Debug, Error)]
-#[non_exhaustive]
-pub(crate) enum PeerError {
+#[error("{why}")]
+pub(crate) struct PeerError {
+    why: Why,
+    /// Whether the other computer may have run the call.
+    pub(crate) may_have_run: bool,
+}
+
+#[derive(Debug, Error)]
+enum Why {
     #[error(transparent)]
     Connect(#[from] ConnectError),
     #[error(transparent)]
@@ -70,7 +77,7 @@ impl Peer {
         self.late.store(late, Ordering::Relaxed);
     }
 
-    /// Sends a call to the other computer as the leader of `term`. Even without an answer, the call may have been run.
+    /// Sends a call to the other computer as the leader of `term`.
     pub(crate) async fn forward(
         &self,
         term: u64,
@@ -86,14 +93,24 @@ impl Peer {
             idle.retain_mut(|connection| !connection.is_closed());
             idle.pop()
         };
-        if let Some(mut connection) = idle
-            && let Ok(reply) = connection.forward(&head, body.clone()).await
-        {
-            return self.answered(term, connection, reply);
+        let mut may_have_run = false;
+        if let Some(mut connection) = idle {
+            match connection.forward(&head, body.clone()).await {
+                Ok(reply) => return self.answered(term, connection, reply, may_have_run),
+                Err(_) => may_have_run = true,
+            }
         }
-        let mut connection = self.upstream.connect().await?;
-        let reply = connection.forward(&head, body.clone()).await?;
-        self.answered(term, connection, reply)
+        let connected = self.upstream.connect().await;
+        let mut connection = connected.map_err(|error| PeerError {
+            why: error.into(),
+            may_have_run,
+        })?;
+        let reply = connection.forward(&head, body.clone()).await;
+        let reply = reply.map_err(|error| PeerError {
+            why: error.into(),
+            may_have_run: true,
+        })?;
+        self.answered(term, connection, reply, may_have_run)
     }
 
     fn answered(
@@ -101,11 +118,13 @@ impl Peer {
         term: u64,
         connection: Connection,
         reply: RawReply,
+        may_have_run: bool,
     ) -> Result<RawReply, PeerError> {
         self.set_late(false);
         let usable = reply.leaves_connection_usable();
         if reply.status == NOT_LEADING {
-            return Err(PeerError::NotLeading { term });
+            let why = Why::NotLeading { term };
+            return Err(PeerError { why, may_have_run });
         }
         let mut idle = self.idle();
         if usable && idle.len() < IDLE_MOST {

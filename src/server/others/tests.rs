@@ -146,6 +146,7 @@ async fn leader(says: Option<StatusCode>) -> Standing {
         let mut open = Vec::new();
         while let Ok((mut stream, _)) = listener.accept().await {
             if let Some(code) = says {
+                request_body(&mut stream).await.unwrap();
                 let answer = format!("HTTP/1.1 {code}\r\nContent-Length: 0\r\n\r\n");
                 stream.write_all(answer.as_bytes()).await.unwrap();
             }
@@ -210,6 +211,27 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
     });
     let answer = computer.ask("/RPC2", &get()).await.unwrap();
     assert_eq!(reply(answer).await, made_by(&get()));
+}
+
+/// The next leader refuses to delete a parameter that is not there any more. The caller must not be told so if its own
+/// call has deleted it, and must be told so if another call has.
+#[tokio::test]
+async fn a_deletion_counts_as_done_only_if_a_leader_may_have_run_it() {
+    let delete = Request::new(Method::DeleteParam, ["/n", "/a"]);
+    for (says, done) in [(None, true), (Some(StatusCode::MISDIRECTED_REQUEST), false)] {
+        let computer = Computer::new(leader(says).await);
+        let another = leader(says).await;
+        // The call is on its way when the parameter disappears.
+        let deleted_by_somebody = async {
+            let nothing = Master::default();
+            computer.calls.ledger.follow_state(nothing).unwrap();
+            if done {
+                computer.standing.send_replace(another);
+            }
+        };
+        let (answer, ()) = tokio::join!(computer.ask("/RPC2", &delete), deleted_by_somebody);
+        assert_eq!(answer.is_ok(), done);
+    }
 }
 
 #[tokio::test]
