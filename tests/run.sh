@@ -34,7 +34,7 @@ else
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 
-# All test programs run, even if one fails. What failed is said again at the end.
+# All test programs run, even if one fails. The failures are repeated at the end.
 #
 # Tests with real ROS mostly wait for processes, so twice as many as there are cores run at once. Tests that measure
 # times (tests/timing) always run one at a time.

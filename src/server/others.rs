@@ -278,8 +278,7 @@ impl Others {
                             .await
                             .unwrap_or_else(|_| silent()));
                     }
-                    let before = deleted.clone();
-                    deleted = deleted.or_else(|| call.deletes());
+                    let deletes = call.deletes();
                     if unanswered.is_none() && call.kind.mutates() {
                         unanswered = call
                             .call
@@ -290,14 +289,16 @@ impl Others {
                         answered = call.forward(&leader, term) => match answered {
                             Ok(reply) => return Ok(reply),
                             Err(may_have_run) => {
-                                if !may_have_run {
-                                    deleted = before;
-                                }
+                                let deletes = deletes.filter(|_| may_have_run);
+                                deleted = deleted.or(deletes);
                                 Some(Instant::now() + RETRY_PAUSE)
                             }
                         },
                         // When the leader changes, the old leader's answer never comes or no longer counts.
-                        _ = standing.changed(), if call.kind != Kind::Read => continue,
+                        _ = standing.changed(), if call.kind != Kind::Read => {
+                            deleted = deleted.or(deletes);
+                            continue;
+                        }
                     }
                 }
                 // Waits until the next leader has taken over, or the merge is done.

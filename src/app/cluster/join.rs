@@ -105,11 +105,7 @@ pub(in crate::app) async fn join(
         forwarded: forwarded.clone(),
         served: setup.context.served.clone(),
         followed: place.subscribe(),
-        // A restored mirror may be outdated, so it answers nothing before etcd's journal has been read.
-        told: Arc::new(Mutex::new(Place {
-            seq: setup.restored.into(),
-            ..Place::default()
-        })),
+        told: Arc::new(Mutex::new(Place::at_the_start())),
         // A call may have to wait for the next leader. That takes the time to live, and longer if etcd must elect its
         // own leader first.
         hold: setup.hold.max(2 * config.ttl),

@@ -240,8 +240,8 @@ fn the_nodes_of_a_realistic_robot_do_not_notice_deaths_of_master_and_worker() {
             robot.revive_master(dead);
         }
         if round < 3 {
-            // Python sends a call again once: also if its kept connection has ended with an earlier worker. So a call
-            // of a node that has made none since then would not survive the death of the next worker.
+            // Python repeats a call only once, and does so already if its kept connection ended with an earlier worker.
+            // So the mission's first call after the death of a worker would not survive the death of the next one.
             eventually("the mission has called this worker", || {
                 robot.arrivals() > arrivals
             });

@@ -12,6 +12,8 @@ pub(crate) enum Mutant {
     MasterWhileAlone,
     /// A follower's mirror answers although it is out of date.
     StaleReads,
+    /// The mirror of a computer that starts answers before etcd's journal has been read.
+    AnswersUnread,
     /// A merge compares two states, so a value that others changed and changed back counts as unchanged.
     MergesByState,
     /// A value that equals this computer's own write never counts as another computer's change.

@@ -62,6 +62,15 @@ pub struct Place {
 }
 
 impl Place {
+    /// The place that counts as shown when a process starts. Its mirror may be outdated or empty, so it answers nothing
+    /// before etcd's journal has been read.
+    pub fn at_the_start() -> Self {
+        Self {
+            seq: u64::from(!Mutant::AnswersUnread.lives()),
+            ..Self::default()
+        }
+    }
+
     /// Whether a mirror at this place may answer reads after earlier answers have shown the place `told`. On one
     /// computer, no read goes back in time.
     pub fn shows(self, told: Self) -> bool {

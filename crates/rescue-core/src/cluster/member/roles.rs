@@ -219,11 +219,9 @@ impl Member {
         if self.machine.role() != Role::Following || self.role != Role::Following {
             return;
         }
-        // The mirror answers reads for a leader that does not answer. Without the session's state it has no answer.
-        let has_state = self.own.restored || self.reading.loaded;
         let standing = match self.leader() {
             // Writes answered while cut off must be merged before new calls.
-            Some((uri, term)) if self.cut_off.is_empty() && has_state => {
+            Some((uri, term)) if self.cut_off.is_empty() => {
                 let uri = uri.to_owned();
                 Standing::Follows { uri, term }
             }

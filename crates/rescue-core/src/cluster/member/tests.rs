@@ -56,27 +56,22 @@ struct Merges {
     lost: usize,
 }
 
-/// Computer `a`, of which an earlier process has left these writes.
-fn member(left: CutOff) -> Member {
-    let settings = Settings {
-        name: "a".to_owned(),
-        id: "a-1".to_owned(),
-        uri: "http://a:1/".to_owned(),
-        boot: String::new(),
-        version: String::new(),
-        ttl: Duration::from_secs(2),
-        commit: Commit::Always,
-        alone: WhenAlone::Serve,
-    };
-    let (keys, own) = (Keys::new("robot"), Own::default());
-    Member::new(settings, keys, own, left, "a-1".to_owned())
-}
-
 impl Merges {
     fn new() -> Self {
+        let settings = Settings {
+            name: "a".to_owned(),
+            id: "a-1".to_owned(),
+            uri: "http://a:1/".to_owned(),
+            boot: String::new(),
+            version: String::new(),
+            ttl: Duration::from_secs(2),
+            commit: Commit::Always,
+            alone: WhenAlone::Serve,
+        };
         let left = CutOff::left(Master::default(), [set(-1)]);
+        let (keys, own) = (Keys::new("robot"), Own::default());
         Self {
-            member: member(left),
+            member: Member::new(settings, keys, own, left, "a-1".to_owned()),
             now: Instant::now(),
             inputs: VecDeque::from([Input::Begin]),
             journal: Progress::default(),
@@ -174,47 +169,4 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
     let last = i32::try_from(first + 49).unwrap();
     assert_eq!(states.next(), Some(&last.into()));
     assert_eq!(states.next(), None);
-}
-
-/// While the leader does not answer, the mirror answers reads. Without the journal it has nothing to answer with.
-#[test]
-fn a_computer_follows_only_once_it_has_read_the_journal() {
-    let (mut member, start) = (member(CutOff::default()), Instant::now());
-    let mut inputs = VecDeque::from([Input::Begin]);
-    let (mut now, mut answers) = (start, 0);
-    while now < start + 2 * START_BY {
-        let input = inputs.pop_front().unwrap_or_else(|| {
-            now = member.deadline().unwrap();
-            Input::Wake
-        });
-        for action in member.on(now, input) {
-            match action {
-                Action::Send { number, .. } => {
-                    answers += 1;
-                    let answer = EtcdAnswer::Is(led(1));
-                    inputs.push_back(Input::Answer { number, answer });
-                }
-                Action::Stand(standing) => {
-                    assert_eq!(standing, Standing::Nobody { known: false });
-                }
-                _ => {}
-            }
-        }
-    }
-    assert!(answers > 0);
-
-    let mut journal = Progress::default();
-    journal.take(vec![record(1)], 1).unwrap();
-    let read = Read {
-        view: led(1),
-        state: None,
-        records: vec![record(1)],
-        progress: journal,
-        heard: Vec::new(),
-    };
-    let actions = member.on(now, Input::Loaded(Some(read)));
-    let place = |is: fn(&Action) -> bool| actions.iter().position(is);
-    let state = place(|action| matches!(action, Action::FollowState(_)));
-    let follows = place(|action| matches!(action, Action::Stand(Standing::Follows { .. })));
-    assert!(state.is_some() && state < follows, "{actions:?}");
 }

@@ -189,7 +189,7 @@ impl Computer {
             cut: (0, 0),
             standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
-            told: Place::default(),
+            told: Place::at_the_start(),
             watching: false,
             watch: 0,
             watch_at: 0,
@@ -204,10 +204,7 @@ impl Computer {
         self.hangs_until = 0;
         self.disk.own.restored = true;
         let own = &self.disk.own;
-        self.told = Place {
-            seq: 1,
-            ..Place::default()
-        };
+        self.told = Place::at_the_start();
         self.ledger = Ledger {
             mirror: own.state.clone(),
             leadership: self.ledger.leadership + 1,
