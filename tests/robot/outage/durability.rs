@@ -216,7 +216,9 @@ fn a_new_registration_is_not_removed_because_of_an_older_report_of_the_node() {
     node.claim_publication("/topic", None);
     robot.crash_master();
     // A topic that the node does not report is unregistered only after the second report.
-    eventually("the node is asked once", || asked("getSubscriptions") == 1);
+    eventually("the node is asked once", || {
+        asked("getSubscriptions") == 1 && asked("getPublications") == 1
+    });
     node.hold();
     eventually("the node is asked again", || asked("getPid") == 3);
     let dead = robot.master_pid();
