@@ -56,9 +56,11 @@ impl Failures {
         text.lines().map(str::to_owned).collect()
     }
 
-    /// The reasons for which masters have died so far.
-    pub(crate) fn deaths(&self) -> Vec<String> {
-        self.lines("deaths")
+    /// The process ids of the masters that have died so far for these reasons.
+    pub(crate) fn deaths(&self) -> Vec<u32> {
+        let deaths = self.lines("deaths").into_iter();
+        let pids = deaths.map(|line| line.split(' ').next().and_then(|pid| pid.parse().ok()));
+        pids.map(|pid| pid.expect("a process id")).collect()
     }
 
     /// The times at which masters were started, in seconds.

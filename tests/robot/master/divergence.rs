@@ -181,14 +181,15 @@ fn an_injection_whose_reply_was_lost_counts_as_a_recovery() {
     eventually("the gate is shut", || status(&client)["open"] == false);
     relay.swallow("swallowed", 1);
     let master = Rosmaster::start_at(&scratch, port);
-    eventually("the dead node is unregistered", || {
-        let known = master.client().ok("getSystemState", params!["/x"]);
-        relay.to_swallow() == 0 && !format!("{known:?}").contains("/dead")
-    });
-    assert_eq!(client.param("/swallowed"), Some(1.into()));
-    let report = eventually_some("a report", || {
+    let report = eventually_some("a report of the rescue", || {
         let report = status(&client)["last_recovery"].clone();
-        (!report["health_check_ms"].is_null()).then_some(report)
+        (report["number"] == 1 && !report["health_check_ms"].is_null()).then_some(report)
     });
     assert_eq!(report["outcome"], "injected", "{report}");
+    assert_eq!(relay.to_swallow(), 0);
+    assert_eq!(client.param("/swallowed"), Some(1.into()));
+    eventually("the dead node is unregistered", || {
+        let known = master.client().ok("getSystemState", params!["/x"]);
+        !format!("{known:?}").contains("/dead")
+    });
 }

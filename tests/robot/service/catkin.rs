@@ -5,7 +5,9 @@ use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{Client, Process, Scratch, eventually, free_port, ros_command, signal};
+use crate::support::{
+    Client, Process, Scratch, eventually, eventually_some, free_port, ros_command, signal, status,
+};
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
@@ -82,13 +84,16 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
         assert!(roslaunch.exited().is_none(), "{}", roslaunch.log());
         master.connect().is_ok() && is_launched()
     });
-    let pid = || match master.ok("getPid", vec!["/test".into()]) {
-        Value::Int(pid) => u32::try_from(pid).unwrap(),
-        other => panic!("{other:?}"),
+    // While there is no master, rosrescue answers with its own process id.
+    let pid_of_master = || {
+        let is_open = status(&master)["open"] == true;
+        is_open.then(|| master.master_pid().expect("a process id"))
     };
-    let first = pid();
+    let first = eventually_some("the master runs", pid_of_master);
     signal(first, Signal::KILL);
-    eventually("another master", || pid() != first);
+    let second = eventually_some("another master runs", || {
+        pid_of_master().filter(|pid| *pid != first)
+    });
     assert!(is_launched());
 
     // Until it waits for its nodes, Ctrl-C is an error of roslaunch.
@@ -97,7 +102,6 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
         logs.lines().any(|line| line.ends_with(": spin"))
     });
 
-    let second = pid();
     roslaunch.signal(Signal::INT);
     assert_eq!(roslaunch.wait().code(), Some(0), "{}", roslaunch.log());
     assert!(
