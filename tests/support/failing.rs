@@ -58,9 +58,9 @@ impl Failures {
 
     /// The process ids of the masters that have died so far for these reasons.
     pub(crate) fn deaths(&self) -> Vec<u32> {
-        let deaths = self.lines("deaths").into_iter();
-        let pids = deaths.map(|line| line.split(' ').next().and_then(|pid| pid.parse().ok()));
-        pids.map(|pid| pid.expect("a process id")).collect()
+        let deaths = self.lines("deaths");
+        let pids = deaths.iter().map(|line| line.split(' ').next().unwrap());
+        pids.map(|pid| pid.parse().unwrap()).collect()
     }
 
     /// The times at which masters were started, in seconds.

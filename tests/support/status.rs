@@ -12,6 +12,12 @@ pub(crate) fn status(client: &Client) -> Value {
     serde_json::from_slice(&response.body).expect("JSON")
 }
 
+/// The process id of the master to which calls pass, according to `status`. `None` while they pass to none.
+pub(crate) fn open_to(status: &Value) -> Option<u32> {
+    let pid = status["last_recovery"]["master_pid"].as_u64()?;
+    (status["open"] == true).then(|| u32::try_from(pid).expect("a process id"))
+}
+
 /// The names in a list of the status.
 pub(crate) fn names(list: &Value) -> Vec<String> {
     let list = list.as_array().cloned().unwrap_or_default();

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::support::{
     Client, Failing, FakeNode, Forkserver, Rescue, Scratch, Setup, State, eventually,
-    eventually_some, free_port, holds, params, status,
+    eventually_some, free_port, holds, open_to, params, status,
 };
 use rosrescue::xmlrpc::Value;
 
@@ -45,8 +45,7 @@ impl Proxied {
     fn await_open(&self, pid: u32) {
         let client = self.rescue.client();
         eventually("the gate is open to the new master", || {
-            let status = status(&client);
-            status["open"] == true && status["last_recovery"]["master_pid"] == pid
+            open_to(&status(&client)) == Some(pid)
         });
     }
 
@@ -183,8 +182,7 @@ fn a_new_master_may_die_at_every_call_of_the_injection() {
         let client = proxied.rescue.client();
         let mut lives = None;
         eventually("the master has died or has the state", || {
-            let status = status(&client);
-            let whole = status["open"] == true && status["last_recovery"]["master_pid"] == failing;
+            let whole = open_to(&status(&client)) == Some(failing);
             lives = (whole || !crate::support::alive(failing)).then_some(whole);
             lives.is_some()
         });
@@ -285,13 +283,11 @@ fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
                 .set(&format!("call {number}\ntimes {deaths}"));
             let pid = robot.kill_master();
             let survived = eventually_some("the gate is open to another master", || {
-                let status = status(&client);
-                let now = u32::try_from(status["last_recovery"]["master_pid"].as_u64()?).ok()?;
+                let now = open_to(&status(&client))?;
                 // The gate may still be open to a master that has just died.
                 let dead = robot.failures.deaths();
-                let open = status["open"] == true && now != pid && !dead.contains(&now);
-                let died = dead.len() == deaths;
-                open.then_some(!died)
+                let lives = now != pid && !dead.contains(&now);
+                lives.then_some(dead.len() < deaths)
             });
             nodes.assert_no_node_disturbed();
             if survived {

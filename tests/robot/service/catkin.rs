@@ -7,7 +7,8 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, Process, Scratch, eventually, eventually_some, free_port, ros_command, signal, status,
+    Client, Process, Scratch, eventually, eventually_some, free_port, open_to, ros_command, signal,
+    status,
 };
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
@@ -85,11 +86,8 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
         assert!(roslaunch.exited().is_none(), "{}", roslaunch.log());
         master.connect().is_ok() && is_launched()
     });
-    // While there is no master, rosrescue answers with its own process id.
-    let pid_of_master = || {
-        let is_open = status(&master)["open"] == true;
-        is_open.then(|| master.master_pid().expect("a process id"))
-    };
+    // Not `getPid`: while there is no master, rosrescue answers that with its own process id.
+    let pid_of_master = || open_to(&status(&master));
     let first = eventually_some("the master runs", pid_of_master);
     signal(first, Signal::KILL);
     let second = eventually_some("another master runs", || {
