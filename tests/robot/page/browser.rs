@@ -68,6 +68,10 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
         "a click shows the details",
         "document.querySelector('#details').innerText.includes('/chatter')",
     );
+    browser.shows(
+        "the nodes have been checked",
+        "document.body.innerText.includes('alive')",
+    );
     let page = browser.text();
     for shown in [
         "/talker",
