@@ -21,7 +21,9 @@ use std::{
 };
 
 use command_fds::{CommandFdExt, FdMapping, FdMappingCollision};
-use rustix::process::{Pid, Signal, WaitOptions, kill_process};
+use rustix::process::{
+    Pid, Signal, WaitOptions, getpriority_process, kill_process, setpriority_process,
+};
 use signal_hook::{
     consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM},
     iterator::Signals,
@@ -39,6 +41,9 @@ const PROGRAM: &str = "/proc/self/exe";
 
 /// Equals `OOMScoreAdjust=` in the systemd unit.
 const OOM_SCORE_ADJUST: &str = "-500";
+
+/// Equals `Nice=` in the systemd unit.
+pub(crate) const NICE: i32 = -20;
 
 /// Longest wait until a worker handles signals. After that, a signal is passed on even if it kills the worker.
 const START_TIME: Duration = Duration::from_secs(1);
@@ -62,6 +67,7 @@ pub enum GuardianError {
 /// If the first worker cannot be started, or signals cannot be received. Later failures are retried forever.
 pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     evade_oom_killer();
+    take_priority();
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
     let mut worker = Worker::start(listeners, 0)?;
@@ -261,6 +267,15 @@ fn evade_oom_killer() {
     if std::fs::read_to_string(SCORE).is_ok_and(|score| score.trim() == "0") {
         // If this fails, the guardian is still the smallest process.
         let _ = std::fs::write(SCORE, OOM_SCORE_ADJUST);
+    }
+}
+
+/// Makes the kernel run rosrescue first on a busy computer, as the systemd unit does. All nodes wait for it, and it needs
+/// little processor time: 5 to 8 ms until a new worker answers. With 32 busy processes per core, that takes a second or
+/// more at the default nice value. It needs `CAP_SYS_NICE`, and is skipped if the user has chosen a value.
+fn take_priority() {
+    if getpriority_process(None).is_ok_and(|nice| nice == 0) {
+        let _ = setpriority_process(None, NICE);
     }
 }
 

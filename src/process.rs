@@ -1,7 +1,7 @@
 //! Child processes: finds, starts and stops rosmaster and rosout. It reports what happens and decides nothing.
 
 use std::{
-    ffi::OsStr,
+    ffi::{OsStr, OsString},
     io,
     net::{Ipv4Addr, SocketAddrV4},
     path::{Path, PathBuf},
@@ -9,7 +9,9 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use rustix::process::{
+    Pid, Signal, getpriority_process, kill_process, setpriority_process, test_kill_process,
+};
 use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::{
@@ -17,7 +19,10 @@ use tokio::{
     task::block_in_place,
 };
 
-use crate::{config::SupervisedConfig, guardian::handover};
+use crate::{
+    config::SupervisedConfig,
+    guardian::{self, handover},
+};
 
 pub(crate) mod bypass;
 pub(crate) mod effort;
@@ -77,7 +82,8 @@ pub(crate) struct Rosmaster {
     log_config: Option<LogConfig>,
     /// PID file of the last rosmaster.
     pid_file: PidFile,
-    checkpoint: PathBuf,
+    /// The checkpoint's path, which marks the rosmasters of this rosrescue in their environment.
+    owner: OsString,
 }
 
 impl Rosmaster {
@@ -89,7 +95,7 @@ impl Rosmaster {
             output: Output::beside(checkpoint, ".rosmaster-output.log"),
             log_config: LogConfig::unless_given(),
             pid_file: PidFile::beside(checkpoint, "rosmaster"),
-            checkpoint: checkpoint.to_owned(),
+            owner: orphan::owner(checkpoint),
         })
     }
 
@@ -138,7 +144,7 @@ impl Rosmaster {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
         add_ros_paths(&mut command, &self.program, 2);
-        command.env(orphan::OWNER, orphan::owner(&self.checkpoint));
+        command.env(orphan::OWNER, &self.owner);
         // The master listens on loopback only, because nodes connect to rosrescue.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
@@ -154,7 +160,7 @@ impl Rosmaster {
         };
         // The master gets its own process group, because rosrescue handles Ctrl-C in the terminal.
         command.stdout(stdout).stderr(stderr).process_group(0);
-        start(command).map_err(|source| ProcessError::Spawn {
+        start(command, ROSMASTER_NICE).map_err(|source| ProcessError::Spawn {
             program: self.program.clone(),
             source,
         })
@@ -213,10 +219,25 @@ pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop of rosrescue does not
-/// interrupt the start, because the process id of the new process would be lost.
-fn start(mut command: Command) -> io::Result<Child> {
-    block_in_place(|| command.spawn())
+/// The nice value of the rosmaster, if rosrescue has [`guardian::NICE`]: it runs before the nodes, which wait for it, and
+/// after rosrescue, so that its start does not delay calls.
+const ROSMASTER_NICE: i32 = -10;
+
+/// Starts `command`, with this nice value if rosrescue runs with [`guardian::NICE`]. The program may be on a slow disk,
+/// so other tasks continue meanwhile. A stop of rosrescue does not interrupt the start, because the process id of the
+/// new process would be lost.
+fn start(mut command: Command, nice: i32) -> io::Result<Child> {
+    let child = block_in_place(|| command.spawn())?;
+    if getpriority_process(None).is_ok_and(|own| own == guardian::NICE)
+        && let Some(pid) = child.id().and_then(raw_pid)
+    {
+        let _ = setpriority_process(Some(pid), nice);
+    }
+    Ok(child)
+}
+
+fn raw_pid(pid: u32) -> Option<Pid> {
+    i32::try_from(pid).ok().and_then(Pid::from_raw)
 }
 
 /// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these paths to
@@ -264,17 +285,14 @@ pub(crate) async fn stop(pid: u32, ended: impl Future) {
 
 /// Sends a signal. Does nothing if the process is gone.
 pub(crate) fn signal_process(pid: u32, signal: Signal) {
-    if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
+    if let Some(pid) = raw_pid(pid) {
         let _ = kill_process(pid, signal);
     }
 }
 
 /// Whether a process with this process id exists.
 pub(crate) fn is_alive(pid: u32) -> bool {
-    i32::try_from(pid)
-        .ok()
-        .and_then(Pid::from_raw)
-        .is_some_and(|pid| test_kill_process(pid).is_ok())
+    raw_pid(pid).is_some_and(|pid| test_kill_process(pid).is_ok())
 }
 
 /// Whether the process `pid` runs a program with this name, according to its command line. A process id that was

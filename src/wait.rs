@@ -1,6 +1,6 @@
 //! Waits for optional events, and for disks.
 
-use std::time::Duration;
+use std::{sync::mpsc, thread, time::Duration};
 
 use tokio::time::Instant;
 
@@ -38,4 +38,14 @@ pub(crate) async fn within<T: Send + 'static>(
 ) -> Option<T> {
     let work = tokio::task::spawn_blocking(work);
     tokio::time::timeout(limit, work).await.ok()?.ok()
+}
+
+/// Like [`within`], but blocks this thread.
+pub(crate) fn blocking_within<T: Send + 'static>(
+    limit: Duration,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Option<T> {
+    let (sender, receiver) = mpsc::sync_channel(1);
+    thread::spawn(move || sender.send(work()));
+    receiver.recv_timeout(limit).ok()
 }

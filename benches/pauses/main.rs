@@ -57,10 +57,11 @@ struct Options {
     #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Kind::Core, Kind::Proxy, Kind::Bare])]
     kinds: Vec<Kind>,
-    /// Measure only deaths of rosrescue: of the worker alone, or of worker and master at once, KILLS of each
+    /// Measure only deaths of rosrescue: of the worker alone, or of worker and master at once, KILLS of each; nobody
+    /// measures the computer's own pauses
     #[arg(long, value_name = "WHO,…", value_delimiter = ',', value_enum)]
     deaths: Vec<Victims>,
-    /// Number of busy processes during those deaths
+    /// Number of busy processes during this measurement
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
     load: usize,
 }

@@ -14,16 +14,20 @@ use std::{
 
 use rustix::process::{PidfdFlags, Signal};
 
-use super::{Rosmaster, listeners, pid_file::Last, pidfd, runs, signal_process};
+use super::{Rosmaster, listeners, output, pid_file::Last, pidfd, runs, signal_process};
+use crate::wait;
 
 /// Environment variable that names the checkpoint of the rosrescue that started the process.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
 
-/// The value of [`OWNER`] in processes started by the rosrescue that uses `checkpoint`.
+/// The value of [`OWNER`] in processes started by the rosrescue that uses `checkpoint`. Symbolic links are followed if
+/// the disk answers within [`output::LIMIT`].
 pub(super) fn owner(checkpoint: &Path) -> OsString {
     let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
     // The checkpoint file may not exist yet.
-    let folder = absolute.parent().and_then(|path| path.canonicalize().ok());
+    let folder = absolute.parent().map(Path::to_owned);
+    let folder = folder
+        .and_then(|path| wait::blocking_within(output::LIMIT, move || path.canonicalize())?.ok());
     match (folder, absolute.file_name()) {
         (Some(folder), Some(name)) => folder.join(name).into(),
         _ => absolute.into(),
@@ -43,7 +47,7 @@ impl Rosmaster {
     /// The port of a rosmaster that an earlier rosrescue with this checkpoint left running. Blocks for long, because it
     /// searches all processes.
     pub(crate) fn orphan_port(&self) -> Option<u16> {
-        let all = find(&owner(&self.checkpoint)).into_iter();
+        let all = find(&self.owner).into_iter();
         let mut masters = all.filter(|pid| !runs(*pid, "rosout"));
         masters.find_map(|pid| listeners::ports(pid).first().copied())
     }
@@ -51,13 +55,13 @@ impl Rosmaster {
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
     /// rosmasters. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
-        let owner = owner(&self.checkpoint);
+        let owner = &self.owner;
         let last = self.pid_file.last();
         let all = match last {
             Last::Running { pid, .. } if is_in_our_network(pid) => vec![pid],
             Last::Running { .. } | Last::Ended => Vec::new(),
             Last::Unknown => {
-                let mut all = find(&owner);
+                let mut all = find(owner);
                 all.retain(|pid| !runs(*pid, "rosout"));
                 all
             }
@@ -67,7 +71,7 @@ impl Rosmaster {
             _ => is_told(pid, port),
         };
         if let Some(port) = port
-            && let Some(left) = choose(port, &all, &owner, is_told)
+            && let Some(left) = choose(port, &all, owner, is_told)
         {
             let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
             if !matches!(last, Last::Running { .. }) {

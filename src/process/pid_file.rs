@@ -6,7 +6,6 @@ use std::{
     fs,
     io::{self, Write},
     path::{Path, PathBuf},
-    sync::mpsc,
     thread,
 };
 
@@ -69,10 +68,7 @@ impl PidFile {
     /// Reads the file, and checks whether the process still runs. Waits at most [`output::LIMIT`] for the disk.
     pub(super) fn last(&self) -> Last {
         let file = self.clone();
-        let (sender, receiver) = mpsc::sync_channel(1);
-        thread::spawn(move || sender.send(file.read()));
-        let last = receiver.recv_timeout(output::LIMIT);
-        last.unwrap_or(Last::Unknown)
+        wait::blocking_within(output::LIMIT, move || file.read()).unwrap_or(Last::Unknown)
     }
 
     fn read(&self) -> Last {

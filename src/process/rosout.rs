@@ -62,7 +62,7 @@ impl Rosout {
         let mut command = self.command(uri);
         command.stderr(stderr);
         self.pid_file.clear().await;
-        let child = start(command)?;
+        let child = start(command, 0)?;
         if let Some(pid) = child.id() {
             // rosout chooses its ports itself.
             self.pid_file.write(pid, 0);

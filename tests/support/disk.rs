@@ -78,6 +78,7 @@ impl SmallDisk {
 /// [on](Self::under) it.
 pub(crate) struct FailingDisk {
     library: PathBuf,
+    folder: PathBuf,
     state: PathBuf,
 }
 
@@ -105,14 +106,19 @@ impl FailingDisk {
         let compiled = compiler.arg(&library).arg(source).status();
         assert!(compiled.expect("gcc runs").success());
         let state = scratch.path("disk.state");
-        Self { library, state }
+        let folder = scratch.path("");
+        Self {
+            library,
+            folder,
+            state,
+        }
     }
 
-    /// Runs `setup` with its checkpoint on this disk.
+    /// Runs `setup` with all files of its robot on this disk.
     pub(crate) fn under(&self, setup: Setup) -> Setup {
         setup
             .env("LD_PRELOAD", &self.library)
-            .env("DISK_PATH", "latest-chkpt")
+            .env("DISK_PATH", &self.folder)
             .env("DISK_STATE", &self.state)
     }
 

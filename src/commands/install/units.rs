@@ -180,6 +180,7 @@ mod tests {
             "Protect",
             "Capability",
             "OOMScoreAdjust",
+            "Nice",
             "multi-user",
             "/etc/",
         ] {

@@ -513,3 +513,57 @@ fn without_a_guardian_the_status_does_not_claim_one() {
     let silent = || !rescue.stderr().join("\n").contains("unguarded");
     assert!(holds(Duration::from_millis(200), silent));
 }
+
+/// Whether this computer lets processes raise their priority. Containers often do not, even for root.
+fn may_take_priority() -> bool {
+    let nice = Command::new("nice").args(["-n", "-20", "nice"]).output();
+    nice.unwrap().stdout == b"-20\n"
+}
+
+fn nice_value(pid: u32) -> i32 {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    // The name in parentheses can contain spaces. The nice value is the 19th field, and the 17th after the name.
+    let (_, fields) = stat.rsplit_once(") ").unwrap();
+    fields.split(' ').nth(16).unwrap().parse().unwrap()
+}
+
+/// On a busy computer rosrescue runs first, then the master, then the nodes, to which rosout belongs.
+#[test]
+fn rosrescue_and_the_master_run_before_the_nodes() {
+    let scratch = Scratch::new();
+    let rescue = core(&scratch);
+    let allowed = match may_take_priority() {
+        true => [-20, -20, -10, 0],
+        false => [0; 4],
+    };
+    let values = || {
+        let [master, rosout] = ["rosmaster", "rosout"].map(|name| process_of(&scratch, name));
+        [rescue.pid(), worker(&scratch), master, rosout].map(nice_value)
+    };
+    assert_eq!(values(), allowed);
+    let dead = worker(&scratch);
+    let master = rescue.client().master_pid().unwrap();
+    signal(master, Signal::KILL);
+    signal(dead, Signal::KILL);
+    worker_after(&scratch, dead);
+    let client = rescue.client();
+    eventually("there is another master", || {
+        client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
+    });
+    assert_eq!(values(), allowed, "after the death of worker and master");
+}
+
+#[test]
+fn a_nice_value_that_the_user_has_chosen_stays() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).guarded();
+    let rescue = setup.wrapped(|command| {
+        let mut nice = Command::new("nice");
+        nice.args(["-n", "5"]);
+        behind(nice, command)
+    });
+    let rescue = rescue.start();
+    let master = process_of(&scratch, "rosmaster");
+    let values = [rescue.pid(), worker(&scratch), master].map(nice_value);
+    assert_eq!(values, [5; 3]);
+}
