@@ -43,6 +43,7 @@ use crate::{
     gate::State,
     limit::rarely,
     master::{Master, Request},
+    nodes::notifications,
     process::ProcessError,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
@@ -245,6 +246,7 @@ impl ClusterDriver {
             Action::TellDisplaced(nodes) => {
                 ledger.with_activity(|_, activity| activity.restore_displaced(nodes));
             }
+            Action::TellAll => notifications::notify_all(&context.nodes),
             Action::Term(term) => ledger.update_session(|session| session.term = term),
             Action::BeginMaster(cause) => {
                 let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);

@@ -198,7 +198,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
                 refused = None;
                 if nodes.clear(port) {
                     // Notifications to this node were held back until now.
-                    notifications::notify_of_all(nodes, port);
+                    notifications::notify_of_all(nodes, |of| of == port);
                 }
             }
         }

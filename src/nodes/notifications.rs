@@ -63,10 +63,16 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     !subscribers.is_empty()
 }
 
-/// Notifies the node at `port` of every topic and parameter that it subscribes to.
-pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
+/// Notifies each node of every topic and parameter that it subscribes to.
+pub(crate) fn notify_all(nodes: &Arc<Nodes>) {
+    notify_of_all(nodes, |_| true);
+}
+
+/// Notifies the nodes at these ports of every topic and parameter that they subscribe to.
+pub(super) fn notify_of_all(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
     nodes.ledger.with_order(|order, mirror| {
-        for (name, _) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
+        for (name, api) in mirror.nodes().filter(|(_, api)| ports(port_of(api))) {
+            let port = port_of(api);
             for topic in mirror.subscriptions(name) {
                 order.tell_state(port, Subject::Topic(topic.to_owned()));
             }

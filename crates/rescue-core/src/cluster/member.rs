@@ -30,6 +30,7 @@ mod giving;
 mod leaving;
 mod lost;
 mod merging;
+mod notifying;
 mod roles;
 #[cfg(test)]
 mod tests;
@@ -297,6 +298,10 @@ impl Member {
             seq: self.seq(),
             boot: settings.boot.clone(),
             holds: self.lost.holds(),
+            notifies: self
+                .chores
+                .notifying
+                .says(&settings.id, !self.cut_off.is_empty()),
         }
     }
 

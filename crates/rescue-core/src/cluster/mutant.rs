@@ -14,6 +14,8 @@ pub(crate) enum Mutant {
     StaleReads,
     /// The mirror of a computer that starts answers before etcd's journal has been read.
     AnswersUnread,
+    /// Nobody corrects what nodes have heard from a former leader, or from a computer that was cut off.
+    LeavesOldNews,
     /// A merge compares two states, so a value that others changed and changed back counts as unchanged.
     MergesByState,
     /// A value that equals this computer's own write never counts as another computer's change.

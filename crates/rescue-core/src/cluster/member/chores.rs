@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{Action, Member};
+use super::{Action, Member, notifying::Notifying};
 use crate::cluster::{journal::Progress, machine::Role};
 
 /// How often a computer updates its entry among the members.
@@ -22,6 +22,10 @@ pub(super) struct Chores {
     snapshot_at: Option<Instant>,
     /// The revision up to which to compact etcd, and when.
     forget: Option<(Instant, u64)>,
+    /// The record with which the journal has all writes that a lone leader kept in a file.
+    kept_until: Option<u64>,
+    /// What the entries among the members say about notifications.
+    pub(super) notifying: Notifying,
 }
 
 impl Chores {
@@ -33,6 +37,12 @@ impl Chores {
     /// Has this computer's entry among the members updated at `now`.
     pub(super) fn say_at(&mut self, now: Instant) {
         self.say_at = Some(now);
+    }
+
+    /// Has the file of kept writes deleted once the journal has record `seq`. If the leader lost its power before, the
+    /// writes would be lost without a report.
+    pub(super) fn keep_until(&mut self, seq: u64) {
+        self.kept_until = Some(seq);
     }
 }
 
@@ -47,6 +57,13 @@ impl Member {
             self.chores.say_at = Some(now + SAYS_EVERY);
             if may_say {
                 self.act(Action::Say);
+            }
+        }
+        if let Some(seq) = self.chores.kept_until {
+            let leads = self.machine.role() == Role::Leading;
+            if !leads || self.journal.progress.seq >= seq {
+                self.chores.kept_until = None;
+                self.keep_all();
             }
         }
         let term = self.machine.term();

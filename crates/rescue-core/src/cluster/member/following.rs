@@ -308,8 +308,13 @@ impl Member {
         for heard in heard.iter().filter(|heard| heard.name == own.name) {
             self.namesake.sign = heard.sign_of_namesake(own);
         }
+        let mut outdated = false;
         for heard in heard.iter().filter(|heard| heard.name != own.name) {
             self.lost.hear(heard);
+            outdated |= self.chores.notifying.hear(heard);
+        }
+        if outdated && self.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
+            self.act(Action::TellAll);
         }
     }
 

@@ -189,7 +189,7 @@ impl Member {
         if calls.is_empty() {
             match self.merging.unread {
                 true => self.judge_again(now),
-                false => self.merged(),
+                false => self.merged(now),
             }
             return;
         }
@@ -281,7 +281,7 @@ impl Member {
     }
 
     /// Finishes the oldest period of being cut off: all its writes have been sent.
-    fn merged(&mut self) {
+    fn merged(&mut self, now: Instant) {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
         self.tell(News::Merged { sent, lost });
         self.merging = Merging {
@@ -290,6 +290,7 @@ impl Member {
             ..Merging::new(std::mem::take(&mut self.merging.id))
         };
         self.cut_off.sent();
+        self.chores.say_at(now);
         self.keep_all();
         self.adopt();
         if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {

@@ -54,7 +54,9 @@ impl Member {
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
                 if self.cut_off.is_empty() {
-                    self.act(Action::KeepNothing);
+                    let last = self.outgoing.changes().last();
+                    self.chores
+                        .keep_until(last.map_or(0, |change| change.seq()));
                 }
             }
         }
@@ -167,6 +169,9 @@ impl Member {
 
     /// Stops recording calls and ends this computer's master, because another computer may lead.
     fn give_up(&mut self) {
+        if self.records() {
+            self.chores.notifying.stop();
+        }
         self.act(Action::Leave);
         let known = self.knows();
         self.stand(Standing::Nobody { known });

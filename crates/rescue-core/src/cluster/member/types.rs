@@ -43,6 +43,12 @@ pub struct Said {
     /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
     #[serde(default)]
     pub holds: Option<Holds>,
+    /// Changes when this process stops notifying nodes, because it no longer leads or is no longer cut off, and with
+    /// each start. The leader then notifies all nodes of the present state, because they may have heard an older one
+    /// last. Empty until the leader has the writes that this computer answered while cut off: before, its nodes would
+    /// lose the publishers that were started meanwhile.
+    #[serde(default)]
+    pub notifies: String,
 }
 
 /// A place in a journal that etcd has lost: its leader's term and a record number.
@@ -260,6 +266,8 @@ pub enum Action {
     AskForwarded,
     /// Tell these nodes, which lost their names to other nodes, to shut down again, because they may have missed it.
     TellDisplaced(Vec<Displaced>),
+    /// Notify every node of the present state, because it may have heard an older one from another computer since.
+    TellAll,
     /// Note in the checkpoint that this computer leads in this term.
     Term(u64),
     BeginMaster(Cause),

@@ -302,12 +302,27 @@ impl History {
                 let own = (later.computer, later.key) == (call.computer, call.key);
                 own && of > number && later.heard.is_some()
             });
+            let recorded = !places.of[number].is_empty();
             // Another write of the same value in the log is as good.
-            let in_log = !places.of[number].is_empty()
-                || places.of_value(self, key, Some(call.value)).is_some();
-            let may_be_lost = commit == Commit::Interval && !in_log;
+            let in_log = recorded || places.of_value(self, key, Some(call.value)).is_some();
+            let may_be_lost = commit == Commit::Interval && !recorded;
             let alone = call.alone.is_some();
-            let excused = call.reported || call.unsynced || superseded || call.unchanged;
+            // For the merge, a computer that changed a value and changed it back has changed nothing.
+            let in_vain = call.held
+                && call.merged.is_some_and(|(_, log)| {
+                    let mut changed = places.changed[number].iter();
+                    !changed.any(|at| *at >= log * 1000)
+                });
+            // The others had the same value when this computer was cut off or later, so nothing was lost when they
+            // replaced it.
+            let equalled = call.alone.is_some_and(|cut| {
+                let value = Some(call.value);
+                let later = places.of_value(self, key, value);
+                let later = later.is_some_and(|(_, last)| last >= cut * 1000);
+                later || etcd.value_at(key, cut * 1000) == value
+            });
+            let unchanged = call.unchanged || in_vain || equalled;
+            let excused = call.reported || call.unsynced || superseded || unchanged;
             if may_be_lost && !alone || alone && excused {
                 continue;
             }
@@ -386,6 +401,8 @@ impl History {
         etcd: &Etcd,
         commit: Commit,
     ) -> Result<(), String> {
+        // With `interval`, the journal may lack an answered write until its leader is back and sends it again.
+        let brought_back = |call: &Call| commit == Commit::Interval && call.held;
         // From the moment in each of these entries, no read may be older than its place in the log.
         let mut floors: Vec<(u64, usize, String)> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
@@ -396,7 +413,7 @@ impl History {
             }
             let Some(heard) = call.heard else { continue };
             // A later write may have taken the place of this one when the writes were kept, and may be lost.
-            if call.alone.is_some() && !call.held {
+            if call.alone.is_some() && !call.held || brought_back(call) {
                 continue;
             }
             // A value in a whole state may come from another call.
@@ -417,7 +434,10 @@ impl History {
         // A value that was lost and reported may come back when its node calls again.
         let lost = |value: Option<i32>| {
             let mut calls = self.calls.iter();
-            calls.any(|call| call.key == key && Some(call.value) == value && call.reported)
+            calls.any(|call| {
+                let same = call.key == key && Some(call.value) == value;
+                same && (call.reported || brought_back(call))
+            })
         };
         for read in reads.iter().filter(|read| !lost(read.value)) {
             if let Some((first, _)) = places.of_value(self, key, read.value) {

@@ -555,6 +555,7 @@ impl World {
                 let leadership = computer.ledger.leadership;
                 self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
+            Action::TellAll => (0..COMPUTERS).for_each(|to| self.tell_state(at, to)),
             Action::Follow(records) => {
                 let computer = &mut self.computers[at];
                 for record in &records {

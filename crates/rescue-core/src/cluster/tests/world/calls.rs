@@ -355,6 +355,11 @@ impl World {
             // The master has ended.
             return;
         }
+        if master.is_some() && self.computers[from].member.role() == Role::Alone {
+            let what =
+                format!("{from} is cut off, and its master tells {to} that {key} is {value:?}");
+            self.history.breaks(&what);
+        }
         if let Some(master) = master
             && let Some(stuck) = self.stuck.get_mut(&(from, master, to))
         {

@@ -220,6 +220,13 @@ impl World {
         format!("{fault:?} for {} ms", time / MS)
     }
 
+    /// Cuts the power of all computers. The leader's comes back at once.
+    pub(in super::super) fn cut_all_power(&mut self) {
+        let leader = self.leaders()[0];
+        (0..COMPUTERS).for_each(|at| self.cut_power(at));
+        self.start(leader);
+    }
+
     /// Stops etcd, which comes back without its data.
     pub(in super::super) fn lose_etcd(&mut self) {
         let time = (20 + self.dice.below(6000)) * MS;
