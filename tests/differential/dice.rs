@@ -2,6 +2,8 @@
 
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
+use crate::support::unordered;
+
 /// A splitmix64 random number generator.
 pub(crate) struct Dice(pub(crate) u64);
 
@@ -300,6 +302,11 @@ impl Dice {
                     if callable {
                         let params = match self.value(cast, 1) {
                             Value::BigInt(_) | Value::Nil => Value::Int(1),
+                            // rosmaster takes the keys for parameters, in an order that only its Python knows.
+                            Value::Struct(mut keys) if unordered() => {
+                                keys.truncate(1);
+                                Value::Struct(keys)
+                            }
                             value => value,
                         };
                         entry.insert("params".to_owned(), params);
