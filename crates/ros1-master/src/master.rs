@@ -33,7 +33,7 @@ pub use names::CALLER_ID;
 pub use names::{name_for, param_name_for};
 pub use notice::{Notice, NoticeSink};
 pub use registry::{Node, Registrations, Registry};
-pub use request::{Entry, Request};
+pub use request::{Entry, Malformed, Request};
 pub use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
