@@ -15,6 +15,9 @@ pub(crate) enum Failure {
     Refused(String),
     /// rosmaster raises a `TypeError`, which it answers with code -1. The text differs from rosmaster's.
     Type(&'static str),
+    /// rosmaster takes a member of a date or of binary data. Python 3 raises a `TypeError`, and Python 2, where these
+    /// are instances of old classes, an `AttributeError`. The text differs from rosmaster's.
+    Instance(&'static str),
     /// rosmaster raises an exception other than `TypeError`, which it answers with code 0. The text differs from
     /// rosmaster's.
     Internal(&'static str),
@@ -254,7 +257,12 @@ impl Master {
             }
             Ok(answer) => answer,
             Err(Failure::Refused(text)) => (-1, text, error()),
-            Err(Failure::Type(text)) => (-1, format!("Error: invalid arguments: {text}"), error()),
+            Err(Failure::Instance(text)) if self.python.is_two() => {
+                (0, format!("Internal failure: {text}"), error())
+            }
+            Err(Failure::Type(text) | Failure::Instance(text)) => {
+                (-1, format!("Error: invalid arguments: {text}"), error())
+            }
             Err(Failure::Internal(text)) => (0, format!("Internal failure: {text}"), error()),
         };
         Ok(Value::Array(vec![code.into(), message.into(), value]))
