@@ -47,6 +47,7 @@ const VALUES: &[&str] = &[
     "<int></int>", "<int/>", "<int> </int>", "<int>+</int>", "<int>- 5</int>", "<int>1 2</int>",
     "<int>--5</int>", "<int>1_000</int>", "<int>1__0</int>", "<int>_1</int>", "<int>1_</int>",
     "<int>-_1</int>", "<int>0x10</int>", "<int>1e3</int>", "<int>1.0</int>", "<int>1L</int>",
+    "<bigdecimal>1.5</bigdecimal>", "<bigdecimal>-0.25</bigdecimal>", "<bigdecimal>100</bigdecimal>",
     "<int>٣</int>", "<int>-٣1\u{ff15}</int>", "<double>٣.٥</double>", "<int>٣x</int>", "<int>é</int>", "<int>\u{666}\u{66a}</int>",
     "<int>2147483647</int>", "<int>2147483648</int>", "<int>-2147483648</int>",
     "<int>-2147483649</int>", "<int>-00002147483649</int>", "<int>0_0</int>",
@@ -366,7 +367,10 @@ pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
             "a digit beyond the first plane",
             value("<int>\u{1d7d0}</int>"),
         ),
-        ("a bigdecimal", value("<bigdecimal>1.5</bigdecimal>")),
+        (
+            "a bigdecimal with an exponent",
+            value("<bigdecimal>1e5</bigdecimal>"),
+        ),
         (
             "a name that is not a string",
             value("<struct><int>1</int><value>x</value></struct>"),

@@ -31,6 +31,7 @@ fn notation(value: &Value) -> String {
         Value::Bool(truth) => format!("bool:{}", i32::from(*truth)),
         Value::Int(number) => format!("int:{number}"),
         Value::BigInt(digits) => format!("int:{digits}"),
+        Value::BigDecimal(text) => format!("decimal:{text}"),
         Value::Double(number) if number.is_nan() => "double:nan".to_owned(),
         Value::Double(number) => format!("double:{:016x}", number.to_bits()),
         Value::String(text) => format!("string:{}", hex(text.as_bytes())),

@@ -342,8 +342,11 @@ fn scalar(tag: Tag, text: &str, python: Python, at: usize) -> Result<Value, Deco
                 }
             }
         }
+        Tag::BigDecimal if number::is_plain_decimal(text) => {
+            return Ok(Value::BigDecimal(text.to_owned()));
+        }
         Tag::BigDecimal => {
-            let what = "a bigdecimal";
+            let what = "a bigdecimal other than digits with a point";
             return Err(DecodeError::Unsupported { at, what });
         }
         _ => (None, "base64"),

@@ -80,6 +80,14 @@ pub(super) fn float(text: &str) -> Option<f64> {
     Some(if number.is_nan() { f64::NAN } else { number })
 }
 
+/// Whether `text` is a decimal number of digits, at most one point, and a sign. Python's `Decimal` accepts more.
+pub(super) fn is_plain_decimal(text: &str) -> bool {
+    let number = text.strip_prefix(['-', '+']).unwrap_or(text);
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
+    let digits = [whole, fraction].concat();
+    !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
+}
+
 /// `text` without its underscores. `None` if one of them is not between two digits.
 fn without_underscores(text: &str) -> Option<String> {
     let mut plain = String::with_capacity(text.len());
