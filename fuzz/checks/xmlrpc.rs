@@ -25,7 +25,7 @@ pub(crate) fn check(bytes: &[u8]) {
             Ok(&mirror)
         );
     }
-    for python in [Python::default(), Python::new(2, 7)] {
+    for python in [Python::default(), Python::new(2, 7, 18)] {
         if let Err(error) = decode_call_for(bytes, python) {
             error.fault(bytes, python);
         }

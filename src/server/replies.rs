@@ -155,7 +155,7 @@ pub(super) fn no_shutdown(why: &str) -> HttpReply {
 pub(super) fn refused_by_rosmaster(head: &Head, body: &[u8], python: Python) -> Option<HttpReply> {
     // Some versions read several slashes as one.
     let has_page =
-        head.path.starts_with("//") || head.path == "/pydoc.css" && python >= Python::new(3, 11);
+        head.path.starts_with("//") || head.path == "/pydoc.css" && python >= Python::new(3, 11, 0);
     if !head.is_for_rpc() && !has_page {
         return Some(page(StatusCode::NOT_FOUND, "text/plain", "No such page"));
     }

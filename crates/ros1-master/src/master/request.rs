@@ -72,7 +72,7 @@ impl Malformed {
             Self::NoStruct("str") => {
                 let not = match python {
                     _ if two => ", not str",
-                    _ if python >= Python::new(3, 11) => ", not 'str'",
+                    _ if python >= Python::new(3, 11, 0) => ", not 'str'",
                     _ => "",
                 };
                 format!("<class 'TypeError'>:string indices must be integers{not}")
@@ -383,10 +383,10 @@ mod tests {
     /// Measured with Python 2.7.11, 3.10.4 and 3.11.2.
     #[test]
     fn a_malformed_multicall_is_refused_in_the_words_of_each_python() {
-        let fault = |list: Value, minor: (u32, u32)| {
+        let fault = |list: Value, version: (u32, u32)| {
             let call = Request::from(Call::new("system.multicall", vec![list]));
             let mut master = super::super::Master::default();
-            master.set_python(Python::new(minor.0, minor.1));
+            master.set_python(Python::new(version.0, version.1, 0));
             match master.apply(&call).reply {
                 xmlrpc::Reply::Fault { text, .. } => text,
                 xmlrpc::Reply::Value(value) => format!("{value:?}"),

@@ -43,7 +43,7 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     decode_call_for(body, Python::default())
 }
 
-/// Decodes a request as this version of Python does. Python 2 knows fewer types, and ignores the elements of others.
+/// Decodes a request as this version of Python does. Python 2 knows fewer types.
 ///
 /// # Errors
 ///
@@ -251,7 +251,7 @@ impl Unmarshaller<'_> {
         }
         self.text = Cow::Borrowed("");
         self.is_unescaped = self.writer == Writer::Python && tag == Some(Tag::DateTime);
-        if self.is_bare && tag.is_none() && !self.python.is_two() {
+        if self.is_bare && tag.is_none() && !self.python.ignores_unknown_types() {
             let tag = name.to_owned();
             return Err(DecodeError::UnknownType { at, tag });
         }

@@ -112,7 +112,16 @@ impl DecodeError {
                 _ => return None,
             },
             Self::UnknownType { tag, .. } => {
-                let text = format!("ResponseError(\"unknown tag {}\")", repr(tag)?);
+                let unicode = if python.is_two() { "u" } else { "" };
+                let comma = if python < Python::new(3, 7, 0) {
+                    ","
+                } else {
+                    ""
+                };
+                let text = format!(
+                    "ResponseError(\"unknown tag {unicode}{}\"{comma})",
+                    repr(tag)?
+                );
                 ("xmlrpc.client.ResponseError", text)
             }
             Self::Shape { what: NOTHING, .. } => {
@@ -153,7 +162,7 @@ fn no_base64(text: &str, python: Python) -> Option<String> {
     }
     let is_data = |byte: &u8| byte.is_ascii_alphanumeric() || matches!(byte, b'+' | b'/');
     let count = text.bytes().filter(is_data).count();
-    Some(match count % 4 == 1 && python >= Python::new(3, 7) {
+    Some(match count % 4 == 1 && python >= Python::new(3, 7, 0) {
         true => format!(
             "Invalid base64-encoded string: number of data characters ({count}) cannot be 1 more than a multiple of 4"
         ),

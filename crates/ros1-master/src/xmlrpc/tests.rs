@@ -302,13 +302,14 @@ fn an_unknown_element_is_refused_only_directly_inside_a_value() {
 
 /// Measured with Python 2.7.11 and 2.7.15.
 #[test]
-fn python_2_ignores_the_elements_of_types_that_it_does_not_know() {
-    let two = Python::new(2, 7);
-    let count = |inside: &str| {
+fn python_2_knows_fewer_types_and_before_2_7_12_ignores_the_elements_of_others() {
+    let count_for = |inside: &str, micro: u32| {
         let body = format!("<methodName>m</methodName><params><value>{inside}</value></params>");
         let body = format!("<methodCall>{body}</methodCall>");
-        decode_call_for(body.as_bytes(), two).map(|call| call.params.len())
+        let python = Python::new(2, 7, micro);
+        decode_call_for(body.as_bytes(), python).map(|call| call.params.len())
     };
+    let count = |inside: &str| count_for(inside, 11);
     for ignored in [
         "i1",
         "i2",
@@ -323,6 +324,10 @@ fn python_2_ignores_the_elements_of_types_that_it_does_not_know() {
             Ok(0),
             "{ignored}"
         );
+        let refused = count_for(&format!("<{ignored}>1</{ignored}>"), 15);
+        let is_refused =
+            matches!(&refused, Err(DecodeError::UnknownType { tag, .. }) if tag == ignored);
+        assert!(is_refused, "{refused:?}");
     }
     for known in ["i4", "i8", "int", "double", "string", "boolean", "nil"] {
         assert_eq!(count(&format!("<{known}>1</{known}>")), Ok(1), "{known}");
@@ -333,12 +338,23 @@ fn python_2_ignores_the_elements_of_types_that_it_does_not_know() {
 
 #[test]
 fn each_version_of_python_words_its_faults_in_its_own_way() {
-    let [two, old, new] = [(2, 7), (3, 6), (3, 11)].map(|(major, minor)| Python::new(major, minor));
+    let [two, old, new] =
+        [(2, 7), (3, 6), (3, 11)].map(|(major, minor)| Python::new(major, minor, 15));
     for (inside, python, fault) in [
         (
             "<int>five</int>",
             two,
             "<type 'exceptions.ValueError'>:invalid literal for int() with base 10: 'five'",
+        ),
+        (
+            "<i1>1</i1>",
+            two,
+            "<class 'xmlrpclib.ResponseError'>:ResponseError(\"unknown tag u'i1'\",)",
+        ),
+        (
+            "<no>1</no>",
+            new,
+            "<class 'xmlrpc.client.ResponseError'>:ResponseError(\"unknown tag 'no'\")",
         ),
         (
             "<int> five </int>",

@@ -181,7 +181,7 @@ fn python_2_has_another_error_for_a_member_of_a_date_or_of_binary_data() {
         ("c".into(), -1),
     ] {
         let members = tree([("b/c", 1.into()), ("b", value)]);
-        for (python, code) in [(Python::new(2, 7), python_2), (Python::default(), -1)] {
+        for (python, code) in [(Python::new(2, 7, 11), python_2), (Python::default(), -1)] {
             let mut master = Master::default();
             master.set_python(python);
             master.apply(&call("subscribeParam", &["/n", "http://n:1/", "/a/b/c"]));
