@@ -185,7 +185,7 @@ impl Calls {
         Ok(xml(&reply))
     }
 
-    /// The call as the master that is away or late would understand it. `call` is the result of [`Request::decode`].
+    /// The call as the master that is away or late would understand it. `call` is `None` if it could not be decoded.
     /// `Ok(None)` if only a master can tell. The error is rosmaster's answer if it would refuse the request.
     fn understood(
         &self,
@@ -200,8 +200,7 @@ impl Calls {
         if let Some(refusal) = refused_by_rosmaster(head, body, python) {
             return Err(Box::new(refusal));
         }
-        let is_final = call.is_some() && !python.is_two();
-        if is_final || head.encoding.is_some() || body.len() > SMALL {
+        if call.is_some() || head.encoding.is_some() || body.len() > SMALL {
             return Ok(call);
         }
         let error = match Request::decode_for(body, python) {

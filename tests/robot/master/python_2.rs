@@ -4,8 +4,8 @@
 use std::time::Duration;
 
 use crate::support::{
-    Client, FakeNode, Mode, Robot, encode_call, eventually, holds, http_request, in_both_modes,
-    params, tree,
+    Client, FakeNode, Mode, NODES, Netns, Robot, Scratch, Setup, encode_call, eventually,
+    free_port, holds, http_request, in_both_modes, params, status, tree,
 };
 use rosrescue::xmlrpc::{Reply, Value};
 
@@ -97,6 +97,28 @@ fn while_a_master_on_python_2_is_away_the_mirror_refuses_what_it_would_refuse() 
     robot.revive_master();
     robot.await_gate();
     assert_eq!(robot.bare().param("/value"), Some(Value::Int(5)));
+}
+
+/// Python 2 does not know prefixes of names, so it reads this call as `shutdown`, and Python 3 as `getPid`.
+#[test]
+fn no_other_computer_can_hide_a_shutdown_from_rosrescue_before_python_2() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let program = format!("{NODES}/unordered_rosmaster.py");
+    let setup = Setup::core(&scratch, free_port()).args(["--rosmaster", &program]);
+    let rescue = setup.env("ROS_IP", net.near()).start();
+    let here = rescue.client();
+    eventually("calls pass to the master", || status(&here)["open"] == true);
+    let elsewhere = Client::at(&net.near(), rescue.port());
+    let call = encode_call("shutdown", params!["/evil", "because"]);
+    let hidden = String::from_utf8(call).unwrap().replace(
+        "</methodName>",
+        "</methodName><x:methodName>getPid</x:methodName>",
+    );
+    let answer = elsewhere
+        .exchange(&http_request(hidden.as_bytes()))
+        .unwrap();
+    assert!(answer.text().contains("own computer"), "{}", answer.text());
 }
 
 /// Checks that reads are answered with the master's own bytes.
