@@ -451,10 +451,10 @@ impl Inner {
             difference = replay::difference(&self.mirror, &state);
             self.version += 1;
         }
-        let (unordered, old) = (self.mirror.is_unordered(), self.mirror.is_old());
+        let (python, old) = (self.mirror.python(), self.mirror.is_old());
         // An equal `state` replaces the mirror too, because the new one may be known more exactly.
         self.mirror = state;
-        self.mirror.set_unordered(unordered);
+        self.mirror.set_python(python);
         self.mirror.set_old(old);
         if differs {
             self.changed_unrecorded();

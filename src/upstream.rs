@@ -33,7 +33,7 @@ use crate::{
     lifecycle::OpenCalls,
     resolver,
     ros_env::MasterUri,
-    xmlrpc::{self, Reply},
+    xmlrpc::{self, Python, Reply},
 };
 
 /// Largest accepted reply of the master, in bytes. The XML of a parameter tree of 64 MiB is
@@ -89,6 +89,13 @@ pub struct Head {
     pub encoding: Option<HeaderValue>,
 }
 
+impl Head {
+    /// Whether every rosmaster accepts calls at this path.
+    pub(crate) fn is_for_rpc(&self) -> bool {
+        matches!(self.path.as_str(), "/" | "/RPC2")
+    }
+}
+
 impl Default for Head {
     fn default() -> Self {
         Self {
@@ -120,7 +127,7 @@ pub struct RawReply {
 impl RawReply {
     /// Whether the other end keeps dictionaries in order, as every Python since 3.6 does.
     pub fn keeps_order(&self) -> bool {
-        keeps_order(self.headers.get(SERVER).and_then(|it| it.to_str().ok()))
+        python(self.headers.get(SERVER).and_then(|it| it.to_str().ok())).keeps_order()
     }
 
     pub fn decode(&self) -> Result<Reply, CallError> {
@@ -131,17 +138,9 @@ impl RawReply {
     }
 }
 
-fn keeps_order(server: Option<&str>) -> bool {
-    let python = server.and_then(python);
-    python.is_none_or(|version| version >= (3, 6))
-}
-
-/// The Python version in a `Server` header such as `BaseHTTP/0.3 Python/2.7.18`.
-fn python(server: &str) -> Option<(u32, u32)> {
-    let mut words = server.split_whitespace();
-    let version = words.find_map(|word| word.strip_prefix("Python/"))?;
-    let mut numbers = version.split('.').map(|number| number.parse().ok());
-    Some((numbers.next()??, numbers.next()??))
+/// The version of Python with which a master that sends this `Server` header is treated.
+fn python(server: Option<&str>) -> Python {
+    server.and_then(Python::of_server).unwrap_or_default()
 }
 
 /// Connects to the master, on this or another computer.
@@ -409,18 +408,4 @@ pub(crate) async fn test_master() -> (
     let sentinel = upstream.connect_sentinel().await.unwrap();
     let (accepted, _) = listener.accept().await.unwrap();
     (listener, accepted, upstream.into(), sentinel.into())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_server_header_names_python() {
-        assert_eq!(python("BaseHTTP/0.3 Python/2.7.18"), Some((2, 7)));
-        assert_eq!(python("BaseHTTP/0.6 Python/3.11.2"), Some((3, 11)));
-        for other in ["", "BaseHTTP/0.6", "Python/", "Python/3", "Python/x.y"] {
-            assert_eq!(python(other), None, "{other}");
-        }
-    }
 }

@@ -2,7 +2,10 @@
 
 use rosrescue::master::{Master, Request};
 use rosrescue::replay;
-use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_call, encode_reply};
+use rosrescue::xmlrpc::{
+    Call, Python, Reply, Value, decode_call, decode_call_for, decode_reply, encode_call,
+    encode_reply,
+};
 
 /// Panics if decoding panics, or if a decoded document is not the same after it was encoded and decoded
 /// again.
@@ -21,6 +24,11 @@ pub(crate) fn check(bytes: &[u8]) {
             Master::from_snapshot(mirror.snapshot()).as_ref(),
             Ok(&mirror)
         );
+    }
+    for python in [Python::default(), Python::new(2, 7, 18)] {
+        if let Err(error) = decode_call_for(bytes, python) {
+            error.fault(bytes, python);
+        }
     }
     if let Ok(reply) = decode_reply(bytes) {
         check_reply(&reply);
@@ -57,7 +65,7 @@ enum Form {
 
 fn form(value: &Value, level: usize) -> Form {
     match value {
-        Value::Nil | Value::BigInt(_) => Form::Refused,
+        Value::Nil | Value::BigInt(_) | Value::BigDecimal(_) => Form::Refused,
         // From here on CPython is close to its recursion limit, so it may or may not encode the value.
         _ if level > 480 => Form::Spoiled,
         Value::DateTime(text) if text.contains(['&', '<', '>']) => Form::Spoiled,

@@ -2,7 +2,7 @@
 //! incarnation (see [`Token`]).
 
 use super::{Basis, Ledger};
-use crate::{master::Master, replay::Token};
+use crate::{master::Master, replay::Token, xmlrpc::Python};
 
 impl Ledger {
     /// Freezes the mirror until [`Self::end_injection`]. Returns the state from which the injection is planned.
@@ -16,9 +16,9 @@ impl Ledger {
         }
     }
 
-    /// Sets whether dictionaries of the present master are unordered, as in Python 2.
-    pub fn set_unordered(&self, unordered: bool) {
-        self.lock().mirror.set_unordered(unordered);
+    /// Sets the version of Python on which the present master runs.
+    pub fn set_python(&self, python: Python) {
+        self.lock().mirror.set_python(python);
     }
 
     /// Sets whether the present master behaves like version 1.14.3 and earlier.

@@ -233,7 +233,7 @@ impl Examiner {
             let reply = self.while_alive(connection.call(&ask)).await?;
             self.ledger.set_old(Master::shows_old(&reply));
         }
-        self.ledger.set_unordered(!connection.keeps_order());
+        self.ledger.set_python(connection.python());
         let keeps_alive = connection.keeps_alive() != Some(false);
         examination.speaks = software::speaks(keeps_alive, connection.server());
         let sees_master =

@@ -19,7 +19,9 @@ use super::{
     body::SMALL,
     compare::Comparisons,
     others::Others,
-    replies::{HttpReply, delivered, encoded, forwarded, made, no_shutdown, xml},
+    replies::{
+        HttpReply, delivered, encoded, forwarded, made, no_shutdown, refused_by_rosmaster, xml,
+    },
 };
 use crate::{
     cli::Reads,
@@ -154,12 +156,11 @@ impl Calls {
         call: Option<Request>,
         source: Source,
     ) -> Result<HttpReply, Unanswered> {
-        let undecoded = || self.decode_without_master(&head, &body);
-        let call = match call.map(Ok).or_else(undecoded).transpose() {
+        let call = match self.understood(&head, &body, call) {
             Ok(call) => call,
-            Err(fault) => {
+            Err(refusal) => {
                 self.stats.calls_without_master.count();
-                return Ok(xml(&fault));
+                return Ok(*refusal);
             }
         };
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
@@ -184,26 +185,33 @@ impl Calls {
         Ok(xml(&reply))
     }
 
-    /// How rosmaster would treat a request that [`Request::decode`] does not decode: as a call, or with a fault. `None`
-    /// if only a master can tell.
-    fn decode_without_master(&self, head: &Head, body: &Bytes) -> Option<Result<Request, Reply>> {
-        let is_away = matches!(self.gate.state(), State::StandingIn | State::Injecting);
-        let is_plain = head.encoding.is_none() && matches!(head.path.as_str(), "/" | "/RPC2");
-        if !is_away || !is_plain || body.len() > SMALL {
-            return None;
+    /// The call as the master that is away or late would understand it. `call` is `None` if it could not be decoded.
+    /// `Ok(None)` if only a master can tell. The error is rosmaster's answer if it would refuse the request.
+    fn understood(
+        &self,
+        head: &Head,
+        body: &Bytes,
+        call: Option<Request>,
+    ) -> Result<Option<Request>, Box<HttpReply>> {
+        if let State::Open { .. } | State::Unknown | State::Elsewhere = self.gate.state() {
+            return Ok(call);
         }
-        // Python 2 words its faults differently.
-        let is_python_3 = !self.ledger.with_mirror(Master::is_unordered);
-        match Request::decode(body)
-            .err()?
-            .fault(body)
-            .filter(|_| is_python_3)
-        {
-            Some(text) => Some(Err(Reply::Fault { code: 1, text })),
-            None => Request::decode(&xmlrpc::without_doctype(body)?)
-                .ok()
-                .map(Ok),
+        let python = self.ledger.with_mirror(Master::python);
+        if let Some(refusal) = refused_by_rosmaster(head, body, python) {
+            return Err(Box::new(refusal));
         }
+        if call.is_some() || head.encoding.is_some() || body.len() > SMALL {
+            return Ok(call);
+        }
+        let error = match Request::decode_for(body, python) {
+            Ok(call) => return Ok(Some(call)),
+            Err(error) => error,
+        };
+        if let Some(text) = error.fault(body, python) {
+            return Err(Box::new(xml(&Reply::Fault { code: 1, text })));
+        }
+        let plain = xmlrpc::without_doctype(body);
+        Ok(plain.and_then(|body| Request::decode_for(&body, python).ok()))
     }
 
     /// The mirror's answer to a read while there is a master. `None` if the master's answer may differ.
@@ -317,7 +325,8 @@ impl Calls {
         loop {
             match gate.look() {
                 State::Open { incarnation } => {
-                    if let Some(reply) = self.exact_answer(call).await {
+                    let read = call.filter(|_| head.is_for_rpc());
+                    if let Some(reply) = self.exact_answer(read).await {
                         return Ok(reply);
                     }
                     let patience = self.patience();

@@ -12,6 +12,7 @@ use http_body_util::Full;
 use hyper::{
     Response, StatusCode,
     body::{Body, Frame, SizeHint},
+    ext::ReasonPhrase,
     header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER},
 };
 use tokio::sync::mpsc;
@@ -19,10 +20,13 @@ use tokio::sync::mpsc;
 use crate::{
     ledger::delivery::Delivery,
     master::Request,
-    upstream::RawReply,
+    upstream::{Head, RawReply},
     write_queue::batch,
-    xmlrpc::{self, Reply, Value},
+    xmlrpc::{self, Python, Reply, Value},
 };
+
+/// The first bytes of everything that is compressed with gzip.
+const GZIP: &[u8] = &[0x1f, 0x8b];
 
 /// The reply that hyper sends.
 pub(crate) type HttpReply = Response<ReplyBody>;
@@ -144,6 +148,36 @@ pub(super) fn encoded(reply: impl Into<Bytes>) -> HttpReply {
 pub(super) fn no_shutdown(why: &str) -> HttpReply {
     let reply: [Value; 3] = [(-1).into(), why.into(), 0.into()];
     xml(&Reply::Value(reply.to_vec().into()))
+}
+
+/// rosmaster's answer to a request that it refuses before it decodes the body: because of the path, or because of the
+/// body's encoding. `None` if it decodes the body, or if that is not certain. `python` is its version of Python.
+pub(super) fn refused_by_rosmaster(head: &Head, body: &[u8], python: Python) -> Option<HttpReply> {
+    // Some versions read several slashes as one.
+    let has_page =
+        head.path.starts_with("//") || head.path == "/pydoc.css" && python >= Python::new(3, 11, 0);
+    if !head.is_for_rpc() && !has_page {
+        return Some(page(StatusCode::NOT_FOUND, "text/plain", "No such page"));
+    }
+    let encoding = head.encoding.as_ref()?.to_str().ok()?.to_ascii_lowercase();
+    let (status, reason) = match encoding.as_str() {
+        "gzip" if body.is_empty() || body.starts_with(GZIP) => return None,
+        "gzip" => (
+            StatusCode::BAD_REQUEST,
+            "error decoding gzip content".to_owned(),
+        ),
+        // Python quotes other texts differently.
+        other if other.contains(['\'', '\\']) => return None,
+        other => (
+            StatusCode::NOT_IMPLEMENTED,
+            format!("encoding '{other}' not supported"),
+        ),
+    };
+    let mut http = Response::new(ReplyBody::from(Bytes::new()));
+    *http.status_mut() = status;
+    http.extensions_mut()
+        .insert(ReasonPhrase::try_from(reason).ok()?);
+    Some(http)
 }
 
 /// A reply that is not XML-RPC.

@@ -26,9 +26,9 @@ use super::{
 };
 use crate::{
     limit::rarely,
-    master::{self, Kind},
+    master::{self, Kind, Master},
     upstream::{Head, INSTANCE_HEADER},
-    xmlrpc::Reply,
+    xmlrpc::{Python, Reply},
 };
 
 /// The answer to a client on another computer if rosrescue cannot decode its body. The master may be able to decode it,
@@ -108,6 +108,7 @@ async fn post(
     if let Err(refusal) = admission::check_post(request.headers(), &server.names) {
         return Ok(refuse(&server, peer, &refusal));
     }
+    let python = server.calls.ledger.with_mirror(Master::python);
     let head = Head {
         path: request.uri().to_string(),
         encoding: request
@@ -123,7 +124,7 @@ async fn post(
         let body = body::read(request.into_body(), limit, &mut room).await?;
         // A compressed body is forwarded without decoding. No ROS client compresses.
         let call = match &head.encoding {
-            None => decode(body.clone(), &mut room).await?,
+            None => decode(body.clone(), python, &mut room).await?,
             Some(_) => None,
         };
         Ok((body, call))
@@ -188,7 +189,10 @@ async fn answer(
             return Ok(server.answers.count(reply, room, &deadlines.reader).await);
         }
         call = match body.len() <= body::SMALL {
-            true => master::Request::decode(&body).ok(),
+            true => {
+                let python = calls.ledger.with_mirror(Master::python);
+                master::Request::decode_for(&body, python).ok()
+            }
             false => None,
         };
         if call.as_ref().map(master::Request::kind) != Some(Kind::Read) {
@@ -232,12 +236,17 @@ fn keep_out(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// Decodes a body. `None` if it cannot be decoded.
-async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<master::Request>, BodyError> {
+/// Decodes a body as a master on this version of Python would, so that no call means something else to the master.
+/// `None` if it cannot be decoded.
+async fn decode(
+    body: Bytes,
+    python: Python,
+    room: &mut Room<'_>,
+) -> Result<Option<master::Request>, BodyError> {
     if body.len() <= body::SMALL {
-        return Ok(master::Request::decode(&body).ok());
+        return Ok(master::Request::decode_for(&body, python).ok());
     }
     body::room_for_values(&body, room).await?;
-    let work = move || master::Request::decode(&body).ok();
+    let work = move || master::Request::decode_for(&body, python).ok();
     Ok(tokio::task::spawn_blocking(work).await.ok().flatten())
 }

@@ -21,12 +21,10 @@ use hyper::{
 use hyper_util::rt::TokioIo;
 use tokio::{net::TcpStream, time::timeout};
 
-use super::{
-    CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer, keeps_order,
-};
+use super::{CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer, python};
 use crate::{
     ros_env::MasterUri,
-    xmlrpc::{self, Call, Reply},
+    xmlrpc::{self, Call, Python, Reply},
 };
 
 /// Size in bytes from which a reply takes more than a millisecond to decode.
@@ -142,7 +140,12 @@ impl Connection {
 
     /// Whether the server keeps dictionaries in order, according to its last answer.
     pub fn keeps_order(&self) -> bool {
-        keeps_order(self.server())
+        self.python().keeps_order()
+    }
+
+    /// The version of Python on which the master runs, according to its last answer.
+    pub fn python(&self) -> Python {
+        python(self.server())
     }
 
     /// The `Server` header of the last answer.

@@ -65,11 +65,12 @@ fn weight(entry: &Entry) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::master::Malformed;
 
     /// The multicall with a malformed entry added at its end.
     fn malformed(call: Request) -> Request {
         let mut entries = call.into_entries();
-        entries.push(Entry::Malformed("malformed".into()));
+        entries.push(Entry::Malformed(Malformed::Arity));
         Request::of_entries(entries)
     }
 

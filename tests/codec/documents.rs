@@ -47,6 +47,8 @@ const VALUES: &[&str] = &[
     "<int></int>", "<int/>", "<int> </int>", "<int>+</int>", "<int>- 5</int>", "<int>1 2</int>",
     "<int>--5</int>", "<int>1_000</int>", "<int>1__0</int>", "<int>_1</int>", "<int>1_</int>",
     "<int>-_1</int>", "<int>0x10</int>", "<int>1e3</int>", "<int>1.0</int>", "<int>1L</int>",
+    "<bigdecimal>1.5</bigdecimal>", "<bigdecimal>-0.25</bigdecimal>", "<bigdecimal>100</bigdecimal>",
+    "<int>٣</int>", "<int>-٣1\u{ff15}</int>", "<double>٣.٥</double>", "<int>٣x</int>", "<int>é</int>", "<int>\u{666}\u{66a}</int>",
     "<int>2147483647</int>", "<int>2147483648</int>", "<int>-2147483648</int>",
     "<int>-2147483649</int>", "<int>-00002147483649</int>", "<int>0_0</int>",
     "<int>5<!-- x -->6</int>", "<int>&#53;</int>", "<i1>300</i1>", "<i2>70000</i2>", "<i4>-1</i4>",
@@ -200,7 +202,16 @@ const DOCUMENTS: &[&str] = &[
     "<!DOCTYPE a [<!ENTITY b 'c'>]><methodName>&b;</methodName>",
     "<!DOCTYPE><methodName>m</methodName>", "<!doctype a><methodName>m</methodName>",
     "<html><body>503</body></html>", "{\"a\": 1}", "<methodName>m</methodName >",
-    "<methodName>m</methodName", "<a><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='latin1'?><a>é&no;</a>", "<?xml version='1.0' encoding='iso-8859-1'?><a>éé</b>",
+    "<?xml version='1.0' encoding='latin1'?><a>é", "<?xml version='1.0' encoding='utf-8'?><a>é",
+    "<?xml version='1.0' encoding='utf-8'?><a>é&no;</a>", "<a>é&no;</a>",
+    "<methodName>m</methodName", "<a><methodName>m</methodName>", "<methodName>m</", "<methodName>m</methodName ",
+    "{}", " \n{}", "<?xml version='1.0'?>{}", "<methodName>m</methodName>{}", "<methodName>m</methodName>\n }", "[1]",
+    "!a", "$a", "*a", "+a", "/a", ";a", "=a", "?a", "@a", "\\a", "^a", "`a", "~a", "\u{7f}a", "(a", "|a", "1a", "-a", "%a", "#a",
+    "<!ENTITY a 'b'><methodName>m</methodName>", "\n<!ATTLIST a><methodName>m</methodName>",
+    "<?xml version='1.0'?><!ELEMENT a ANY><methodName>m</methodName>", "<!ELEMENT><methodName>m</methodName>",
+    "<!E1 a><methodName>m</methodName>", "<!a b", "<!a ", "<!a", "<methodName>m</methodName><!ENTITY a 'b'>",
+    "<a/><!ENTITY a 'b'><b/>",
 ];
 
 /// A call with `inside` between `<params>` and `</params>`.
@@ -241,6 +252,45 @@ pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     ] {
         documents.push(bytes.to_vec());
     }
+    for name in [
+        "utf8",
+        "Utf_8",
+        "ascii",
+        "latin1",
+        "LATIN-1",
+        "latin_1",
+        "iso8859-1",
+        "ISO_8859-1",
+        "iso8859_1",
+        "L1",
+        "cp1252",
+        "Windows-1252",
+    ] {
+        documents.push(declared(name));
+    }
+    for text in [
+        DECLARED,
+        "<methodName>é€𝄞\u{1}</methodName>",
+        "<methodName>é€𝄞</methodName>",
+        "\u{feff}<a/>",
+        "<a",
+    ] {
+        documents.push(utf16_of(text, &[0xff, 0xfe]));
+        let big = text.encode_utf16().flat_map(u16::to_be_bytes);
+        documents.push([0xfe, 0xff].into_iter().chain(big).collect());
+    }
+    for name in ["utf-16", "UTF-16", "utf-8"] {
+        let text = String::from_utf8(declared(name)).unwrap();
+        documents.push(utf16_of(&text, &[0xff, 0xfe]));
+    }
+    for (name, bytes) in [
+        ("latin1", &b"\xe9\x80"[..]),
+        ("utf8", "é".as_bytes()),
+        ("ascii", b"\x80"),
+    ] {
+        let document = format!("<?xml version='1.0' encoding='{name}'?><methodName>");
+        documents.push([document.as_bytes(), bytes, b"</methodName>"].concat());
+    }
     for names in [31, 32, 33, 100] {
         let many: String = (0..names).map(|n| format!(" a{n}='x'")).collect();
         documents.push(params(&format!("<param{many}/>")));
@@ -269,17 +319,21 @@ pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     documents
 }
 
+const DECLARED: &str = "<?xml version='1.0'?><methodName>m</methodName>";
+
+/// A document that names its encoding.
+fn declared(name: &str) -> Vec<u8> {
+    format!("<?xml version='1.0' encoding='{name}'?><methodName>m</methodName>").into_bytes()
+}
+
+/// `text` in UTF-16, little end first, after a byte order mark.
+fn utf16_of(text: &str, mark: &[u8]) -> Vec<u8> {
+    let units = text.encode_utf16().flat_map(u16::to_le_bytes);
+    mark.iter().copied().chain(units).collect()
+}
+
 /// Documents that CPython accepts and this decoder refuses, so that they are only forwarded.
 pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
-    let utf16 = |mark: bool| {
-        let text = "<?xml version='1.0'?><methodName>m</methodName>".encode_utf16();
-        let mark = mark.then_some([0xff, 0xfe]).into_iter().flatten();
-        mark.chain(text.flat_map(u16::to_le_bytes))
-            .collect::<Vec<u8>>()
-    };
-    let declared = |name: &str| {
-        format!("<?xml version='1.0' encoding='{name}'?><methodName>m</methodName>").into_bytes()
-    };
     vec![
         (
             "a document type",
@@ -289,11 +343,12 @@ pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
             "a document type",
             b"<!DOCTYPE a SYSTEM 'x'><methodName>m</methodName>".to_vec(),
         ),
-        ("UTF-16", utf16(true)),
-        ("UTF-16", utf16(false)),
-        ("an 8-bit encoding", declared("windows-1252")),
-        ("an 8-bit encoding", declared("latin-1")),
-        ("an 8-bit encoding", declared("utf8")),
+        ("UTF-16 without a byte order mark", utf16_of(DECLARED, &[])),
+        ("an 8-bit encoding", declared("koi8-r")),
+        (
+            "an 8-bit encoding",
+            [declared("cp1252"), b"<!-- \xe9 -->".to_vec()].concat(),
+        ),
         (
             "a byte order mark with another encoding",
             [b"\xef\xbb\xbf".to_vec(), declared("ISO-8859-1")].concat(),
@@ -306,10 +361,19 @@ pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
         ("a non-ASCII name", params("<aé/>")),
         ("a non-ASCII name", params("<a é='1'/>")),
         ("a non-ASCII name", params("<?é x?>")),
-        ("a non-ASCII number", value("<int>٣</int>")),
-        ("a non-ASCII number", value("<int>5\u{a0}</int>")),
-        ("a non-ASCII number", value("<double>٣.٥</double>")),
-        ("a bigdecimal", value("<bigdecimal>1.5</bigdecimal>")),
+        ("a non-ASCII space", value("<int>5\u{a0}</int>")),
+        (
+            "a digit that Python 2 does not know",
+            value("<int>\u{de7}</int>"),
+        ),
+        (
+            "a digit beyond the first plane",
+            value("<int>\u{1d7d0}</int>"),
+        ),
+        (
+            "a bigdecimal with an exponent",
+            value("<bigdecimal>1e5</bigdecimal>"),
+        ),
         (
             "a name that is not a string",
             value("<struct><int>1</int><value>x</value></struct>"),

@@ -17,7 +17,7 @@ use std::fmt::Write;
 
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{
-    Call, DecodeError, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
+    Call, DecodeError, Python, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
 };
 
 use cases::{any_value, double, mess, returnable, text};
@@ -31,6 +31,7 @@ fn notation(value: &Value) -> String {
         Value::Bool(truth) => format!("bool:{}", i32::from(*truth)),
         Value::Int(number) => format!("int:{number}"),
         Value::BigInt(digits) => format!("int:{digits}"),
+        Value::BigDecimal(text) => format!("decimal:{text}"),
         Value::Double(number) if number.is_nan() => "double:nan".to_owned(),
         Value::Double(number) => format!("double:{:016x}", number.to_bits()),
         Value::String(text) => format!("string:{}", hex(text.as_bytes())),
@@ -88,7 +89,7 @@ fn compare(peer: &mut Peer, verb: &str, document: &[u8]) -> Result<(), String> {
     if verb == "call"
         && let Some(ours) = decode_call(document)
             .err()
-            .and_then(|error| error.fault(document))
+            .and_then(|error| error.fault(document, Python::default()))
     {
         let theirs = peer.ask("fault", document);
         if ours != theirs {
@@ -139,7 +140,7 @@ fn faults_for_undecodable_calls_are_in_cpythons_words() {
         let Err(error) = decode_call(&document) else {
             continue;
         };
-        let Some(ours) = error.fault(&document) else {
+        let Some(ours) = error.fault(&document, Python::default()) else {
             continue;
         };
         known += 1;

@@ -5,6 +5,7 @@
     fault HEX   the text of the fault that a server answers to a request
     echo HEX    the answer, in hex, of a server whose method `echo` returns its parameter
 """
+import decimal
 import struct
 import sys
 import xmlrpc.client
@@ -28,6 +29,8 @@ def text(value):
             out.append("bool:%d" % v)
         elif type(v) is int:
             out.append("int:%d" % v)
+        elif type(v) is decimal.Decimal:
+            out.append("decimal:%s" % v)
         elif type(v) is float:
             bits = b"nan" if v != v else struct.pack(">d", v).hex().encode()
             out.append("double:" + bits.decode())

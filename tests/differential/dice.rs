@@ -2,6 +2,8 @@
 
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
+use crate::support::unordered;
+
 /// A splitmix64 random number generator.
 pub(crate) struct Dice(pub(crate) u64);
 
@@ -113,6 +115,7 @@ impl Dice {
             5 => Value::Base64(vec![0, 255, 10][..self.below(4)].to_vec()),
             6 | 7 if cast.unreturnable && self.once_in(3) => match self.below(2) {
                 0 => Value::Nil,
+                1 if !unordered() && self.once_in(3) => Value::BigDecimal("1.5".to_owned()),
                 _ => Value::BigInt(
                     self.pick(&["2147483648", "-5000000000", "99999999999999999999"])
                         .to_owned(),
@@ -299,7 +302,12 @@ impl Dice {
                         .is_none_or(|name| !NO_METHODS.contains(&name));
                     if callable {
                         let params = match self.value(cast, 1) {
-                            Value::BigInt(_) | Value::Nil => Value::Int(1),
+                            Value::BigInt(_) | Value::BigDecimal(_) | Value::Nil => Value::Int(1),
+                            // rosmaster takes the keys for parameters, in an order that only its Python knows.
+                            Value::Struct(mut keys) if unordered() => {
+                                keys.truncate(1);
+                                Value::Struct(keys)
+                            }
                             value => value,
                         };
                         entry.insert("params".to_owned(), params);

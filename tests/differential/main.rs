@@ -41,7 +41,6 @@ mod unreturnable;
 
 use std::io::Write;
 use std::path::Path;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use crashes::Tally;
@@ -111,7 +110,7 @@ fn play_or_shorten(
     // A failure by timeout is not a shorter form of this failure.
     let is_late = |why: &Failure| why.contains("there is never");
     let late = is_late(&first);
-    nodes::HURRIED.store(!late, Ordering::Relaxed);
+    nodes::HURRIED.set(!late);
     let mut why = first;
     let steps = shrink(&script.steps, simpler, PATIENCE, |steps: &[Step]| {
         let steps = steps.to_vec();

@@ -1,6 +1,6 @@
 //! Nodes that record every callback they get.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::cell::Cell;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -9,16 +9,15 @@ use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
 use crate::support::{FakeMaster, sorted, unordered};
 
-/// Whether a failure was found, and only a shorter script is searched for.
-pub(crate) static HURRIED: AtomicBool = AtomicBool::new(false);
+thread_local! {
+    /// Whether a failure was found, and only a shorter script is searched for. Each test has its own thread, and the
+    /// failure of one must not hurry the others.
+    pub(crate) static HURRIED: Cell<bool> = const { Cell::new(false) };
+}
 
 /// Longest wait for callbacks. rosmaster's notifier threads look for work ten times a second.
 pub(crate) fn patience() -> Duration {
-    Duration::from_secs(if HURRIED.load(Ordering::Relaxed) {
-        3
-    } else {
-        60
-    })
+    Duration::from_secs(if HURRIED.get() { 3 } else { 60 })
 }
 
 /// The calls of the health check.

@@ -241,6 +241,7 @@ fn to_json(value: &Value) -> Json {
         Value::Bool(truth) => json!(truth),
         Value::Int(number) => json!(number),
         Value::BigInt(digits) => json!({ "int": digits }),
+        Value::BigDecimal(text) => json!({ "decimal": text }),
         Value::Double(number) => json!({ "double": format!("{number:?}") }),
         Value::String(text) => json!(text),
         Value::DateTime(text) => json!({ "date": text }),
@@ -268,6 +269,7 @@ fn from_json(json: &Json) -> Value {
             let text = || value.as_str().expect(kind).to_owned();
             match kind.as_str() {
                 "int" => Value::BigInt(text()),
+                "decimal" => Value::BigDecimal(text()),
                 "double" => Value::Double(text().parse().unwrap()),
                 "date" => Value::DateTime(text()),
                 "base64" => {

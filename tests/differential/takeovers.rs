@@ -298,7 +298,7 @@ pub(crate) fn run(
     let result = rig
         .state()
         .and_then(|model| steps(script, nodes, &mut rig, model, tally));
-    if result.is_err() && !crate::nodes::HURRIED.load(Ordering::Relaxed) {
+    if result.is_err() && !crate::nodes::HURRIED.get() {
         for computer in &rig.computers {
             eprintln!("{}", computer.rescue.log());
         }

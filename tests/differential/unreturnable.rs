@@ -17,6 +17,7 @@ fn what_rosmaster_cannot_return_becomes_its_fault() {
         Value::Base64(b"abc".to_vec()),
         Value::Nil,
         Value::BigInt("2147483648".to_owned()),
+        Value::BigDecimal("1.5".to_owned()),
         Value::Array(Vec::new()),
         Value::Struct(Struct::new()),
     ];

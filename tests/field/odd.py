@@ -1,7 +1,10 @@
 #!/usr/bin/python3
 """Counts odd requests that rosrescue answers with the bytes of a bare rosmaster: forwarded, and while it stands in.
 
-    tests/field/odd.py ROSRESCUE      prints a table as Markdown, and the requests with another answer on standard error
+    tests/field/odd.py ROSRESCUE [ROSMASTER…]
+
+prints a table as Markdown, and the requests with another answer on standard error. ROSMASTER starts a master of another
+release, for example `chroot FOLDER rosmaster`.
 
 They are requests that no ROS client sends, but tools, scanners and other XML-RPC libraries do.
 """
@@ -16,6 +19,7 @@ import time
 import xmlrpc.client
 
 rosrescue = sys.argv[1]
+rosmaster = sys.argv[2:] or ["rosmaster"]
 
 METHODS = """getPid getUri shutdown registerPublisher unregisterPublisher registerSubscriber unregisterSubscriber
 registerService unregisterService lookupService lookupNode getPublishedTopics getTopicTypes getSystemState setParam
@@ -142,9 +146,9 @@ with tempfile.TemporaryDirectory() as scratch:
         processes = []
         try:
             bare, behind, ours = free_port(), free_port(), free_port()
-            begun, bare_pid = start("rosmaster", "--core", "-p", str(bare), port=bare)
+            begun, bare_pid = start(*rosmaster, "--core", "-p", str(bare), port=bare)
             processes.append(begun)
-            master, _ = start("rosmaster", "--core", "-p", str(behind), port=behind)
+            master, _ = start(*rosmaster, "--core", "-p", str(behind), port=behind)
             processes.append(master)
             command = [rosrescue, "proxy", "--master", "http://127.0.0.1:%d" % behind, "--listen", "127.0.0.1:%d" % ours]
             begun, _ = start(*command, "--checkpoint", os.path.join(scratch, title), "--hold", "1", port=ours)

@@ -30,12 +30,12 @@ pub(crate) fn request(first: &str, headers: &[&str], body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// A request in UTF-16 that sets `key` to `value`. rosmaster understands it and rosrescue does not.
+/// A request in UTF-16 without a byte order mark that sets `key` to `value`. rosmaster understands it and rosrescue does not.
 pub(crate) fn unreadable(key: &str, value: i32) -> Vec<u8> {
     let params = vec!["/test".into(), key.into(), value.into()];
     let call = String::from_utf8(encode_call("setParam", params)).unwrap();
     let (_, call) = call.split_once("?>").unwrap();
-    let call = format!("\u{feff}<?xml version='1.0' encoding='utf-16'?>{call}");
+    let call = format!("<?xml version='1.0' encoding='utf-16'?>{call}");
     let body: Vec<_> = call.encode_utf16().flat_map(u16::to_le_bytes).collect();
     http_request(&body)
 }

@@ -4,7 +4,8 @@
 //! * [`Request`]: a call, parsed once, with its [`Method`] and its [`Kind`].
 //!
 //! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that clients can
-//! see. Only errors that no ROS client causes have other texts than in rosmaster.
+//! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that no ROS client causes
+//! have other texts than in rosmaster.
 
 mod api;
 mod checks;
@@ -33,7 +34,7 @@ pub use names::CALLER_ID;
 pub use names::{name_for, param_name_for};
 pub use notice::{Notice, NoticeSink};
 pub use registry::{Node, Registrations, Registry};
-pub use request::{Entry, Request};
+pub use request::{Entry, Malformed, Request};
 pub use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};

@@ -6,14 +6,16 @@ mod error;
 mod json;
 mod number;
 mod prolog;
+mod python;
 mod scan;
 #[cfg(test)]
 mod tests;
 mod value;
 
-pub use decode::{MAX_DEPTH, decode_call, decode_reply};
+pub use decode::{MAX_DEPTH, decode_call, decode_call_for, decode_reply};
 pub use encode::{ListWriter, encode_call, encode_reply, encode_result};
 pub(crate) use encode::{MAX_REPLY_DEPTH, TOO_DEEP, refusal};
 pub use error::DecodeError;
 pub use prolog::without_doctype;
+pub use python::Python;
 pub use value::{Call, Reply, Struct, Value};

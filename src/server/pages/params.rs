@@ -144,6 +144,7 @@ impl ParamEntry {
             Value::Bool(_) => "bool",
             Value::Int(_) | Value::BigInt(_) => "int",
             Value::Double(_) => "double",
+            Value::BigDecimal(_) => "decimal",
             Value::String(_) => "str",
             Value::DateTime(_) => "date",
             Value::Base64(_) => "binary",
@@ -185,7 +186,7 @@ fn write(value: &Value, to: &mut String) {
         Value::Bool(truth) => to.push_str(if *truth { "true" } else { "false" }),
         Value::Int(number) => to.push_str(&number.to_string()),
         Value::Double(number) => to.push_str(&format!("{number:?}")),
-        Value::BigInt(text) | Value::DateTime(text) => to.push_str(text),
+        Value::BigInt(text) | Value::BigDecimal(text) | Value::DateTime(text) => to.push_str(text),
         Value::String(text) => {
             to.push('"');
             to.extend(text.chars().take(TEXT));

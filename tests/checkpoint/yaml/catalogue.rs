@@ -54,6 +54,7 @@ pub(crate) fn catalogue() -> Vec<Value> {
         ]
         .map(|digits| Value::BigInt(digits.to_owned())),
     );
+    values.extend(["1.5", "-0.250", "x"].map(|text| Value::BigDecimal(text.to_owned())));
     values.push(Value::BigInt("7".repeat(4_000)));
     values.push(Value::BigInt("7".repeat(5_000)));
     for odd in ["5", "-0", "007", "", "x", "1: {", "00000000000000000001"] {

@@ -27,7 +27,7 @@ def show(v):
     if t is dict: return '{' + ' '.join(show(k) + '=' + show(w) for k, w in v.items()) + '}'
     if t is list and len(v) == 1 and type(v[0]) is tuple:
         (kind, text), = v
-        return {'dateTime.iso8601': 'date:', 'int': 'digits:'}[kind] + text.encode().hex()
+        return {'dateTime.iso8601': 'date:', 'int': 'digits:', 'bigdecimal': 'decimal:'}[kind] + text.encode().hex()
     if t is list: return '[' + ' '.join(map(show, v)) + ']'
     raise TypeError(t)
 
@@ -58,6 +58,7 @@ fn shown(value: &Value) -> String {
             Ok(n) => format!("int:{n:#x}"),
             Err(_) => format!("digits:{}", hex(digits.as_bytes())),
         },
+        Value::BigDecimal(text) => format!("decimal:{}", hex(text.as_bytes())),
         Value::Double(n) if n.is_nan() => "nan".to_owned(),
         Value::Double(n) => format!("float:{:016x}", n.to_bits()),
         Value::String(text) => format!("str:{}", hex(text.as_bytes())),

@@ -144,7 +144,7 @@ fn deleting_an_unreadable_parameter_causes_no_divergence() {
     let nil = "<array><data><value><nil/></value></data></array>";
     let numbered = "<struct><member><value><int>1</int></value><value>x</value></member></struct>";
     for (prolog, value) in [
-        ("", "<bigdecimal>1.5</bigdecimal>"),
+        ("", "<bigdecimal>1.5e1</bigdecimal>"),
         ("<!DOCTYPE methodCall>", nil),
         ("<!DOCTYPE methodCall>", "<i8>99999999999</i8>"),
         // A dictionary with a number as a key.

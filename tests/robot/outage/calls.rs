@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{
     FakeNode, Mode, Robot, Rosmaster, State, encode_call, eventually, holds, http_request,
-    in_both_modes, kinds, params, tree, unreadable,
+    in_both_modes, kinds, params, request, tree, unreadable,
 };
 use rosrescue::xmlrpc::{Call, Value};
 
@@ -157,6 +157,7 @@ fn unusual_calls_during_an_outage_get_the_bytes_of_a_living_rosmaster() {
     for list in [
         Value::Int(1),
         Value::Array(vec![Value::Int(1)]),
+        Value::Array(vec!["x".into()]),
         Value::Array(vec![Value::Array(vec![])]),
         Value::Array(vec![tree! {}]),
         Value::Array(vec![tree! { "methodName" => "getPid" }]),
@@ -182,6 +183,8 @@ fn unusual_calls_during_an_outage_get_the_bytes_of_a_living_rosmaster() {
         "<int></int>",
         "<double>1,5</double>",
         "<boolean>true</boolean>",
+        "<int>\u{661}</int>",
+        "<base64>A</base64>",
         "<unknown>1</unknown>",
         "<struct><member><name>a</name></member></struct>",
         "&nbsp;",
@@ -205,6 +208,10 @@ fn unusual_calls_during_an_outage_get_the_bytes_of_a_living_rosmaster() {
         format!("{whole}more"),
         format!(" <?xml version='1.0'?>{whole}"),
         "<methodResponse><params/></methodResponse>".to_owned(),
+        whole.trim_end_matches('>').to_owned(),
+        "{}".to_owned(),
+        format!("<!ENTITY a 'b'>{whole}"),
+        format!("<?xml version='1.0' encoding='latin1'?>{whole}"),
     ] {
         requests.push(text.into_bytes());
     }
@@ -212,15 +219,25 @@ fn unusual_calls_during_an_outage_get_the_bytes_of_a_living_rosmaster() {
         requests.push(encode_call("getParam", params!["/n", key]));
     }
     requests.push(encode_call("deleteParam", params!["/n", "/v"]));
+    let units = whole.encode_utf16().flat_map(u16::to_le_bytes);
+    requests.push([0xff, 0xfe].into_iter().chain(units).collect());
+    let mut requests: Vec<_> = requests.iter().map(|body| http_request(body)).collect();
+    for (first, header) in [
+        ("POST /x HTTP/1.1", "X-A: b"),
+        ("POST /rpc2 HTTP/1.1", "X-A: b"),
+        ("POST / HTTP/1.1", "Content-Encoding: X"),
+        ("POST / HTTP/1.1", "Content-Encoding: gzip"),
+    ] {
+        requests.push(request(first, &[header], whole.as_bytes()));
+    }
     let mut differences = Vec::new();
-    for body in requests {
-        let request = http_request(&body);
+    for request in requests {
         let theirs = bare.client().exchange(&request).unwrap().text();
         let ours = client.exchange(&request);
         let ours = ours.map_or_else(|error| error.to_string(), |answer| answer.text());
         if ours != theirs {
-            let body = String::from_utf8_lossy(&body).into_owned();
-            differences.push(format!("{body}\n{theirs}\n{ours}"));
+            let request = String::from_utf8_lossy(&request).into_owned();
+            differences.push(format!("{request}\n{theirs}\n{ours}"));
         }
     }
     assert!(differences.is_empty(), "{}", differences.join("\n\n"));

@@ -97,7 +97,7 @@ impl<'a> Walk<'_, 'a> {
             call,
             reply,
             executed,
-            unordered: self.mirror.is_unordered(),
+            unordered: !self.mirror.python().keeps_order(),
         });
     }
 

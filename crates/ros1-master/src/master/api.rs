@@ -15,6 +15,9 @@ pub(crate) enum Failure {
     Refused(String),
     /// rosmaster raises a `TypeError`, which it answers with code -1. The text differs from rosmaster's.
     Type(&'static str),
+    /// rosmaster takes a member of a date or of binary data. Python 3 raises a `TypeError`, and Python 2, where these
+    /// are instances of old classes, an `AttributeError`. The text differs from rosmaster's.
+    Instance(&'static str),
     /// rosmaster raises an exception other than `TypeError`, which it answers with code 0. The text differs from
     /// rosmaster's.
     Internal(&'static str),
@@ -194,7 +197,7 @@ impl Master {
         match result {
             Ok(value) => match returnable::reply_error(&value) {
                 None => Reply::Value(value),
-                Some(text) => fault(text),
+                Some(text) => fault(&self.python.fault(text.to_owned())),
             },
             Err(text) => fault(&text),
         }
@@ -225,7 +228,7 @@ impl Master {
         // A node that only subscribes to parameters may have registered without rosrescue's knowledge. Only
         // `lookupNode` shows such a node.
         let hidden = *read.method() == Method::LookupNode && code != 1;
-        let in_some_order = self.unordered && shows_order(read.method(), &value);
+        let in_some_order = !self.python.keeps_order() && shows_order(read.method(), &value);
         (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
@@ -236,7 +239,7 @@ impl Master {
         notices: &mut dyn NoticeSink,
     ) -> Result<Value, String> {
         let Some(spec) = request.method().spec() else {
-            return Err(self.unsupported(request.method().name()));
+            return Err(self.python.fault(unsupported(request.method().name())));
         };
         let old = self.old == Some(true);
         let error = || match request.method() {
@@ -254,24 +257,15 @@ impl Master {
             }
             Ok(answer) => answer,
             Err(Failure::Refused(text)) => (-1, text, error()),
-            Err(Failure::Type(text)) => (-1, format!("Error: invalid arguments: {text}"), error()),
+            Err(Failure::Instance(text)) if self.python.is_two() => {
+                (0, format!("Internal failure: {text}"), error())
+            }
+            Err(Failure::Type(text) | Failure::Instance(text)) => {
+                (-1, format!("Error: invalid arguments: {text}"), error())
+            }
             Err(Failure::Internal(text)) => (0, format!("Internal failure: {text}"), error()),
         };
         Ok(Value::Array(vec![code.into(), message.into(), value]))
-    }
-
-    /// The text of the fault with which rosmaster answers an unknown method `name`.
-    fn unsupported(&self, name: &str) -> String {
-        let attribute = ATTRIBUTES.iter().find(|(attribute, _)| *attribute == name);
-        let (class, text) = match attribute {
-            None => ("Exception", format!("method \"{name}\" is not supported")),
-            Some((_, is_a)) => ("TypeError", format!("'{is_a}' object is not callable")),
-        };
-        // A master whose dictionaries have no order runs on Python 2.
-        match self.unordered {
-            true => format!("<type 'exceptions.{class}'>:{text}"),
-            false => format!("<class '{class}'>:{text}"),
-        }
     }
 
     /// Checks the number of parameters and the caller id, then runs the method, like rosmaster's `apivalidate`.
@@ -302,6 +296,14 @@ impl Master {
 /// Whether `reply` is an answer of the Master API with code 1, success.
 pub fn is_success(reply: &Reply) -> bool {
     matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
+}
+
+/// The text of the fault with which rosmaster on Python 3 answers an unknown method `name`.
+fn unsupported(name: &str) -> String {
+    match ATTRIBUTES.iter().find(|(attribute, _)| *attribute == name) {
+        None => format!("<class 'Exception'>:method \"{name}\" is not supported"),
+        Some((_, is_a)) => format!("<class 'TypeError'>:'{is_a}' object is not callable"),
+    }
 }
 
 fn refused(text: &str) -> MethodResult {

@@ -26,6 +26,7 @@ fn is_falsy(value: &Value) -> bool {
     match value {
         Value::Nil | Value::Bool(false) | Value::Int(0) => true,
         Value::Double(number) => *number == 0.0,
+        Value::BigDecimal(text) => !text.contains(|c: char| matches!(c, '1'..='9')),
         Value::Array(elements) => elements.is_empty(),
         Value::Struct(members) => members.is_empty(),
         _ => false,

@@ -34,7 +34,7 @@ impl Master {
             at.extend([index, 0]);
             let depth = at.len();
             let result = match entry {
-                Entry::Malformed(text) => return Err(text.to_string()),
+                Entry::Malformed(malformed) => return Err(malformed.fault(self.python)),
                 Entry::Refused(text) => Err((*text).to_owned()),
                 Entry::Request(request) if *request.method() == Method::Multicall => {
                     self.run_entries(request.entries(), notices, at)

@@ -1,9 +1,7 @@
 //! A call, parsed once: its method, its parameters, and the entries of a multicall.
 
-use std::borrow::Cow;
-
 use super::{Kind, Method};
-use crate::xmlrpc::{self, Call, DecodeError, Value};
+use crate::xmlrpc::{self, Call, DecodeError, Python, Value};
 
 /// Deepest nesting of multicalls that is parsed. A decoded document cannot contain more, because each multicall takes
 /// three of its levels.
@@ -42,8 +40,58 @@ pub enum Entry {
     /// An entry that is answered with a fault. This is the fault's text.
     Refused(&'static str),
     /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is always the
-    /// last entry of its multicall. The text is rosmaster's only if it starts with `<`.
-    Malformed(Cow<'static, str>),
+    /// last entry of its multicall.
+    Malformed(Malformed),
+}
+
+/// Why a multicall fails as a whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Malformed {
+    /// It does not have exactly one parameter.
+    Arity,
+    /// Its parameter is of this Python type, which has no elements.
+    NoList(&'static str),
+    /// An entry is of this Python type, which has no members.
+    NoStruct(&'static str),
+    /// An entry lacks this member.
+    Lacks(&'static str),
+}
+
+impl Malformed {
+    /// The text of the fault with which a master on this version of Python answers. For [`Self::Arity`] it is not
+    /// rosmaster's.
+    pub(crate) fn fault(self, python: Python) -> String {
+        let two = python.is_two();
+        python.fault(match self {
+            Self::Arity => "system.multicall takes one list".to_owned(),
+            Self::Lacks(member) => format!("<class 'KeyError'>:'{member}'"),
+            Self::NoList("Binary" | "DateTime") if two => {
+                "<class 'TypeError'>:iteration over non-sequence".to_owned()
+            }
+            Self::NoList(is_a) => format!("<class 'TypeError'>:'{is_a}' object is not iterable"),
+            Self::NoStruct("str") => {
+                let not = match python {
+                    _ if two => ", not str",
+                    _ if python >= Python::new(3, 11, 0) => ", not 'str'",
+                    _ => "",
+                };
+                format!("<class 'TypeError'>:string indices must be integers{not}")
+            }
+            Self::NoStruct("list") => {
+                let or = if two { "" } else { " or slices" };
+                format!("<class 'TypeError'>:list indices must be integers{or}, not str")
+            }
+            Self::NoStruct(is_a @ ("Binary" | "DateTime")) if two => {
+                format!("<class 'AttributeError'>:{is_a} instance has no attribute '__getitem__'")
+            }
+            Self::NoStruct(is_a) if two => {
+                format!("<class 'TypeError'>:'{is_a}' object has no attribute '__getitem__'")
+            }
+            Self::NoStruct(is_a) => {
+                format!("<class 'TypeError'>:'{is_a}' object is not subscriptable")
+            }
+        })
+    }
 }
 
 impl Request {
@@ -77,6 +125,15 @@ impl Request {
     /// The errors of [`xmlrpc::decode_call`].
     pub fn decode(body: &[u8]) -> Result<Self, DecodeError> {
         xmlrpc::decode_call(body).map(Self::from)
+    }
+
+    /// Decodes and parses the body of a call as a master on this version of Python does.
+    ///
+    /// # Errors
+    ///
+    /// The errors of [`xmlrpc::decode_call`].
+    pub fn decode_for(body: &[u8], python: Python) -> Result<Self, DecodeError> {
+        xmlrpc::decode_call_for(body, python).map(Self::from)
     }
 
     fn parse(method: Method, params: Vec<Value>, depth: usize) -> Self {
@@ -156,7 +213,7 @@ impl Request {
             Method::Multicall => self.entries.iter().all(|entry| match entry {
                 Entry::Request(request) => request.is_answerable(),
                 Entry::Refused(_) => false,
-                Entry::Malformed(text) => text.starts_with('<'),
+                Entry::Malformed(malformed) => *malformed != Malformed::Arity,
             }),
             // rosmaster refuses a `shutdown` that does not have exactly two parameters, or whose caller id is not a
             // string.
@@ -206,12 +263,11 @@ impl From<Request> for Call {
 /// The entries of a multicall with these parameters, up to and including the first malformed one.
 fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
     let Ok([list]) = <[Value; 1]>::try_from(params) else {
-        return vec![Entry::Malformed("system.multicall takes one list".into())];
+        return vec![Entry::Malformed(Malformed::Arity)];
     };
     let is_a = list.python_type();
     let Some(list) = items(list) else {
-        let text = format!("<class 'TypeError'>:'{is_a}' object is not iterable");
-        return vec![Entry::Malformed(text.into())];
+        return vec![Entry::Malformed(Malformed::NoList(is_a))];
     };
     let mut entries = Vec::with_capacity(list.len());
     for element in list {
@@ -227,25 +283,13 @@ impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
         let mut members = match element {
             Value::Struct(members) => members,
-            // For a string, rosmaster's error depends on the Python version.
-            Value::String(_) => {
-                return Self::Malformed("an entry of a multicall is a string".into());
-            }
-            Value::Array(_) => {
-                let text = "<class 'TypeError'>:list indices must be integers or slices, not str";
-                return Self::Malformed(text.into());
-            }
-            other => {
-                let is_a = other.python_type();
-                let text = format!("<class 'TypeError'>:'{is_a}' object is not subscriptable");
-                return Self::Malformed(text.into());
-            }
+            other => return Self::Malformed(Malformed::NoStruct(other.python_type())),
         };
         let Some(name) = members.swap_remove("methodName") else {
-            return Self::Malformed("<class 'KeyError'>:'methodName'".into());
+            return Self::Malformed(Malformed::Lacks("methodName"));
         };
         let Some(params) = members.swap_remove("params") else {
-            return Self::Malformed("<class 'KeyError'>:'params'".into());
+            return Self::Malformed(Malformed::Lacks("params"));
         };
         let Value::String(name) = name else {
             return Self::Refused("the method name of an entry is not a string");
@@ -329,9 +373,85 @@ mod tests {
         let inner = Request::multicall([call("setParam"), call("getParam")]);
         assert!(Request::multicall([inner]).is_answerable());
         assert!(multicall(vec![Value::Int(1)]).is_answerable());
-        assert!(!multicall(vec!["text".into()]).is_answerable());
+        assert!(multicall(vec!["text".into()]).is_answerable());
+        let no_list = Request::from(Call::new("system.multicall", vec![]));
+        assert!(!no_list.is_answerable());
         let set = |value: Value| Request::new(Method::SetParam, ["/n".into(), "/a".into(), value]);
         assert!(set(vec![Value::Nil].into()).is_answerable());
+    }
+
+    /// Measured with Python 2.7.11, 3.10.4 and 3.11.2.
+    #[test]
+    fn a_malformed_multicall_is_refused_in_the_words_of_each_python() {
+        let fault = |list: Value, version: (u32, u32)| {
+            let call = Request::from(Call::new("system.multicall", vec![list]));
+            let mut master = super::super::Master::default();
+            master.set_python(Python::new(version.0, version.1, 0));
+            match master.apply(&call).reply {
+                xmlrpc::Reply::Fault { text, .. } => text,
+                xmlrpc::Reply::Value(value) => format!("{value:?}"),
+            }
+        };
+        let of = |entry: Value| Value::Array(vec![entry]);
+        for (list, python, text) in [
+            (
+                of("x".into()),
+                (2, 7),
+                "<type 'exceptions.TypeError'>:string indices must be integers, not str",
+            ),
+            (
+                of("x".into()),
+                (3, 10),
+                "<class 'TypeError'>:string indices must be integers",
+            ),
+            (
+                of("x".into()),
+                (3, 11),
+                "<class 'TypeError'>:string indices must be integers, not 'str'",
+            ),
+            (
+                of(1.into()),
+                (2, 7),
+                "<type 'exceptions.TypeError'>:'int' object has no attribute '__getitem__'",
+            ),
+            (
+                of(1.into()),
+                (3, 8),
+                "<class 'TypeError'>:'int' object is not subscriptable",
+            ),
+            (
+                of(of(1.into())),
+                (2, 7),
+                "<type 'exceptions.TypeError'>:list indices must be integers, not str",
+            ),
+            (
+                of(of(1.into())),
+                (3, 8),
+                "<class 'TypeError'>:list indices must be integers or slices, not str",
+            ),
+            (
+                of(Value::Base64(vec![])),
+                (2, 7),
+                "<type 'exceptions.AttributeError'>:Binary instance has no attribute '__getitem__'",
+            ),
+            (
+                of(Value::Struct(Struct::new())),
+                (2, 7),
+                "<type 'exceptions.KeyError'>:'methodName'",
+            ),
+            (
+                1.into(),
+                (2, 7),
+                "<type 'exceptions.TypeError'>:'int' object is not iterable",
+            ),
+            (
+                Value::DateTime("x".into()),
+                (2, 7),
+                "<type 'exceptions.TypeError'>:iteration over non-sequence",
+            ),
+        ] {
+            assert_eq!(fault(list.clone(), python), text, "{list:?} {python:?}");
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::registry::{Node, Registry, SharedRegistration};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
 use super::{Method, Request, names};
-use crate::xmlrpc::{Reply, Struct, Value};
+use crate::xmlrpc::{Python, Reply, Struct, Value};
 
 /// A complete master without IO: holds the state of a rosmaster and answers calls by [`Master::apply`].
 ///
@@ -27,8 +27,8 @@ pub struct Master {
     /// Whether a value is stored differently than in rosmaster, so that answers may differ. No ROS client sends a value
     /// that causes this.
     pub(crate) inexact: bool,
-    /// Whether the modelled master has unordered dictionaries, as on Python 2.
-    pub(crate) unordered: bool,
+    /// The version of Python on which the modelled master runs.
+    pub(crate) python: Python,
     /// Whether the modelled master behaves like rosmaster 1.14.3 and earlier. `None` if unknown.
     pub(crate) old: Option<bool>,
     pub(crate) pid: i32,
@@ -134,7 +134,7 @@ impl Master {
         Self {
             params: self.params.clone(),
             inexact: self.inexact,
-            unordered: self.unordered,
+            python: self.python,
             old: self.old,
             ..Self::default()
         }
@@ -150,14 +150,14 @@ impl Master {
         self.inexact = inexact;
     }
 
-    /// Sets whether the modelled master has unordered dictionaries, as on Python 2.
-    pub fn set_unordered(&mut self, unordered: bool) {
-        self.unordered = unordered;
+    /// Sets the version of Python on which the modelled master runs. Faults and the order of dictionaries depend on it.
+    pub fn set_python(&mut self, python: Python) {
+        self.python = python;
     }
 
-    /// The value set by [`Self::set_unordered`]. Ignored when two masters are compared.
-    pub fn is_unordered(&self) -> bool {
-        self.unordered
+    /// The version set by [`Self::set_python`]. Ignored when two masters are compared.
+    pub fn python(&self) -> Python {
+        self.python
     }
 
     /// Sets whether the modelled master behaves like rosmaster 1.14.3 and earlier. Such a master also notifies the node

@@ -10,6 +10,8 @@ use crate::xmlrpc::{Struct, Value};
 /// The value of a deleted parameter in a `paramUpdate`.
 pub(crate) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
+const HOLDS_SLASH: &str = "a member's name holds a slash";
+
 /// A `paramUpdate` to the subscribers of one key. Its value is the value that the call sets, a part of that value, or
 /// [`GONE`].
 pub(crate) struct Update<'a> {
@@ -118,8 +120,9 @@ fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
         Value::Struct(members) => {
             let member = members.get(part);
-            member.ok_or(Failure::Internal("a member's name holds a slash"))
+            member.ok_or(Failure::Internal(HOLDS_SLASH))
         }
-        _ => Err(Failure::Type("a member's name holds a slash")),
+        Value::DateTime(_) | Value::Base64(_) => Err(Failure::Instance(HOLDS_SLASH)),
+        _ => Err(Failure::Type(HOLDS_SLASH)),
     })
 }

@@ -8,6 +8,7 @@ use std::borrow::Cow;
 use super::error::{DecodeError, NO_METHOD, NOTHING, TEXT_CHARS_MAX};
 use super::number;
 use super::prolog::text_of;
+use super::python::Python;
 use super::scan::{Event, LineEnds, Scanner};
 use super::value::{Call, Reply, Struct, Value};
 
@@ -22,7 +23,7 @@ pub const MAX_DEPTH: usize = 512;
 /// The remaining elements are for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
-/// Decodes a request.
+/// Decodes a request as the default [`Python`] does.
 ///
 /// ```
 /// use ros1_master::xmlrpc::{Value, decode_call};
@@ -39,8 +40,17 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 ///
 /// Where CPython raises an exception, and in the few cases listed at [`DecodeError`].
 pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
+    decode_call_for(body, Python::default())
+}
+
+/// Decodes a request as this version of Python does. Python 2 knows fewer types.
+///
+/// # Errors
+///
+/// Those of [`decode_call`].
+pub fn decode_call_for(body: &[u8], python: Python) -> Result<Call, DecodeError> {
     let wanted = "call";
-    let document = unmarshal(body, wanted, Writer::Any)?;
+    let document = unmarshal(body, wanted, Writer::Any, python)?;
     if document.is_fault {
         let what = "it is a fault";
         return Err(DecodeError::Shape { wanted, what });
@@ -64,7 +74,7 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
 /// [`DecodeError`].
 pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     let wanted = "reply";
-    let document = unmarshal(body, wanted, Writer::Python)?;
+    let document = unmarshal(body, wanted, Writer::Python, Python::default())?;
     let mut values = document.values.into_iter();
     let (Some(value), None) = (values.next(), values.next()) else {
         let what = "it does not hold exactly one value";
@@ -111,7 +121,12 @@ enum Writer {
     Python,
 }
 
-fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Document, DecodeError> {
+fn unmarshal(
+    body: &[u8],
+    wanted: &'static str,
+    writer: Writer,
+    python: Python,
+) -> Result<Document, DecodeError> {
     let text = text_of(body)?;
     let line_ends = match writer {
         Writer::Any => LineEnds::Normal,
@@ -120,6 +135,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
     let mut scanner = Scanner::new(&text, MAX_OPEN, line_ends);
     let mut machine = Unmarshaller {
         writer,
+        python,
         ..Unmarshaller::default()
     };
     while let Some(event) = scanner.next()? {
@@ -175,8 +191,9 @@ enum Tag {
 
 impl Tag {
     /// The element with this name, without its namespace prefix.
-    fn named(name: &str) -> Option<Self> {
+    fn named(name: &str, python: Python) -> Option<Self> {
         Some(match name {
+            "i1" | "i2" | "biginteger" | "float" | "bigdecimal" if python.is_two() => return None,
             "value" => Self::Value,
             "string" | "name" => Self::Text,
             "i1" | "i2" | "i4" | "i8" | "int" | "biginteger" => Self::Int,
@@ -196,9 +213,12 @@ impl Tag {
     }
 }
 
-/// Removes the namespace prefix from a name.
-fn local(name: &str) -> &str {
-    name.rsplit_once(':').map_or(name, |(_, local)| local)
+/// Removes the namespace prefix from a name. Python 2 does not know prefixes.
+fn local(name: &str, python: Python) -> &str {
+    match name.rsplit_once(':') {
+        Some((_, local)) if !python.is_two() => local,
+        _ => name,
+    }
 }
 
 #[derive(Default)]
@@ -213,14 +233,15 @@ struct Unmarshaller<'a> {
     /// Whether a `<value>` is open without an element in it so far. Then its text is an untyped string.
     is_bare: bool,
     writer: Writer,
+    python: Python,
     /// Whether references in this element are plain text, because the writer does not escape its content.
     is_unescaped: bool,
 }
 
 impl Unmarshaller<'_> {
     fn start(&mut self, name: &str, at: usize) -> Result<(), DecodeError> {
-        let name = local(name);
-        let tag = Tag::named(name);
+        let name = local(name, self.python);
+        let tag = Tag::named(name, self.python);
         if matches!(tag, Some(Tag::Array | Tag::Struct)) {
             if self.marks.len() >= MAX_DEPTH {
                 let limit = MAX_DEPTH;
@@ -230,7 +251,7 @@ impl Unmarshaller<'_> {
         }
         self.text = Cow::Borrowed("");
         self.is_unescaped = self.writer == Writer::Python && tag == Some(Tag::DateTime);
-        if self.is_bare && tag.is_none() {
+        if self.is_bare && tag.is_none() && !self.python.ignores_unknown_types() {
             let tag = name.to_owned();
             return Err(DecodeError::UnknownType { at, tag });
         }
@@ -239,7 +260,7 @@ impl Unmarshaller<'_> {
     }
 
     fn end(&mut self, name: &str, at: usize) -> Result<(), DecodeError> {
-        let Some(tag) = Tag::named(local(name)) else {
+        let Some(tag) = Tag::named(local(name, self.python), self.python) else {
             return Ok(());
         };
         let value = match tag {
@@ -263,7 +284,7 @@ impl Unmarshaller<'_> {
                 Value::Array(self.stack.split_off(mark))
             }
             Tag::Struct => self.end_struct(at)?,
-            _ => scalar(tag, &self.text, at)?,
+            _ => scalar(tag, &self.text, self.python, at)?,
         };
         self.stack.push(value);
         self.is_bare = false;
@@ -292,7 +313,7 @@ impl Unmarshaller<'_> {
 }
 
 /// The value of a scalar element with this text.
-fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
+fn scalar(tag: Tag, text: &str, python: Python, at: usize) -> Result<Value, DecodeError> {
     let (value, tag) = match tag {
         Tag::Text => return Ok(Value::String(text.to_owned())),
         Tag::DateTime => return Ok(Value::DateTime(text.trim().to_owned())),
@@ -306,14 +327,26 @@ fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
             (value, "boolean")
         }
         Tag::Base64 if text.is_ascii() => (number::base64_bytes(text).map(Value::Base64), "base64"),
-        Tag::Int | Tag::Double if !text.is_ascii() => {
-            let what = "a number with non-ASCII characters";
-            return Err(DecodeError::Unsupported { at, what });
+        Tag::Int | Tag::Double => {
+            let Some(text) = number::ascii_digits(text) else {
+                let what = "a number with non-ASCII characters that are no digits";
+                return Err(DecodeError::Unsupported { at, what });
+            };
+            let has_underscores = python.has_underscores();
+            let text = Some(text).filter(|text| has_underscores || !text.contains('_'));
+            match tag {
+                Tag::Int => (text.and_then(|text| number::int(&text)), "int"),
+                _ => {
+                    let number = text.and_then(|text| number::float(&text));
+                    (number.map(Value::Double), "double")
+                }
+            }
         }
-        Tag::Int => (number::int(text), "int"),
-        Tag::Double => (number::float(text).map(Value::Double), "double"),
+        Tag::BigDecimal if number::is_plain_decimal(text) => {
+            return Ok(Value::BigDecimal(text.to_owned()));
+        }
         Tag::BigDecimal => {
-            let what = "a bigdecimal";
+            let what = "a bigdecimal other than digits with a point";
             return Err(DecodeError::Unsupported { at, what });
         }
         _ => (None, "base64"),

@@ -287,6 +287,7 @@ impl Writer {
                 self.leaf(if compact { "i4" } else { "int" }, &number.to_string());
             }
             Value::BigInt(digits) => self.leaf("i8", digits),
+            Value::BigDecimal(text) => self.leaf("bigdecimal", text),
             Value::Double(number) => self.leaf("double", &repr(*number)),
             Value::String(text) if compact => {
                 self.raw("<value>");
@@ -328,6 +329,9 @@ pub(crate) fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
         _ if depth > MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
         Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
+        Value::BigDecimal(_) => {
+            Some("<class 'TypeError'>:cannot marshal <class 'decimal.Decimal'> objects")
+        }
         // Python makes more nested function calls for these types.
         Value::Double(_) | Value::DateTime(_) if depth >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(TOO_DEEP),

@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use super::python::Python;
+
 /// Maximum number of characters of a value's text in an error.
 pub(super) const TEXT_CHARS_MAX: usize = 40;
 // Reasons from which expat's own error text can be derived.
@@ -14,10 +16,17 @@ pub(super) const BAD_REFERENCE: &str = "a reference to an unknown entity or char
 pub(super) const LATE_DECLARATION: &str = "an XML declaration after the start of the document";
 pub(super) const OTHER_END: &str = "an end tag that does not match its start tag";
 pub(super) const BAD_MARKUP: &str = "markup that is not closed or not allowed here";
+pub(super) const MARKUP_OUTSIDE: &str =
+    "markup outside of the root element that is not closed or not allowed there";
 /// The document has no element that CPython knows.
 pub(super) const NOTHING: &str = "it has no params, fault or methodName";
 /// The call has parameters but no method name.
 pub(super) const NO_METHOD: &str = "it has no method name";
+
+/// ASCII characters with which nothing begins that may stand outside of an element.
+const NO_TOKEN: [char; 16] = [
+    '!', '$', '*', '+', '/', ';', '=', '?', '@', '\\', '^', '`', '{', '}', '~', '\u{7f}',
+];
 
 /// Why a document was not decoded. Either CPython would raise an exception too, or it would accept something that is
 /// not decoded here on purpose (see [`DecodeError::Unsupported`]).
@@ -73,18 +82,23 @@ pub enum DecodeError {
 }
 
 impl DecodeError {
-    /// The fault text with which rosmaster on Python 3 answers `body`, which was not decoded because of this
-    /// error. `None` if the text depends on the Python version or is not known here.
-    pub fn fault(&self, body: &[u8]) -> Option<String> {
+    /// The fault text with which rosmaster on this version of Python answers `body`, which was not decoded because of
+    /// this error. `None` if the text is not known here.
+    pub fn fault(&self, body: &[u8], python: Python) -> Option<String> {
         let (class, text) = match self {
             Self::BadText { tag, text, .. } => match *tag {
                 "int" => {
-                    let text = repr(text)?;
+                    // Python 2 skips leading spaces before it quotes the text.
+                    let text = match python.is_two() && !text.trim().is_empty() {
+                        true => repr(text.trim_start())?,
+                        false => repr(text)?,
+                    };
                     (
                         "ValueError",
                         format!("invalid literal for int() with base 10: {text}"),
                     )
                 }
+                "double" if python.is_two() => ("ValueError", no_float_of_2(text)?),
                 "double" => {
                     let text = repr(text)?;
                     (
@@ -92,12 +106,22 @@ impl DecodeError {
                         format!("could not convert string to float: {text}"),
                     )
                 }
+                "base64" => ("binascii.Error", no_base64(text, python)?),
                 "boolean" => ("TypeError", "bad boolean value".to_owned()),
                 "struct" => ("IndexError", "list index out of range".to_owned()),
                 _ => return None,
             },
             Self::UnknownType { tag, .. } => {
-                let text = format!("ResponseError(\"unknown tag {}\")", repr(tag)?);
+                let unicode = if python.is_two() { "u" } else { "" };
+                let comma = if python < Python::new(3, 7, 0) {
+                    ","
+                } else {
+                    ""
+                };
+                let text = format!(
+                    "ResponseError(\"unknown tag {unicode}{}\"{comma})",
+                    repr(tag)?
+                );
                 ("xmlrpc.client.ResponseError", text)
             }
             Self::Shape { what: NOTHING, .. } => {
@@ -112,8 +136,38 @@ impl DecodeError {
             ),
             _ => return None,
         };
-        Some(format!("<class '{class}'>:{text}"))
+        Some(python.fault(format!("<class '{class}'>:{text}")))
     }
+}
+
+/// Python 2's complaint about a text that is no number.
+fn no_float_of_2(text: &str) -> Option<String> {
+    repr(text)?;
+    let text = text.trim_start();
+    let begins_with_one = (1..text.len())
+        .filter_map(|end| text.get(..end))
+        .any(|part| part.parse::<f64>().is_ok());
+    let complaint = match begins_with_one {
+        true => "invalid literal for float()",
+        false => "could not convert string to float",
+    };
+    Some(format!("{complaint}: {text}"))
+}
+
+/// Python's complaint about a text that is not base64.
+fn no_base64(text: &str, python: Python) -> Option<String> {
+    // The text may have been shortened, or hold characters for which there is another complaint.
+    if text.len() >= TEXT_CHARS_MAX || !text.is_ascii() {
+        return None;
+    }
+    let is_data = |byte: &u8| byte.is_ascii_alphanumeric() || matches!(byte, b'+' | b'/');
+    let count = text.bytes().filter(is_data).count();
+    Some(match count % 4 == 1 && python >= Python::new(3, 7, 0) {
+        true => format!(
+            "Invalid base64-encoded string: number of data characters ({count}) cannot be 1 more than a multiple of 4"
+        ),
+        false => "Incorrect padding".to_owned(),
+    })
 }
 
 /// Expat's error text for the problem `what` at byte `at`.
@@ -129,6 +183,9 @@ fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
     let (text, at) = match what {
         NO_ELEMENT | NOT_CLOSED => ("no element found", body.len()),
         SECOND_ROOT if is_name(rest.get(1..2)?) => ("junk after document element", at),
+        TEXT_BEFORE_ROOT | TEXT_AFTER_ROOT if word.starts_with(NO_TOKEN) => {
+            ("not well-formed (invalid token)", word_at)
+        }
         TEXT_AFTER_ROOT if is_word(word) => ("junk after document element", word_at),
         TEXT_BEFORE_ROOT if is_word(word) => ("syntax error", word_at),
         BAD_REFERENCE if is_name(inside(rest, "&", ";")?) => ("undefined entity", at),
@@ -141,13 +198,11 @@ fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
         OTHER_END if is_name(inside(rest, "</", ">")?.trim_ascii_end()) => {
             ("mismatched tag", at + "</".len())
         }
-        BAD_MARKUP
-            if rest
-                .strip_prefix('<')
-                .is_some_and(|name| name.is_empty() || is_name(name)) =>
-        {
-            ("unclosed token", at)
+        MARKUP_OUTSIDE if is_declaration(rest) && is_before_root(body.get(..at)?) => {
+            ("syntax error", at)
         }
+        BAD_MARKUP | MARKUP_OUTSIDE if is_begun(rest.strip_prefix('<')?) => ("unclosed token", at),
+        BAD_MARKUP if is_begun(rest.strip_prefix("</")?) => ("unclosed token", at),
         _ => return None,
     };
     let before = body.get(..at)?;
@@ -161,6 +216,16 @@ fn is_before_root(text: &str) -> bool {
     text.trim_ascii().is_empty() || text.starts_with("<?xml ") && text.matches('<').count() == 1
 }
 
+/// Whether `text` starts with a declaration such as `<!ENTITY a 'b'>`, which belongs into a document type.
+fn is_declaration(text: &str) -> bool {
+    let mut words = text
+        .strip_prefix("<!")
+        .into_iter()
+        .flat_map(|rest| rest.split_ascii_whitespace());
+    let is_word = |word: &str| word.bytes().all(|byte| byte.is_ascii_alphabetic());
+    words.next().is_some_and(is_word) && words.next().is_some()
+}
+
 /// The part of `text` after `begin`, with which `text` must start, up to the next `end`.
 fn inside<'t>(text: &'t str, begin: &str, end: &str) -> Option<&'t str> {
     Some(text.strip_prefix(begin)?.split_once(end)?.0)
@@ -170,6 +235,11 @@ fn inside<'t>(text: &'t str, begin: &str, end: &str) -> Option<&'t str> {
 fn is_name(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic())
         && text.bytes().all(|b| b.is_ascii_alphanumeric())
+}
+
+/// Whether this is empty or may be the begin of a name.
+fn is_begun(text: &str) -> bool {
+    text.is_empty() || is_name(text)
 }
 
 /// Whether `text` starts with a name that is followed by white space or the end.

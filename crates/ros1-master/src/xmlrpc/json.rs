@@ -5,7 +5,7 @@ use serde::{Serialize, Serializer};
 
 use super::{Struct, Value};
 
-/// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, infinities and NaN become strings,
+/// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, decimal numbers, infinities and NaN become strings,
 /// because JSON lacks them.
 impl Serialize for Value {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
@@ -15,9 +15,10 @@ impl Serialize for Value {
             Self::Int(number) => to.serialize_i32(*number),
             Self::Double(number) if !number.is_finite() => to.collect_str(number),
             Self::Double(number) => to.serialize_f64(*number),
-            Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => {
-                to.serialize_str(text)
-            }
+            Self::BigInt(text)
+            | Self::BigDecimal(text)
+            | Self::String(text)
+            | Self::DateTime(text) => to.serialize_str(text),
             Self::Base64(bytes) => {
                 to.serialize_str(&base64::engine::general_purpose::STANDARD.encode(bytes))
             }

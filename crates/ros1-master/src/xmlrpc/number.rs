@@ -1,5 +1,7 @@
 //! Reads and writes numbers and binary data as Python does.
 
+use std::borrow::Cow;
+
 use super::value::Value;
 
 /// Maximum number of digits that Python's `int()` accepts in text, including leading zeros
@@ -8,6 +10,33 @@ const MAX_DIGITS: usize = 4300;
 
 /// The white space that Python strips from a number, as far as ASCII and XML have it.
 const SPACE: [char; 4] = [' ', '\t', '\n', '\r'];
+
+/// Decimal digits outside of ASCII: the zero of each script in the first plane that Python 2.7 knows, and so every later
+/// Python. The other nine follow it.
+const ZEROS: &[char] = &[
+    '\u{660}', '\u{6f0}', '\u{7c0}', '\u{966}', '\u{9e6}', '\u{a66}', '\u{ae6}', '\u{b66}',
+    '\u{be6}', '\u{c66}', '\u{ce6}', '\u{d66}', '\u{e50}', '\u{ed0}', '\u{f20}', '\u{1040}',
+    '\u{1090}', '\u{17e0}', '\u{1810}', '\u{1946}', '\u{19d0}', '\u{1a80}', '\u{1a90}', '\u{1b50}',
+    '\u{1bb0}', '\u{1c40}', '\u{1c50}', '\u{a620}', '\u{a8d0}', '\u{a900}', '\u{a9d0}', '\u{aa50}',
+    '\u{abf0}', '\u{ff10}',
+];
+
+/// `text` with ASCII digits in place of the digits of other scripts, as Python reads numbers. `None` if another
+/// character is not ASCII.
+pub(super) fn ascii_digits(text: &str) -> Option<Cow<'_, str>> {
+    if text.is_ascii() {
+        return Some(Cow::Borrowed(text));
+    }
+    let digit = |character: char| {
+        let zero = ZEROS.iter().rev().find(|&&zero| zero <= character)?;
+        char::from_digit(u32::from(character) - u32::from(*zero), 10)
+    };
+    let ascii = |character: char| match character.is_ascii() {
+        true => Some(character),
+        false => digit(character),
+    };
+    text.chars().map(ascii).collect()
+}
 
 /// Python's `int(text)`, for ASCII text.
 pub(super) fn int(text: &str) -> Option<Value> {
@@ -49,6 +78,14 @@ pub(super) fn float(text: &str) -> Option<f64> {
             .ok()?,
     };
     Some(if number.is_nan() { f64::NAN } else { number })
+}
+
+/// Whether `text` is a decimal number of digits, at most one point, and a sign. Python's `Decimal` accepts more.
+pub(super) fn is_plain_decimal(text: &str) -> bool {
+    let number = text.strip_prefix(['-', '+']).unwrap_or(text);
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
+    let digits = [whole, fraction].concat();
+    !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 /// `text` without its underscores. `None` if one of them is not between two digits.

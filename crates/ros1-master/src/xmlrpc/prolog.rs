@@ -12,19 +12,24 @@ use super::scan::{checked_attributes, is_in_xml};
 ///
 /// # Errors
 ///
-/// For an encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, and CPython all 8-bit codecs),
-/// for bytes that are not valid in it, for characters that XML does not allow, and for a bad declaration.
+/// For an encoding other than UTF-8, UTF-16 with a byte order mark, US-ASCII and ISO-8859-1 (CPython knows all 8-bit
+/// codecs), for bytes that are not valid in it, for characters that XML does not allow, and for a bad declaration.
 pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
+    if let Some(text) = utf16(body)? {
+        return Ok(Cow::Owned(allowed(text)?));
+    }
     let encoding = match Reader::from_reader(body).read_event() {
         Ok(Event::Decl(declaration)) => declared(&declaration)?,
         _ => None,
     };
     let name = encoding.unwrap_or_else(|| "UTF-8".to_owned());
+    let known = name.to_ascii_uppercase();
+    let known = of_python(&known).unwrap_or(&known);
     let not_text = |at, encoding| DecodeError::NotText { at, encoding };
     let marked = body.strip_prefix("\u{feff}".as_bytes());
     let body = marked.unwrap_or(body);
     let utf8 = || std::str::from_utf8(body).map_err(|e| not_text(e.valid_up_to(), "UTF-8"));
-    let text = match name.to_ascii_uppercase().as_str() {
+    let text = match known {
         "UTF-8" => Cow::Borrowed(utf8()?),
         _ if marked.is_some() => return Err(DecodeError::Encoding { name }),
         "US-ASCII" => match body.iter().position(|b| !b.is_ascii()) {
@@ -33,15 +38,65 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
         },
         "ISO-8859-1" if body.is_ascii() => Cow::Borrowed(utf8()?),
         "ISO-8859-1" => body.iter().map(|&b| char::from(b)).collect(),
+        "WINDOWS-1252" if body.is_ascii() => Cow::Borrowed(utf8()?),
         _ => return Err(DecodeError::Encoding { name }),
     };
+    allowed(text)
+}
+
+/// Returns `text` if XML allows all its characters.
+fn allowed<T: AsRef<str>>(text: T) -> Result<T, DecodeError> {
     // A second byte order mark is text, but quick-xml would skip it.
-    let second = text.starts_with('\u{feff}').then_some(0);
-    if let Some(at) = second.or_else(|| text.find(|c| !is_in_xml(c))) {
+    let second = text.as_ref().starts_with('\u{feff}').then_some(0);
+    if let Some(at) = second.or_else(|| text.as_ref().find(|c| !is_in_xml(c))) {
         let what = "a character that XML does not allow";
         return Err(DecodeError::Syntax { at, what });
     }
     Ok(text)
+}
+
+/// The encoding that `name`, in upper case, stands for. Expat asks Python about all names except those of
+/// [`text_of`]'s encodings. Python takes each byte for a character then, so its UTF-8 is ASCII only.
+fn of_python(name: &str) -> Option<&'static str> {
+    Some(match name {
+        "UTF8" | "UTF_8" | "ASCII" => "US-ASCII",
+        "LATIN1" | "LATIN-1" | "LATIN_1" | "ISO8859-1" | "ISO_8859-1" | "ISO8859_1" | "L1" => {
+            "ISO-8859-1"
+        }
+        "CP1252" => "WINDOWS-1252",
+        _ => return None,
+    })
+}
+
+/// The text of a document in UTF-16 with a byte order mark, without the mark. `None` if there is no such mark.
+///
+/// # Errors
+///
+/// If the text is not valid, or declares another encoding.
+fn utf16(body: &[u8]) -> Result<Option<String>, DecodeError> {
+    let other = |name: &str| DecodeError::Encoding {
+        name: name.to_owned(),
+    };
+    let unit: fn([u8; 2]) -> u16 = match body {
+        [0xff, 0xfe, ..] => u16::from_le_bytes,
+        [0xfe, 0xff, ..] => u16::from_be_bytes,
+        _ => return Ok(None),
+    };
+    let units = body.chunks(2).skip(1);
+    let units = units.map(|pair| {
+        pair.try_into()
+            .map(unit)
+            .map_err(|_| other("half a UTF-16"))
+    });
+    let units: Vec<u16> = units.collect::<Result<_, _>>()?;
+    let text = String::from_utf16(&units).map_err(|_| other("UTF-16"))?;
+    if let Ok(Event::Decl(declaration)) = Reader::from_str(&text).read_event()
+        && let Some(name) = declared(&declaration)?
+        && !name.eq_ignore_ascii_case("UTF-16")
+    {
+        return Err(other(&name));
+    }
+    Ok(Some(text))
 }
 
 /// The document without its document type, if that is only a name and so declares nothing. `None` if the document has

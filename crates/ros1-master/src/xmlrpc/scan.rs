@@ -14,8 +14,8 @@ use quick_xml::events::{BytesEnd, BytesRef, BytesStart, Event as Markup};
 use quick_xml::reader::Reader;
 
 use super::error::{
-    BAD_MARKUP, BAD_REFERENCE, DecodeError, LATE_DECLARATION, NO_ELEMENT, NOT_CLOSED, OTHER_END,
-    SECOND_ROOT, TEXT_AFTER_ROOT, TEXT_BEFORE_ROOT,
+    BAD_MARKUP, BAD_REFERENCE, DecodeError, LATE_DECLARATION, MARKUP_OUTSIDE, NO_ELEMENT,
+    NOT_CLOSED, OTHER_END, SECOND_ROOT, TEXT_AFTER_ROOT, TEXT_BEFORE_ROOT,
 };
 
 /// One event of the scanner. An empty element causes two events, a start and an end.
@@ -148,7 +148,8 @@ impl<'a> Scanner<'a> {
             Error::IllFormed(IllFormedError::DoubleHyphenInComment) => "-- in a comment",
             Error::IllFormed(IllFormedError::MismatchedEndTag { .. }) => OTHER_END,
             Error::IllFormed(_) => "an end tag without an element",
-            _ => BAD_MARKUP,
+            _ if self.open > 0 => BAD_MARKUP,
+            _ => MARKUP_OUTSIDE,
         };
         let at = offset(self.reader.error_position());
         DecodeError::Syntax { at, what }

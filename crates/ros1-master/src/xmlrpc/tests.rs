@@ -2,8 +2,8 @@
 
 use super::number::repr;
 use super::{
-    Call, DecodeError, MAX_DEPTH, Reply, Struct, Value, decode_call, decode_reply, encode_call,
-    encode_reply,
+    Call, DecodeError, MAX_DEPTH, Python, Reply, Struct, Value, decode_call, decode_call_for,
+    decode_reply, encode_call, encode_reply,
 };
 
 /// The only parameter of a call with `inside` between `<value>` and `</value>`.
@@ -147,6 +147,27 @@ fn text_is_read_in_the_encoding_that_the_document_declares() {
             ..
         })
     ));
+    let declared =
+        |name: &str| format!("<?xml version='1.0' encoding='{name}'?><methodName>m</methodName>");
+    for name in ["utf8", "LATIN-1", "windows-1252"] {
+        assert_eq!(
+            method(declared(name).as_bytes()),
+            Ok("m".to_owned()),
+            "{name}"
+        );
+    }
+    let units = "<methodName>é𝄞</methodName>".encode_utf16();
+    let utf16: Vec<u8> = [0xfe, 0xff]
+        .into_iter()
+        .chain(units.flat_map(u16::to_be_bytes))
+        .collect();
+    assert_eq!(method(&utf16), Ok("é𝄞".to_owned()));
+    for broken in [utf16.split_last().unwrap().1, b"\xff\xfe\0\xd8"] {
+        assert!(
+            matches!(method(broken), Err(DecodeError::Encoding { .. })),
+            "{broken:?}"
+        );
+    }
     assert_eq!(
         method(b"<?xml version='1.0' encoding='koi8-r'?><methodName>m</methodName>"),
         Err(DecodeError::Encoding {
@@ -166,6 +187,7 @@ fn integers_are_read_as_python_reads_them() {
     ] {
         assert_eq!(value(&format!("<i4>{inside}</i4>")), Value::Int(number));
     }
+    assert_eq!(value("<int>-\u{661}0\u{ff19}</int>"), Value::Int(-109));
     for tag in ["i1", "i2", "i4", "i8", "int", "biginteger", "ex:i8"] {
         assert_eq!(
             value(&format!("<{tag}>-2147483648</{tag}>")),
@@ -276,6 +298,133 @@ fn an_unknown_element_is_refused_only_directly_inside_a_value() {
         value("<array><foo><value>1</value></foo></array>"),
         Value::Array(vec![text("1")])
     );
+}
+
+/// Measured with Python 2.7.11 and 2.7.15.
+#[test]
+fn python_2_knows_fewer_types_and_before_2_7_12_ignores_the_elements_of_others() {
+    let count_for = |inside: &str, micro: u32| {
+        let body = format!("<methodName>m</methodName><params><value>{inside}</value></params>");
+        let body = format!("<methodCall>{body}</methodCall>");
+        let python = Python::new(2, 7, micro);
+        decode_call_for(body.as_bytes(), python).map(|call| call.params.len())
+    };
+    let count = |inside: &str| count_for(inside, 11);
+    for ignored in [
+        "i1",
+        "i2",
+        "biginteger",
+        "float",
+        "bigdecimal",
+        "ex:int",
+        "unknown",
+    ] {
+        assert_eq!(
+            count(&format!("<{ignored}>1</{ignored}>")),
+            Ok(0),
+            "{ignored}"
+        );
+        let refused = count_for(&format!("<{ignored}>1</{ignored}>"), 15);
+        let is_refused =
+            matches!(&refused, Err(DecodeError::UnknownType { tag, .. }) if tag == ignored);
+        assert!(is_refused, "{refused:?}");
+    }
+    for known in ["i4", "i8", "int", "double", "string", "boolean", "nil"] {
+        assert_eq!(count(&format!("<{known}>1</{known}>")), Ok(1), "{known}");
+    }
+    assert!(count("<int>1_000</int>").is_err());
+    assert!(count("<double>1_0.5</double>").is_err());
+}
+
+#[test]
+fn each_version_of_python_words_its_faults_in_its_own_way() {
+    let [two, old, new] =
+        [(2, 7), (3, 6), (3, 11)].map(|(major, minor)| Python::new(major, minor, 15));
+    for (inside, python, fault) in [
+        (
+            "<int>five</int>",
+            two,
+            "<type 'exceptions.ValueError'>:invalid literal for int() with base 10: 'five'",
+        ),
+        (
+            "<i1>1</i1>",
+            two,
+            "<class 'xmlrpclib.ResponseError'>:ResponseError(\"unknown tag u'i1'\",)",
+        ),
+        (
+            "<no>1</no>",
+            new,
+            "<class 'xmlrpc.client.ResponseError'>:ResponseError(\"unknown tag 'no'\")",
+        ),
+        (
+            "<int> five </int>",
+            two,
+            "<type 'exceptions.ValueError'>:invalid literal for int() with base 10: 'five '",
+        ),
+        (
+            "<int> five </int>",
+            new,
+            "<class 'ValueError'>:invalid literal for int() with base 10: ' five '",
+        ),
+        (
+            "<int> </int>",
+            two,
+            "<type 'exceptions.ValueError'>:invalid literal for int() with base 10: ' '",
+        ),
+        (
+            "<double>five</double>",
+            two,
+            "<type 'exceptions.ValueError'>:could not convert string to float: five",
+        ),
+        (
+            "<double> 1,5 </double>",
+            two,
+            "<type 'exceptions.ValueError'>:invalid literal for float(): 1,5 ",
+        ),
+        (
+            "<double>1,5</double>",
+            new,
+            "<class 'ValueError'>:could not convert string to float: '1,5'",
+        ),
+        (
+            "<boolean>2</boolean>",
+            two,
+            "<type 'exceptions.TypeError'>:bad boolean value",
+        ),
+        (
+            "<base64>A</base64>",
+            two,
+            "<class 'binascii.Error'>:Incorrect padding",
+        ),
+        (
+            "<base64>A</base64>",
+            old,
+            "<class 'binascii.Error'>:Incorrect padding",
+        ),
+        (
+            "<base64>AAAA\nA</base64>",
+            new,
+            "<class 'binascii.Error'>:Invalid base64-encoded string: number of data characters (5) cannot be 1 more than a multiple of 4",
+        ),
+        (
+            "<base64>AA</base64>",
+            new,
+            "<class 'binascii.Error'>:Incorrect padding",
+        ),
+        (
+            "<string>1</int>",
+            two,
+            "<class 'xml.parsers.expat.ExpatError'>:mismatched tag: line 1, column 38",
+        ),
+    ] {
+        let body = format!("<methodCall><params><value>{inside}</value></params></methodCall>");
+        let error = decode_call_for(body.as_bytes(), python).unwrap_err();
+        assert_eq!(
+            error.fault(body.as_bytes(), python).as_deref(),
+            Some(fault),
+            "{inside}"
+        );
+    }
 }
 
 #[test]

@@ -108,6 +108,8 @@ pub enum Value {
     Int(i32),
     /// An integer beyond 32 bits, in canonical decimal form. rosmaster accepts it but can never return it.
     BigInt(String),
+    /// `<bigdecimal>`: the text of a decimal number. rosmaster on Python 3 accepts it but can never return it.
+    BigDecimal(String),
     /// `<double>`.
     Double(f64),
     /// `<string>`, or text without a type element.
@@ -130,6 +132,7 @@ impl PartialEq for Value {
             (Self::Int(a), Self::Int(b)) => a == b,
             (Self::Double(a), Self::Double(b)) => a.to_bits() == b.to_bits(),
             (Self::BigInt(a), Self::BigInt(b))
+            | (Self::BigDecimal(a), Self::BigDecimal(b))
             | (Self::String(a), Self::String(b))
             | (Self::DateTime(a), Self::DateTime(b)) => a == b,
             (Self::Base64(a), Self::Base64(b)) => a == b,
@@ -166,7 +169,10 @@ impl Value {
     /// parts.
     fn visit_sizes(&self, visit: &mut impl FnMut(usize) -> bool) -> bool {
         let within = match self {
-            Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),
+            Self::BigInt(text)
+            | Self::BigDecimal(text)
+            | Self::String(text)
+            | Self::DateTime(text) => text.len(),
             Self::Base64(bytes) => bytes.len(),
             _ => 0,
         };
@@ -193,6 +199,7 @@ impl Value {
             Self::Nil => "NoneType",
             Self::Bool(_) => "bool",
             Self::Int(_) | Self::BigInt(_) => "int",
+            Self::BigDecimal(_) => "decimal.Decimal",
             Self::Double(_) => "float",
             Self::String(_) => "str",
             Self::DateTime(_) => "DateTime",

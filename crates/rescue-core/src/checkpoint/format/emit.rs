@@ -21,6 +21,7 @@ const INT_DIGITS_MAX: usize = 4_000;
 pub(super) const DATE_TIME: &str = "dateTime.iso8601";
 /// The kind of `!!pairs` entry that holds a large integer.
 pub(super) const BIG_INT: &str = "int";
+pub(super) const BIG_DECIMAL: &str = "bigdecimal";
 
 /// Writes `members` in block style, one line each, indented by `indent` columns.
 pub(super) fn block(
@@ -74,6 +75,7 @@ pub(super) fn flow(out: &mut Vec<u8>, value: &Value, depth: usize) -> Result<(),
             out.extend_from_slice(digits.as_bytes());
         }
         Value::BigInt(digits) => pair(out, BIG_INT, digits),
+        Value::BigDecimal(text) => pair(out, BIG_DECIMAL, text),
         Value::Double(number) => double(out, *number),
         Value::String(text) => quoted(out, text),
         Value::DateTime(text) => match timestamp(text) {

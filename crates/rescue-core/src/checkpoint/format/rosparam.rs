@@ -70,6 +70,7 @@ fn refusal(value: &Value) -> Option<&'static str> {
     match value {
         Value::Nil => Some("it holds null, which rosparam cannot send"),
         Value::BigInt(_) => Some("it holds an integer beyond 32 bits, which rosparam cannot send"),
+        Value::BigDecimal(_) => Some("it holds a decimal number, which rosparam cannot send"),
         Value::DateTime(text) if emit::timestamp(text).is_none() => {
             Some("it holds a date that is not in the calendar")
         }

@@ -10,7 +10,7 @@ use std::borrow::Cow;
 use serde_saphyr::granit_parser::{self, Event, Parser, ScalarStyle, Tag};
 
 use super::DEPTH_MAX;
-use super::emit::{BIG_INT, DATE_TIME, date_time};
+use super::emit::{BIG_DECIMAL, BIG_INT, DATE_TIME, date_time};
 use crate::xmlrpc::{Struct, Value};
 
 const TAG_PREFIX: &str = "tag:yaml.org,2002:";
@@ -163,6 +163,7 @@ fn pair(elements: Vec<Value>) -> Option<Value> {
     match kind.as_str() {
         DATE_TIME => Some(Value::DateTime(text)),
         BIG_INT => Some(Value::BigInt(text)),
+        BIG_DECIMAL => Some(Value::BigDecimal(text)),
         _ => None,
     }
 }

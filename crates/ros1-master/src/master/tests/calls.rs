@@ -1,7 +1,7 @@
 //! Tests of calls on the model. `tests/differential` checks that the model equals a real rosmaster.
 
 use crate::{
-    master::{Entry, Master, Method, Notice, Request},
+    master::{Entry, Malformed, Master, Method, Notice, Request},
     xmlrpc::{Reply, Struct, Value},
 };
 
@@ -80,6 +80,6 @@ pub(crate) fn notices(master: &mut Master, call: &Request) -> Vec<Notice> {
 /// Adds a malformed entry at the end of a multicall.
 pub(crate) fn malformed(call: Request) -> Request {
     let mut entries = call.into_entries();
-    entries.push(Entry::Malformed("malformed".into()));
+    entries.push(Entry::Malformed(Malformed::Arity));
     Request::of_entries(entries)
 }

@@ -1,7 +1,7 @@
 //! Tests which reads the model answers byte for byte as rosmaster does, and which it leaves to the master.
 
 use super::*;
-use crate::xmlrpc::MAX_DEPTH;
+use crate::xmlrpc::{MAX_DEPTH, Python};
 
 fn master() -> Master {
     after([publish("/n", "/t", "a/B"), set("/a/b", 1)])
@@ -84,7 +84,7 @@ fn there_is_no_exact_answer_that_shows_dictionary_order_for_a_master_without_one
         ["/n".into(), "/t".into(), tree],
     ));
     master.apply(&call("registerPublisher", &["/n", "/x", "a/B", &api("/n")]));
-    master.set_unordered(true);
+    master.set_python(Python::new(2, 7, 11));
     let state = call("getSystemState", &["/c"]);
     for exact in [&state, &call("getParam", &["/c", "/t/a"])] {
         assert!(master.exact_answer(exact).is_some(), "{exact:?}");

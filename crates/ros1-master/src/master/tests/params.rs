@@ -1,6 +1,7 @@
 //! Tests of the parameter server's special cases.
 
 use super::*;
+use crate::xmlrpc::Python;
 
 #[test]
 fn a_value_in_the_way_becomes_a_namespace_and_empty_namespaces_stay() {
@@ -167,5 +168,25 @@ fn member_names_that_start_with_a_slash_may_have_any_characters() {
         let reply = master.apply(&set("/a", members)).reply;
         let (code, _, value) = answer(&mut master, &call("getParam", &["/n", "/a/b"]));
         assert_eq!((code, value), (1, 2.into()), "{name}: {reply:?}");
+    }
+}
+
+/// Measured with rosmaster 1.11.16 on Python 2.7.11. The member `b` hides the one in which rosmaster then searches `c`.
+#[test]
+fn python_2_has_another_error_for_a_member_of_a_date_or_of_binary_data() {
+    for (value, python_2) in [
+        (Value::Base64(vec![1]), 0),
+        (Value::DateTime("x".to_owned()), 0),
+        (1.into(), -1),
+        ("c".into(), -1),
+    ] {
+        let members = tree([("b/c", 1.into()), ("b", value)]);
+        for (python, code) in [(Python::new(2, 7, 11), python_2), (Python::default(), -1)] {
+            let mut master = Master::default();
+            master.set_python(python);
+            master.apply(&call("subscribeParam", &["/n", "http://n:1/", "/a/b/c"]));
+            let refusal = message(&mut master, &set("/a", members.clone()));
+            assert_eq!(refusal.0, code, "{refusal:?} on {python:?}");
+        }
     }
 }
