@@ -48,6 +48,7 @@ use crate::{
     ros_env::MasterUri,
     server::others::{Forwarded, Handover},
     status::cluster::MemberFacts,
+    task::boxed,
     upstream::{Head, peer::Peers},
     wait,
     write_queue::WriteQueue,
@@ -348,7 +349,7 @@ impl ClusterDriver {
 
     /// Starts `work`. If it panics, its result is `otherwise`, because the member waits for every result.
     fn spawn(&mut self, otherwise: Input, work: impl Future<Output = Input> + Send + 'static) {
-        self.work.spawn(answered(otherwise, work));
+        self.work.spawn(boxed(answered(otherwise, work)));
     }
 
     fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {

@@ -6,10 +6,7 @@ use std::{
     time::Instant,
 };
 
-use tokio::{
-    task::{block_in_place, spawn_blocking},
-    time::timeout,
-};
+use tokio::{task::block_in_place, time::timeout};
 
 use super::{
     Inner, Ledger,
@@ -104,7 +101,7 @@ impl Ledger {
     /// Writes the queued records to the checkpoint, in another thread.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
-            spawn_blocking(move || worker.work());
+            crate::task::spawn_blocking(move || worker.work());
         }
     }
 

@@ -98,7 +98,7 @@ pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     for port in ports {
         match nodes.is_unreachable(&port) {
             true => nodes.ledger.with_order(|order, _| order.drop_port(&port)),
-            false => drop(tokio::spawn(deliver(nodes.clone(), port))),
+            false => drop(crate::task::spawn(deliver(nodes.clone(), port))),
         }
     }
 }
@@ -169,7 +169,7 @@ async fn answers(nodes: &Nodes, port: &str) -> bool {
 /// listens at the address by now.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
-    tokio::spawn(async move {
+    crate::task::spawn(async move {
         for seconds in SHUTDOWN_PAUSES {
             tokio::time::sleep(Duration::from_secs(seconds)).await;
             let name = Subject::Name(displaced.node.clone());

@@ -216,7 +216,7 @@ mod tests {
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
-        let end = tokio::spawn(ended(orphan));
+        let end = crate::task::spawn(ended(orphan));
         signal_process(orphan, Signal::KILL);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is reported").unwrap().unwrap();

@@ -260,7 +260,7 @@ impl Calls {
             }
         };
         let before = last.take();
-        let encoding = tokio::task::spawn_blocking(move || encode(before));
+        let encoding = crate::task::spawn_blocking(move || encode(before));
         let answer = encoding.await.ok()??;
         let text = answer.text.clone();
         *last = Some(answer).filter(|answer| answer.text.len() <= KEPT_MOST);
@@ -343,7 +343,7 @@ impl Calls {
                             if let Some(reply) = self.stand_in(known_now).await {
                                 // The read continues, because its end shows that the master answers again.
                                 let pool = self.pool.clone();
-                                tokio::spawn(async move {
+                                crate::task::spawn(async move {
                                     let _stalled = pool.stalled();
                                     let _ = forwarding.await;
                                 });

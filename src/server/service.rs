@@ -239,5 +239,5 @@ async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<master::Reque
     }
     body::room_for_values(&body, room).await?;
     let work = move || master::Request::decode(&body).ok();
-    Ok(tokio::task::spawn_blocking(work).await.ok().flatten())
+    Ok(crate::task::spawn_blocking(work).await.ok().flatten())
 }

@@ -592,7 +592,7 @@ impl Drain {
             return send(true);
         }
         let ledger = self.link.ledger.clone();
-        tokio::spawn(async move {
+        crate::task::spawn(async move {
             let is_safe = match mark {
                 Some(mark) => ledger.durable(mark).await,
                 None => true,
