@@ -236,7 +236,6 @@ mod tests {
             numworkers: 1,
             timeout: 0.0,
             rosout: false,
-            log_dir: folder.path().to_owned(),
         };
         let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
         let mut ended = Command::new("sleep").arg("60").spawn().unwrap();
