@@ -8,10 +8,10 @@ use std::pin::Pin;
 use tokio::task::JoinHandle;
 
 /// Work for a task, which results in a `T`.
-pub(crate) type Work<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+pub(crate) type BoxedWork<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 
 /// Boxes the `work` of a task.
-pub(crate) fn boxed<T>(work: impl Future<Output = T> + Send + 'static) -> Work<T> {
+pub(crate) fn boxed<T>(work: impl Future<Output = T> + Send + 'static) -> BoxedWork<T> {
     Box::pin(work)
 }
 

@@ -148,7 +148,7 @@ impl ClusterDriver {
         }
         let actions = self.member.on(now, input);
         let lease = self.member.machine().lease(now);
-        self.setup.context.ledger.set_lease(lease);
+        self.setup.context.ledger.lease.set(lease);
         for action in actions {
             match action {
                 Action::End => return Some(Ok(())),
@@ -234,7 +234,7 @@ impl ClusterDriver {
                     let _ = ledger.follow_state(state);
                 }
             }
-            Action::Acknowledge(seq) => ledger.agree(seq),
+            Action::Acknowledge(seq) => ledger.agreement.reach(seq),
             Action::TakeAsState => {
                 let state = ledger.take_as_state();
                 self.inbox.push_front(Input::AsState(state));

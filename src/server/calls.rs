@@ -290,7 +290,7 @@ impl Calls {
         let patience = self.patience();
         loop {
             changed.mark_unchanged();
-            if let Ok(delivery) = self.ledger.begin_read(Instant::now(), read) {
+            if let Ok(delivery) = Delivery::of_read(&self.ledger, Instant::now(), read) {
                 return delivery;
             }
             if tokio::time::timeout_at(patience, changed.changed())
@@ -298,7 +298,7 @@ impl Calls {
                 .is_err()
             {
                 self.slow.notify_one();
-                return self.ledger.begin_read_now(read?);
+                return Delivery::of_read_now(&self.ledger, read?);
             }
         }
     }

@@ -260,7 +260,7 @@ impl Others {
                                 let number = HeaderValue::from(number);
                                 reply.headers_mut().insert(peer::ANSWER_HEADER, number);
                             }
-                            let seq = HeaderValue::from(calls.ledger.last_agreed());
+                            let seq = HeaderValue::from(calls.ledger.agreement.last());
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
                         }
