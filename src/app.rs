@@ -20,6 +20,7 @@ use crate::{
     recovery::{Driver, master_process::MasterProcess},
     ros_env::MasterUri,
     server::{Server, listener, others::Others},
+    task::boxed,
 };
 
 mod assemble;
@@ -138,8 +139,8 @@ pub async fn run(
         checkpointer,
         runs.begin(&context, port, restored, &stop, &halt)
     );
-    tasks.spawn(checkpointer.run(halt.clone()));
-    tasks.spawn(drain.run());
+    tasks.spawn(boxed(checkpointer.run(halt.clone())));
+    tasks.spawn(boxed(drain.run()));
     watch(&config, &context, &mut tasks);
     let process = tokio::select! {
         process = begun.run(stop, halt) => process?,
@@ -186,27 +187,30 @@ fn accept(
     let server = Arc::new(server);
     let mut tasks = JoinSet::new();
     for listener in listeners {
-        tasks.spawn(listener::run(
+        tasks.spawn(boxed(listener::run(
             listener,
             server.clone(),
             permits.clone(),
             connections.clone(),
             halt.clone(),
-        ));
+        )));
     }
     tasks
 }
 
 /// Starts the tasks that look after the nodes, and after clients that bypass this rosrescue.
 fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
-    tasks.spawn(nodes::liveness::watch(context.nodes.clone()));
-    tasks.spawn(nodes::watch(context.nodes.clone(), config.reap_interval));
+    tasks.spawn(boxed(nodes::liveness::watch(context.nodes.clone())));
+    tasks.spawn(boxed(nodes::watch(
+        context.nodes.clone(),
+        config.reap_interval,
+    )));
     if matches!(config.master, MasterConfig::External(_)) {
-        tasks.spawn(bypass::watch(
+        tasks.spawn(boxed(bypass::watch(
             context.upstream.clone(),
             context.board.clone(),
             config.advertised.to_string(),
-        ));
+        )));
     }
 }
 
@@ -292,9 +296,9 @@ impl Begun {
     ) -> Result<Option<MasterProcess>, RunError> {
         let task = match self {
             Self::Single(driver, first) => {
-                tokio::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
+                crate::task::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
             }
-            Self::Member(member) => tokio::spawn(member.run(stop)),
+            Self::Member(member) => crate::task::spawn(member.run(stop)),
         };
         match task.await {
             Ok(ended) => ended,

@@ -25,6 +25,7 @@ mod wait;
 use std::{
     fmt::Display,
     io::{self, Write},
+    pin::Pin,
     process::ExitCode,
 };
 
@@ -85,28 +86,28 @@ pub fn run(tool: &Tool) -> ExitCode {
         .worker_threads(1)
         .enable_all()
         .build();
+    // Boxed, so that the compiler generates each command once and not within each way to run a future.
+    let work: Pin<Box<dyn Future<Output = _>>> = match tool {
+        Tool::Check(args) => Box::pin(check::run(args)),
+        Tool::Completions(args) => Box::pin(completions::run(args)),
+        Tool::Diff(args) => Box::pin(diff::run(args)),
+        Tool::Drill(args) => Box::pin(drill::run(args)),
+        Tool::Handover(args) => Box::pin(handover::run(args)),
+        Tool::History(args) => Box::pin(history::run(args)),
+        Tool::Inspect(args) => Box::pin(inspect::run(args)),
+        Tool::Install(args) => Box::pin(install::run(args)),
+        Tool::Man(args) => Box::pin(man::run(args)),
+        Tool::Params(args) => Box::pin(params::run(args)),
+        Tool::Report(args) => Box::pin(report::run(args)),
+        Tool::Restore(args) => Box::pin(restore::run(args)),
+        Tool::Status(args) => Box::pin(status::run(args)),
+        Tool::Top(args) => Box::pin(top::run(args)),
+        Tool::Uninstall(args) => Box::pin(install::undo(args)),
+        Tool::Verify(args) => Box::pin(verify::run(args)),
+        Tool::Wait(args) => Box::pin(wait::run(args)),
+    };
     let ended = match runtime {
-        Ok(runtime) => runtime.block_on(async {
-            match tool {
-                Tool::Check(args) => check::run(args).await,
-                Tool::Completions(args) => completions::run(args).await,
-                Tool::Diff(args) => diff::run(args).await,
-                Tool::Drill(args) => drill::run(args).await,
-                Tool::Handover(args) => handover::run(args).await,
-                Tool::History(args) => history::run(args).await,
-                Tool::Inspect(args) => inspect::run(args).await,
-                Tool::Install(args) => install::run(args).await,
-                Tool::Man(args) => man::run(args).await,
-                Tool::Params(args) => params::run(args).await,
-                Tool::Report(args) => report::run(args).await,
-                Tool::Restore(args) => restore::run(args).await,
-                Tool::Status(args) => status::run(args).await,
-                Tool::Top(args) => top::run(args).await,
-                Tool::Uninstall(args) => install::undo(args).await,
-                Tool::Verify(args) => verify::run(args).await,
-                Tool::Wait(args) => wait::run(args).await,
-            }
-        }),
+        Ok(runtime) => runtime.block_on(work),
         Err(error) => Err(CommandFailure::Failed(format!("no runtime: {error}"))),
     };
     match ended {

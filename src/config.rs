@@ -154,8 +154,6 @@ pub struct SupervisedConfig {
     /// Socket timeout of the master in seconds; 0 for none.
     pub timeout: f64,
     pub rosout: bool,
-    /// Folder for the master's log and the log configuration that rosrescue writes for it.
-    pub log_dir: PathBuf,
 }
 
 impl Config {
@@ -188,7 +186,6 @@ impl Config {
             numworkers: args.numworkers,
             timeout: seconds("--timeout", args.timeout, 3600.0)?.as_secs_f64(),
             rosout: !args.no_rosout,
-            log_dir: ros_env::log_dir(env),
         });
         let host = advertised_host(&listen, env, hostname, local_address);
         let advertised = MasterUri { host, port };

@@ -11,7 +11,7 @@ pub(crate) mod checkpointer;
 pub(crate) mod delivery;
 mod durability;
 pub(crate) mod history;
-mod injection;
+mod inner;
 pub(crate) mod journal;
 pub(crate) mod late;
 mod pending;
@@ -19,35 +19,34 @@ mod shared;
 mod summary;
 
 use std::{
-    collections::HashSet,
     sync::{Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
     time::Instant,
 };
 
 use tokio::sync::{Notify, watch};
 
-use self::activity::{Activity, Noticed};
+use self::activity::Activity;
 pub(crate) use self::durability::Mark;
 use self::{
-    durability::Whole,
-    journal::Journal,
-    late::LateState,
-    pending::PendingWrites,
-    shared::{Agreed, Shared},
+    inner::Inner,
+    late::{CatchUp, LateState, Missed, once},
+    shared::{Agreement, LeaderLease, Shared},
 };
 use crate::{
     checkpoint::{
-        format::{RecordContent, Session},
+        format::{Record, RecordContent, Session},
         store::Store,
     },
     cli::SyncPolicy,
-    cluster::sharing::Source,
-    health::port_of,
+    cluster::{
+        merge::Verdict,
+        sharing::{Change, Sharing, Source},
+    },
     master::{Master, Method, Request},
-    order::Order,
+    order::{Order, Subject},
     replay::{self, Answered, Token},
     status::stats::Stats,
-    xmlrpc::Reply,
+    xmlrpc::{Python, Reply},
 };
 
 /// Refuses an outdated result: another incarnation (see [`Token`]) has begun, the mirror has changed since, or the
@@ -84,10 +83,8 @@ pub struct Ledger {
     sync_is_late: AtomicBool,
     /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
-    /// The last of this computer's records that the other computers have.
-    agreed: watch::Sender<Agreed>,
-    /// The time until which this computer may act as leader. See [`Ledger::set_lease`].
-    lease: watch::Sender<Option<Instant>>,
+    pub(crate) agreement: Agreement,
+    pub(crate) lease: LeaderLease,
     /// The mirror's version in the last complete checkpoint that was written or could not be written.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
@@ -97,38 +94,6 @@ pub struct Ledger {
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
     order_changed: watch::Sender<()>,
-}
-
-struct Inner {
-    mirror: Master,
-    /// The answers to `getPid` and `getUri`, which are not part of the state.
-    identity: (i32, String),
-    session: Session,
-    /// `None` if no checkpoint could be opened. Then the state is unprotected.
-    journal: Option<Journal>,
-    shared: Shared,
-    /// Changes whenever the mirror changes.
-    version: u64,
-    whole: Whole,
-    pending: PendingWrites,
-    activity: Activity,
-    order: Order,
-    diverged: HashSet<Method>,
-    /// Whether a master is being brought to the mirror's state (an injection), so that the mirror must not change.
-    injecting: bool,
-    /// Whether the present master may differ from the mirror and must be read again.
-    doubted: bool,
-    /// Whether the present master may still run a batch whose reply is no longer awaited.
-    abandoned: bool,
-    /// The state that a late master will have once it has answered its outstanding calls.
-    behind: Option<LateState>,
-    /// The number of the last master to which calls have passed.
-    served: Option<u64>,
-    /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
-    /// be newer than the mirror.
-    unconfirmed: bool,
-    /// Whether the session has changed and the change is not in the journal yet.
-    session_unwritten: bool,
 }
 
 impl Ledger {
@@ -142,37 +107,15 @@ impl Ledger {
         sync: SyncPolicy,
         stats: &'static Stats,
     ) -> Self {
-        let mut inner = Inner {
-            mirror,
-            identity: (-1, String::new()),
-            session,
-            journal: None,
-            shared: Shared::Nobody,
-            version: 0,
-            whole: Whole::default(),
-            pending: PendingWrites::default(),
-            activity: Activity::default(),
-            order: Order::default(),
-            diverged: HashSet::new(),
-            injecting: false,
-            doubted: false,
-            abandoned: false,
-            behind: None,
-            served: None,
-            unconfirmed: false,
-            session_unwritten: false,
-        };
-        inner.add_pending(pending);
-        inner.pending.are_restored();
         let ledger = Self {
-            inner: Mutex::new(inner),
+            inner: Mutex::new(Inner::new(mirror, session, pending)),
             sync,
             stats,
             durable: watch::channel(0).0,
             sync_is_late: AtomicBool::new(false),
             disk_silent: Notify::new(),
-            agreed: watch::channel(Agreed::default()).0,
-            lease: watch::channel(None).0,
+            agreement: Agreement::new(),
+            lease: LeaderLease::new(),
             attempted: watch::channel(0).0,
             work: Notify::new(),
             shared: Notify::new(),
@@ -284,7 +227,7 @@ impl Ledger {
             if !answered.agrees(&outcome, index < last_write) {
                 if !is_inexact {
                     self.stats.divergences.count();
-                    inner.report_divergence(&answered, &outcome);
+                    inner.diverged.report(&answered, &outcome);
                 }
                 recorded.doubtful = true;
                 if !answered.executed {
@@ -391,6 +334,312 @@ impl Ledger {
         Ok(difference)
     }
 
+    /// Notes that another computer has the master, or may have it. From now on only the records given to
+    /// [`Self::follow`] are recorded. Calls whose records the other computers lack are not acknowledged. No node is
+    /// notified, because the other computer does that.
+    pub fn leave(&self) {
+        let mut inner = self.lock();
+        inner.shared = Shared::Elsewhere;
+        inner.order.forget_notifications();
+        drop(inner);
+        self.agreement.lost();
+    }
+
+    /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is
+    /// the state that the others hold. If this computer's state differs, the others get the whole state.
+    pub fn lead(&self, seq: u64, held: &Master) {
+        let mut inner = self.lock();
+        let times_led = self.agreement.times_led();
+        let sharing = Sharing::after(seq);
+        inner.shared = Shared::Here { times_led, sharing };
+        if inner.mirror != *held {
+            inner.share_state();
+        }
+        drop(inner);
+        // The other computers have these records. A write that changes nothing waits only for the last of them.
+        self.agreement.reach(seq);
+        self.shared.notify_one();
+    }
+
+    /// Takes the changes that the other computers have not got yet.
+    pub(crate) fn take_changes(&self) -> Vec<Change> {
+        match &mut self.lock().shared {
+            Shared::Here { sharing, .. } => sharing.take(),
+            _ => Vec::new(),
+        }
+    }
+
+    /// Like [`Self::take_changes`], but takes the changes as a single one: the state that they have led to. `None` if
+    /// this computer does not have the master.
+    pub(crate) fn take_as_state(&self) -> Option<Change> {
+        let inner = &mut *self.lock();
+        match &mut inner.shared {
+            Shared::Here { sharing, .. } => Some(sharing.take_as_state(&inner.mirror)),
+            _ => None,
+        }
+    }
+
+    /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
+    /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
+    /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
+    pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
+        let inner = self.lock();
+        match &inner.shared {
+            Shared::Here { sharing, .. } => sharing.judge(&inner.mirror, seq, merge, calls),
+            _ => None,
+        }
+    }
+
+    /// Applies and records the records of the computer that has the master.
+    ///
+    /// # Errors
+    ///
+    /// If this computer has the master itself.
+    pub fn follow(&self, records: &[Record]) -> Result<(), Superseded> {
+        let mut inner = self.lock();
+        if !inner.is_elsewhere() {
+            return Err(Superseded);
+        }
+        let entries: Vec<RecordContent> =
+            records.iter().map(|record| record.entry.clone()).collect();
+        for entry in &entries {
+            if let RecordContent::Call { call, .. } = entry {
+                inner
+                    .mirror
+                    .apply_telling(&Request::from(call.clone()), &mut ());
+                inner.version += 1;
+            }
+        }
+        inner.append(entries);
+        drop(inner);
+        self.write_soon();
+        self.work.notify_one();
+        Ok(())
+    }
+
+    /// Replaces the state by that of the computer that has the master.
+    ///
+    /// # Errors
+    ///
+    /// If this computer has the master itself.
+    pub fn follow_state(&self, state: Master) -> Result<(), Superseded> {
+        let mut inner = self.lock();
+        if !inner.is_elsewhere() {
+            return Err(Superseded);
+        }
+        inner.pending.clear();
+        inner.activity = Default::default();
+        (inner.doubted, inner.abandoned) = (false, false);
+        inner.adopt(state);
+        drop(inner);
+        self.work.notify_one();
+        Ok(())
+    }
+
+    /// Freezes the mirror until [`Self::end_injection`]. Returns the state from which the injection is planned.
+    pub fn begin_injection(&self) -> Basis {
+        let mut inner = self.lock();
+        inner.injecting = true;
+        Basis {
+            mirror: inner.mirror.clone(),
+            version: inner.version,
+            pending: inner.pending.calls().to_vec(),
+        }
+    }
+
+    /// Sets the version of Python on which the present master runs.
+    pub fn set_python(&self, python: Python) {
+        self.lock().mirror.set_python(python);
+    }
+
+    /// Sets whether the present master behaves like version 1.14.3 and earlier.
+    pub fn set_old(&self, old: Option<bool>) {
+        self.lock().mirror.set_old(old);
+    }
+
+    /// The mirror's version and state, and the [`Token`] for the next master.
+    pub fn next(&self) -> (u64, Master, Token) {
+        let inner = self.lock();
+        let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
+        (inner.version, inner.mirror.clone(), token)
+    }
+
+    /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. So a master has run the
+    /// checkpoint's pending writes.
+    pub fn catch_up(&self, number: u64) {
+        let mut inner = self.lock();
+        inner.pending.forget_restored();
+        inner.session.incarnation = number;
+        inner.session_unwritten = true;
+    }
+
+    /// Starts the next incarnation (see [`Token`]), so that replies of the previous one no longer count. Returns the
+    /// new token.
+    ///
+    /// The journal records the new token's number once the master has it. A rosrescue that starts before that finds
+    /// either a master with a higher number than the recorded one, or a master without the pending writes.
+    pub fn succeed(&self) -> Token {
+        let mut inner = self.lock();
+        inner.raise_incarnation();
+        // The injection makes both sides equal, so no doubt remains.
+        (inner.doubted, inner.abandoned) = (false, false);
+        inner.token()
+    }
+
+    /// Notes that the present master holds the mirror's state, so no write is pending.
+    pub fn delivered(&self) {
+        let mut inner = self.lock();
+        if !inner.pending.calls().is_empty() {
+            inner.pending.clear();
+            inner.session.delivered = inner.seq();
+            inner.session_unwritten = true;
+        }
+        inner.write_session();
+        drop(inner);
+        self.write_soon();
+        self.work.notify_one();
+    }
+
+    /// Lets calls pass to the present master and allows the mirror to change again. Returns the number in the master's
+    /// [`Token`].
+    pub fn serve(&self) -> u64 {
+        let mut inner = self.lock();
+        inner.injecting = false;
+        inner.unconfirmed = false;
+        let incarnation = inner.session.incarnation;
+        inner.served = Some(incarnation);
+        incarnation
+    }
+
+    /// Whether calls have passed to the present master. `None` if calls have never passed to a master.
+    pub fn has_served_present(&self) -> Option<bool> {
+        let inner = self.lock();
+        inner.served.map(|of| of == inner.session.incarnation)
+    }
+
+    /// Ends the freeze of [`Self::begin_injection`] and [`Self::resume`]: the mirror may change again.
+    pub fn end_injection(&self) {
+        self.lock().injecting = false;
+    }
+
+    /// Notes that the connection to the present master ended before the answer to a batch. The master may still run
+    /// that batch.
+    pub fn abandon_batch(&self) {
+        let mut inner = self.lock();
+        (inner.abandoned, inner.behind) = (true, None);
+    }
+
+    /// Notes that the present master can no longer be running a batch of an ended connection.
+    pub fn settled(&self) {
+        self.lock().abandoned = false;
+    }
+
+    /// Whether the present master can continue unchanged: no write is pending, and it runs no batch of an ended
+    /// connection. If so, the mirror is frozen until [`Self::end_injection`].
+    pub fn resume(&self) -> bool {
+        let mut inner = self.lock();
+        let whole = inner.pending.calls().is_empty() && !inner.abandoned;
+        inner.injecting |= whole;
+        whole
+    }
+
+    /// Notes that the mirror has answered the calls that the present master is late with, and no later calls. `tells`
+    /// are the topics, parameters and node names about which these calls may make the master notify nodes.
+    pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
+        let mut inner = self.lock();
+        inner.behind = Some(LateState {
+            state: inner.mirror.clone(),
+            ran: inner.pending.calls().len(),
+            tells,
+            answered: false,
+        });
+    }
+
+    /// Notes that the late master has answered its outstanding calls. It may notify nodes of the changes by these calls
+    /// only now.
+    pub(crate) fn late_answered(&self, now: Instant) {
+        let mut inner = self.lock();
+        let Inner {
+            behind: Some(behind),
+            mirror,
+            order,
+            ..
+        } = &mut *inner
+        else {
+            return;
+        };
+        behind.answered = true;
+        for subject in &behind.tells {
+            let nodes = match subject {
+                Subject::Topic(topic) => mirror.subscribers_of(topic).len(),
+                Subject::Param(_) => 1,
+                Subject::Name(_) => continue,
+            };
+            order.told_by_master(now, subject, nodes);
+        }
+        drop(inner);
+        self.outbox_changed.notify_one();
+    }
+
+    /// Decides what the present master needs after it was late and has answered. Freezes the mirror until
+    /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation (see [`Token`]) if the master must run
+    /// writes.
+    ///
+    /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
+    /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
+    pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
+        let mut inner = self.lock();
+        let behind = inner.behind.take().filter(|behind| behind.answered)?;
+        if inner.doubted || inner.abandoned || inner.mirror.is_inexact() {
+            return None;
+        }
+        if inner.pending.calls().is_empty() {
+            inner.injecting = true;
+            return Some(CatchUp::Nothing);
+        }
+        let writes = inner.pending.calls().get(behind.ran..)?.to_vec();
+        let told = once(&behind, &writes)?;
+        inner.injecting = true;
+        let before = inner.token();
+        inner.raise_incarnation();
+        for (subject, nodes) in told {
+            inner.order.told_by_master(now, &subject, nodes);
+        }
+        Some(CatchUp::Run(Box::new(Missed {
+            behind: behind.state,
+            writes,
+            mirror: inner.mirror.clone(),
+            before,
+            token: inner.token(),
+        })))
+    }
+
+    /// Runs `work` on the [`Order`] and the mirror.
+    pub(crate) fn with_order<T>(&self, work: impl FnOnce(&mut Order, &Master) -> T) -> T {
+        let mut inner = self.lock();
+        let Inner { mirror, order, .. } = &mut *inner;
+        let result = work(order, mirror);
+        let repeats = order.has_new_repeat();
+        drop(inner);
+        if repeats {
+            self.outbox_changed.notify_one();
+        }
+        result
+    }
+
+    /// Signals that a call or notification that [waits](Order) may be able to go on.
+    pub(crate) fn order_changed(&self) -> watch::Receiver<()> {
+        self.order_changed.subscribe()
+    }
+
+    /// Runs `work` on the [`Order`]. If it returns true, wakes the calls and notifications that wait.
+    pub(crate) fn release(&self, work: impl FnOnce(&mut Order) -> bool) {
+        let awaited = work(&mut self.lock().order);
+        if awaited {
+            self.order_changed.send_replace(());
+        }
+    }
+
     /// Runs `work` on the mirror and the recent activity.
     pub fn with_activity<T>(&self, work: impl FnOnce(&Master, &mut Activity) -> T) -> T {
         let mut inner = self.lock();
@@ -398,146 +647,6 @@ impl Ledger {
             mirror, activity, ..
         } = &mut *inner;
         work(mirror, activity)
-    }
-}
-
-impl Inner {
-    /// Applies `call` to the mirror. `standing_in` is `None` if a master notifies the nodes. Otherwise rosrescue must
-    /// notify them, and the value says whether `call` changes the mirror.
-    fn apply(
-        &mut self,
-        now: Instant,
-        call: &Request,
-        standing_in: Option<bool>,
-        outbox_changed: &Notify,
-    ) -> Reply {
-        let mut noticed = Noticed::new(standing_in.is_some());
-        noticed.displaced = self.activity.displaced_by(&self.mirror, call);
-        self.activity.note_lost(&self.mirror, call);
-        let reply = self.mirror.apply_telling(call, &mut noticed);
-        self.version += u64::from(standing_in.unwrap_or(true));
-        match noticed.take_calls() {
-            Some(calls) => {
-                for (api, subject, call) in calls {
-                    self.order.notify(port_of(&api), subject, call);
-                    outbox_changed.notify_one();
-                }
-            }
-            None => {
-                for (subject, nodes) in noticed.subjects() {
-                    self.order.told_by_master(now, &subject, nodes);
-                }
-                if self.order.has_new_repeat() {
-                    outbox_changed.notify_one();
-                }
-            }
-        }
-        let registered = |node: &str| self.mirror.api_of(node).is_some();
-        if self.activity.applied(now, call, noticed, registered) {
-            outbox_changed.notify_one();
-        }
-        reply
-    }
-
-    fn set_identity(&mut self, identity: (i32, String)) {
-        self.mirror.set_identity(identity.0, identity.1.clone());
-        self.identity = identity;
-    }
-
-    fn adopt(&mut self, state: Master) -> Vec<String> {
-        let mut difference = Vec::new();
-        let differs = self.mirror != state;
-        if differs {
-            difference = replay::difference(&self.mirror, &state);
-            self.version += 1;
-        }
-        let (python, old) = (self.mirror.python(), self.mirror.is_old());
-        // An equal `state` replaces the mirror too, because the new one may be known more exactly.
-        self.mirror = state;
-        self.mirror.set_python(python);
-        self.mirror.set_old(old);
-        if differs {
-            self.changed_unrecorded();
-        }
-        self.set_identity(self.identity.clone());
-        difference
-    }
-
-    fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
-        if self.pending.extend(writes).is_err() {
-            // If the present master answers again, it gets the mirror's whole state.
-            self.raise_incarnation();
-            self.write_session();
-        }
-    }
-
-    fn raise_incarnation(&mut self) {
-        self.behind = None;
-        self.pending.clear();
-        self.session.incarnation += 1;
-        self.session.delivered = self.seq();
-        self.session_unwritten = true;
-    }
-
-    fn update_session(&mut self, change: impl FnOnce(&mut Session)) {
-        change(&mut self.session);
-        self.session_unwritten = true;
-        self.write_session();
-    }
-
-    fn write_session(&mut self) {
-        if std::mem::take(&mut self.session_unwritten) {
-            // While a complete checkpoint is due, the file lacks changes that have no record.
-            self.session.cluster_seq = match self.whole.is_due() {
-                true => 0,
-                false => self.cluster_seq(),
-            };
-            let entry = RecordContent::Session(self.session.clone());
-            self.append(vec![entry]);
-        }
-    }
-
-    fn token(&self) -> Token {
-        Token::new(&self.session.mark, self.session.incarnation)
-    }
-
-    /// Notes that the mirror has changed without a record. The next complete checkpoint is due.
-    fn changed_unrecorded(&mut self) {
-        self.whole.unrecorded = self.version;
-        self.share_state();
-    }
-
-    /// Number of the journal's last record.
-    fn seq(&self) -> u64 {
-        self.last_seq().unwrap_or_default()
-    }
-
-    /// Number of the journal's last record. `None` without a journal.
-    fn last_seq(&self) -> Option<u64> {
-        self.journal.as_ref().map(Journal::seq)
-    }
-
-    /// Identifies the last record, so that an answer can wait for it.
-    fn mark(&self) -> Mark {
-        Mark {
-            disk: self.last_seq(),
-            shared: self.shared.last(),
-        }
-    }
-
-    /// Passes `entries` to the journal. A failure is kept in the store, and does not fail the call.
-    fn append(&mut self, entries: Vec<RecordContent>) {
-        self.append_from(entries, &[]);
-    }
-
-    /// Like [`Self::append`], with the source of each call. Missing sources stand for this computer.
-    fn append_from(&mut self, entries: Vec<RecordContent>, sources: &[&Source]) {
-        // The session's record comes first, because it names the incarnation of the following entries.
-        self.write_session();
-        self.share(&entries, sources);
-        if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {
-            journal.append(entries);
-        }
     }
 }
 

@@ -21,7 +21,7 @@
 //! The *shell* does IO and decides as little as possible. From the bottom to the top:
 //!
 //! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
-//! * `clock`, `resolver`, `wait`: the wall clock; addresses of hosts; waiting for optional events.
+//! * `clock`, `resolver`, `task`, `wait`: the wall clock; addresses of hosts; starting tasks; waiting for optional events.
 //! * `limit`, [`log`]: how often a line is logged; where the log goes.
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
@@ -38,6 +38,7 @@
 //! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
 //! * [`app`]: assembles the program.
 //! * [`commands`]: the commands that do not serve nodes.
+//! * [`program`]: arguments, logging, signals and exit statuses.
 //!
 //! `docs/architecture.md` names the functions that a call and a record pass on their way through these modules.
 
@@ -58,12 +59,14 @@ pub(crate) mod limit;
 pub mod log;
 pub(crate) mod nodes;
 pub(crate) mod process;
+pub mod program;
 pub(crate) mod recovery;
 pub(crate) mod resolver;
 pub mod ros_env;
 pub(crate) mod roscore;
 pub(crate) mod server;
 pub(crate) mod status;
+pub(crate) mod task;
 pub(crate) mod upstream;
 pub(crate) mod wait;
 pub(crate) mod write_queue;

@@ -271,7 +271,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
             () = wait::tick(&mut reaping) => {
                 if nodes.gate.is_open() {
                     let check = reap(nodes.clone());
-                    tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
+                    crate::task::spawn(check.instrument(tracing::debug_span!("health_check")));
                 }
             }
         }
@@ -360,7 +360,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
     nodes.update_notifying();
     for port in due {
         let nodes = nodes.clone();
-        tokio::spawn(async move {
+        crate::task::spawn(async move {
             let outcome = health_check::visit(&nodes, port).await;
             match outcome.sign {
                 Reaction::Alive => say(&outcome, "an unreachable node answers again"),

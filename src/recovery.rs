@@ -13,10 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::{
-    sync::Notify,
-    task::{JoinHandle, spawn_blocking},
-};
+use tokio::{sync::Notify, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
@@ -208,7 +205,7 @@ impl Driver {
             return;
         }
         let look = move || (pid.and_then(effort::of), effort::own_wait());
-        let (master, own_wait) = spawn_blocking(look).await.unwrap_or_default();
+        let (master, own_wait) = crate::task::spawn_blocking(look).await.unwrap_or_default();
         self.lifecycle.observe(Sample {
             at: Instant::now(),
             master,
@@ -561,7 +558,7 @@ fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     let id = u32::try_from(pid).ok().filter(|_| sentinel.is_local())?;
     Some(Box::pin(async move {
         // The check blocks, because reading the command line needs the lock of the master's memory.
-        let watched = spawn_blocking(move || process::runs(id, "rosmaster")).await;
+        let watched = crate::task::spawn_blocking(move || process::runs(id, "rosmaster")).await;
         if let (Ok(true), Ok(ended)) = (watched, thread_exit::of(pid)) {
             ended.await;
         } else {
@@ -575,7 +572,7 @@ async fn holder(new: Option<(u32, u16, bool)>) -> Holder {
     let Some((pid, port, own)) = new else {
         return Holder::Unknown;
     };
-    let look = spawn_blocking(move || Holder::of(pid, port, own));
+    let look = crate::task::spawn_blocking(move || Holder::of(pid, port, own));
     look.await.unwrap_or(Holder::Unknown)
 }
 

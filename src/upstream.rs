@@ -315,7 +315,7 @@ impl Upstream {
         let (found, asked) = (self.found.clone(), address.clone());
         // The lookup runs in a task of its own, so that a late answer can serve the next connection. A moved master is
         // found even with a slow name server.
-        let lookup = tokio::spawn(async move {
+        let lookup = crate::task::spawn(async move {
             let addresses = resolver::addresses(&asked.host, asked.port).await?;
             found.send_replace(Some((asked, addresses)));
             io::Result::Ok(())

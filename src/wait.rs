@@ -36,7 +36,7 @@ pub(crate) async fn within<T: Send + 'static>(
     limit: Duration,
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Option<T> {
-    let work = tokio::task::spawn_blocking(work);
+    let work = crate::task::spawn_blocking(work);
     tokio::time::timeout(limit, work).await.ok()?.ok()
 }
 

@@ -51,7 +51,9 @@ struct Stage {
 impl Stage {
     fn start(count: usize) -> Self {
         let (scratch, master_port) = (Scratch::new(), free_port());
-        let setup = Setup::core(&scratch, master_port).arg("--no-rosout");
+        // The default, unlike in most tests.
+        let setup = Setup::core(&scratch, master_port).env("ROSRESCUE_STAND_IN_AFTER", "100");
+        let setup = setup.arg("--no-rosout");
         let rescue = setup.guarded().start();
         let client = rescue.client();
         client.set_param("/deaths/value", 1);

@@ -49,6 +49,7 @@ use crate::{
     ros_env::MasterUri,
     server::others::{Forwarded, Handover},
     status::cluster::MemberFacts,
+    task::boxed,
     upstream::{Head, peer::Peers},
     wait,
     write_queue::WriteQueue,
@@ -148,7 +149,7 @@ impl ClusterDriver {
         }
         let actions = self.member.on(now, input);
         let lease = self.member.machine().lease(now);
-        self.setup.context.ledger.set_lease(lease);
+        self.setup.context.ledger.lease.set(lease);
         for action in actions {
             match action {
                 Action::End => return Some(Ok(())),
@@ -234,7 +235,7 @@ impl ClusterDriver {
                     let _ = ledger.follow_state(state);
                 }
             }
-            Action::Acknowledge(seq) => ledger.agree(seq),
+            Action::Acknowledge(seq) => ledger.agreement.reach(seq),
             Action::TakeAsState => {
                 let state = ledger.take_as_state();
                 self.inbox.push_front(Input::AsState(state));
@@ -350,7 +351,7 @@ impl ClusterDriver {
 
     /// Starts `work`. If it panics, its result is `otherwise`, because the member waits for every result.
     fn spawn(&mut self, otherwise: Input, work: impl Future<Output = Input> + Send + 'static) {
-        self.work.spawn(answered(otherwise, work));
+        self.work.spawn(boxed(answered(otherwise, work)));
     }
 
     fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {

@@ -8,7 +8,7 @@ use std::{
 
 use tokio::{
     sync::Notify,
-    task::{JoinError, JoinHandle, spawn_blocking},
+    task::{JoinError, JoinHandle},
 };
 use tokio_util::sync::CancellationToken;
 
@@ -87,7 +87,7 @@ impl Context {
         if seeds {
             roscore::seed_run_id(&roscore);
         }
-        tokio::spawn(roscore::run(roscore, rosout, stop))
+        crate::task::spawn(roscore::run(roscore, rosout, stop))
     }
 
     /// Creates the driver of a single computer, with its first actions.
@@ -107,7 +107,8 @@ impl Context {
         let process = match rosmaster {
             Some(rosmaster) => {
                 let starter = rosmaster.clone();
-                let orphan = spawn_blocking(move || rosmaster.claim_orphan(port)).await;
+                let orphan =
+                    crate::task::spawn_blocking(move || rosmaster.claim_orphan(port)).await;
                 Some(MasterProcess::new(
                     starter,
                     port,
@@ -119,7 +120,7 @@ impl Context {
         let has_orphan = process.as_ref().is_some_and(MasterProcess::is_orphan);
         let (stop, halt) = ends;
         let duties = rosout.map(|rosout| self.roscore(rosout, !has_orphan, stop.clone()));
-        tokio::spawn(async move {
+        crate::task::spawn(async move {
             stop.cancelled().await;
             if let Some(duties) = duties {
                 // A panic in that task must not prevent the stop.
@@ -148,7 +149,7 @@ impl Context {
         let mut driver = self.driver(Some(process));
         let first = driver.take_over(cause);
         MasterDuties {
-            driver: tokio::spawn(driver.run(first, stop.clone())),
+            driver: crate::task::spawn(driver.run(first, stop.clone())),
             roscore,
             roscore_stop,
             stop,

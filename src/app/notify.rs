@@ -49,17 +49,17 @@ pub(super) fn start(
                 pid,
                 restarted: is_restarted(pid),
             };
-            tokio::spawn(follow_guardian(pid, guarded, link, context.clone()));
+            crate::task::spawn(follow_guardian(pid, guarded, link, context.clone()));
             guarded
         }
     };
     context.board.update(|facts| facts.guarded = guarded);
     let is_notified = std::env::var_os("NOTIFY_SOCKET").is_some();
     if is_notified {
-        tokio::spawn(report_ready(context.clone()));
-        tokio::spawn(report_status(context, stop.clone()));
+        crate::task::spawn(report_ready(context.clone()));
+        crate::task::spawn(report_status(context, stop.clone()));
     }
-    tokio::spawn(async move {
+    crate::task::spawn(async move {
         stop.cancelled().await;
         if is_notified {
             let state = [NotifyState::Stopping, NotifyState::Status("stopping")];
@@ -206,7 +206,7 @@ async fn report_status(context: Arc<Context>, stop: CancellationToken) {
 /// Sends a message to systemd in a thread of its own, because sending blocks while systemd does not
 /// read.
 async fn send(notify: impl FnOnce() -> io::Result<()> + Send + 'static) {
-    let sent = tokio::task::spawn_blocking(notify).await;
+    let sent = crate::task::spawn_blocking(notify).await;
     if let Err(error) = sent.map_err(io::Error::other).flatten() {
         tracing::debug!(%error, "could not notify systemd");
     }

@@ -5,8 +5,6 @@ use std::{
     time::Duration,
 };
 
-use tokio::task::spawn_blocking;
-
 use super::{RunError, earlier, life};
 use crate::{
     checkpoint::{
@@ -128,7 +126,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     }
     if let Some(store) = &store {
         let (path, most) = (store.path().to_owned(), config.history);
-        spawn_blocking(move || {
+        crate::task::spawn_blocking(move || {
             if let Err(error) = history::trim(&path, most) {
                 tracing::debug!(%error, "cannot list the kept checkpoints");
             }

@@ -178,7 +178,7 @@ impl Drill<'_> {
             key: self.key().to_owned(),
             topic: format!("{}/topic", self.key()),
         };
-        self.calls = Some(tokio::spawn(callers.run(stop.clone())));
+        self.calls = Some(crate::task::spawn(callers.run(stop.clone())));
         self.choose_topics().await?;
         sleep(BEFORE).await;
         let meanwhile = RobotState::read(&api)

@@ -147,7 +147,7 @@ async fn try_exchange(
     request: hyper::http::Result<Request<Full<Bytes>>>,
 ) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
     let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
-    tokio::spawn(connection);
+    crate::task::spawn(connection);
     let (head, body) = sender.send_request(request?).await?.into_parts();
     let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
     Ok((head.status, body))

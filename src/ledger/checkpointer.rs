@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::{task::spawn_blocking, time::timeout};
+use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::{
@@ -165,7 +165,7 @@ impl Checkpointer {
         });
         let (check, sync) = jobs.await.unwrap_or_default();
         let folder = self.path.parent().map(PathBuf::from).unwrap_or_default();
-        let work = spawn_blocking(move || {
+        let work = crate::task::spawn_blocking(move || {
             let free = free_bytes(&folder);
             (check.map(CheckJob::run), sync.map(SyncJob::run), free)
         });
@@ -218,7 +218,7 @@ impl Checkpointer {
         let (seq, finished) = match begun {
             None => return,
             Some((seq, Err(error))) => (seq, Some(Err(error))),
-            Some((seq, Ok(job))) => match spawn_blocking(move || job.run()).await {
+            Some((seq, Ok(job))) => match crate::task::spawn_blocking(move || job.run()).await {
                 Ok(done) => {
                     let finished = self.on_store(|store| store.finish_compaction(done));
                     (seq, finished.await)
@@ -250,7 +250,7 @@ impl Checkpointer {
     /// are unknown. Its state is not used, because the state in memory is newer.
     async fn open_again(&self) {
         let path = self.path.clone();
-        let opened = spawn_blocking(move || Store::open_over(&path)).await;
+        let opened = crate::task::spawn_blocking(move || Store::open_over(&path)).await;
         if let Ok(Ok(store)) = opened {
             self.ledger.set_store(store);
         }

@@ -3,21 +3,17 @@
 use std::{
     path::PathBuf,
     sync::{Arc, atomic::Ordering},
-    time::Instant,
 };
 
-use tokio::{
-    task::{block_in_place, spawn_blocking},
-    time::timeout,
-};
+use tokio::{task::block_in_place, time::timeout};
 
 use super::{
-    Inner, Ledger,
+    Ledger,
     journal::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
     shared::Agreed,
 };
 use crate::checkpoint::{
-    format::{Checkpoint, Session},
+    format::Checkpoint,
     store::{Store, StoreError},
 };
 
@@ -89,7 +85,7 @@ impl Ledger {
             }
         }
         match mark.shared {
-            Some(place) => self.agreed(place).await,
+            Some(place) => self.agreement.wait(place).await,
             None => true,
         }
     }
@@ -104,7 +100,7 @@ impl Ledger {
     /// Writes the queued records to the checkpoint, in another thread.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
-            spawn_blocking(move || worker.work());
+            crate::task::spawn_blocking(move || worker.work());
         }
     }
 
@@ -223,27 +219,6 @@ impl Ledger {
         let late = self.sync_is_late.load(Ordering::Relaxed).then_some(SILENT);
         let unprotected = journal.seen().unprotected;
         unprotected.or_else(|| failure.or(late).map(str::to_owned))
-    }
-}
-
-impl Inner {
-    pub(super) fn checkpoint(&self) -> Checkpoint {
-        Checkpoint {
-            seq: self.seq(),
-            session: Session {
-                cluster_seq: self.cluster_seq(),
-                ..self.session.clone()
-            },
-            pending: self
-                .pending
-                .calls()
-                .iter()
-                .cloned()
-                .map(Into::into)
-                .collect(),
-            snapshot: self.mirror.snapshot(),
-            displaced: self.activity.displaced_lately(Instant::now()),
-        }
     }
 }
 

@@ -41,7 +41,7 @@ impl Rescues {
         };
         // The checkpoint is taken now: the health check will soon unregister dead nodes.
         let checkpoint = self.ledger.checkpoint();
-        tokio::task::spawn_blocking(move || {
+        crate::task::spawn_blocking(move || {
             let kept = history::keep_rescue(&path, number, checkpoint);
             match kept.and_then(|kept| history::trim(&path, bytes_most).map(|()| kept)) {
                 Ok(kept) => {

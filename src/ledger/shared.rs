@@ -1,18 +1,11 @@
-//! Replication: the writes that the other computers get from this one, and those that this one gets from the leader.
+//! Replication: whose writes the ledger holds, how far the other computers have them, and until when this computer may
+//! lead.
 
 use std::time::Instant;
 
 use tokio::sync::watch;
 
-use super::{Inner, Ledger, Superseded};
-use crate::{
-    checkpoint::format::{Record, RecordContent},
-    cluster::{
-        merge::Verdict,
-        sharing::{Change, Sharing, Source},
-    },
-    master::{Master, Request},
-};
+use crate::cluster::sharing::Sharing;
 
 /// Which computer's writes the ledger holds.
 #[derive(Debug)]
@@ -25,12 +18,12 @@ pub(super) enum Shared {
     Here { times_led: u64, sharing: Sharing },
 }
 
-/// A position in the journal that all computers share: a record's number, and a count of [`Ledger::leave`] calls, which
+/// A position in the journal that all computers share: a record's number, and a count of [`Ledger::leave`](super::Ledger::leave) calls, which
 /// tells the terms of this computer apart.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
     times_led: u64,
-    seq: u64,
+    pub(super) seq: u64,
 }
 
 impl Shared {
@@ -45,16 +38,17 @@ impl Shared {
     }
 }
 
-impl Ledger {
-    /// Notes that another computer has the master, or may have it. From now on only the records given to
-    /// [`Self::follow`] are recorded. Calls whose records the other computers lack are not acknowledged. No node is
-    /// notified, because the other computer does that.
-    pub fn leave(&self) {
-        let mut inner = self.lock();
-        inner.shared = Shared::Elsewhere;
-        inner.order.forget_notifications();
-        drop(inner);
-        self.agreed.send_modify(|agreed| {
+/// How far the other computers have this computer's records.
+pub(crate) struct Agreement(watch::Sender<Agreed>);
+
+impl Agreement {
+    pub(super) fn new() -> Self {
+        Self(watch::Sender::default())
+    }
+
+    /// Notes that another computer has the master, so what was not agreed never will be.
+    pub(super) fn lost(&self) {
+        self.0.send_modify(|agreed| {
             *agreed = Agreed {
                 times_led: agreed.times_led + 1,
                 seq: 0,
@@ -62,75 +56,46 @@ impl Ledger {
         });
     }
 
-    /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is
-    /// the state that the others hold. If this computer's state differs, the others get the whole state.
-    pub fn lead(&self, seq: u64, held: &Master) {
-        let mut inner = self.lock();
-        let times_led = self.agreed.borrow().times_led;
-        let sharing = Sharing::after(seq);
-        inner.shared = Shared::Here { times_led, sharing };
-        if inner.mirror != *held {
-            inner.share_state();
-        }
-        drop(inner);
-        // The other computers have these records. A write that changes nothing waits only for the last of them.
-        self.agree(seq);
-        self.shared.notify_one();
-    }
-
-    /// Whether this computer records its own calls, instead of another computer's.
-    pub fn records_here(&self) -> bool {
-        !self.lock().is_elsewhere()
-    }
-
-    /// Takes the changes that the other computers have not got yet.
-    pub(crate) fn take_changes(&self) -> Vec<Change> {
-        match &mut self.lock().shared {
-            Shared::Here { sharing, .. } => sharing.take(),
-            _ => Vec::new(),
-        }
-    }
-
-    /// Like [`Self::take_changes`], but takes the changes as a single one: the state that they have led to. `None` if
-    /// this computer does not have the master.
-    pub(crate) fn take_as_state(&self) -> Option<Change> {
-        let inner = &mut *self.lock();
-        match &mut inner.shared {
-            Shared::Here { sharing, .. } => Some(sharing.take_as_state(&inner.mirror)),
-            _ => None,
-        }
-    }
-
-    /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
-    /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
-    /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
-    pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
-        let inner = self.lock();
-        match &inner.shared {
-            Shared::Here { sharing, .. } => sharing.judge(&inner.mirror, seq, merge, calls),
-            _ => None,
-        }
+    pub(super) fn times_led(&self) -> u64 {
+        self.0.borrow().times_led
     }
 
     /// The last record of this term that the other computers have or do not need.
-    pub fn last_agreed(&self) -> u64 {
-        self.agreed.borrow().seq
+    pub(crate) fn last(&self) -> u64 {
+        self.0.borrow().seq
     }
 
     /// Notes that the other computers have the records up to `seq`, or do not need them.
-    pub fn agree(&self, seq: u64) {
-        self.agreed.send_if_modified(|agreed| {
+    pub(crate) fn reach(&self, seq: u64) {
+        self.0.send_if_modified(|agreed| {
             let more = seq > agreed.seq;
             agreed.seq = agreed.seq.max(seq);
             more
         });
     }
 
+    /// Waits until the other computers have the record at `place`. False if this computer stopped leading before that.
+    pub(super) async fn wait(&self, place: Agreed) -> bool {
+        let mut agreed = self.0.subscribe();
+        // This cannot fail: this owns the sender.
+        let reached = agreed.wait_for(|reached| *reached >= place).await;
+        reached.is_ok_and(|reached| reached.times_led == place.times_led)
+    }
+}
+
+/// Until when this computer may act as leader.
+pub(crate) struct LeaderLease(watch::Sender<Option<Instant>>);
+
+impl LeaderLease {
+    pub(super) fn new() -> Self {
+        Self(watch::Sender::new(None))
+    }
+
     /// Sets until when no other computer can lead. `None` if there is no limit. After that time no call goes to this
     /// computer's master and no node is notified: another leader may have acknowledged newer writes while this process
     /// stood still.
-    pub fn set_lease(&self, until: Option<Instant>) {
-        self.lease.send_if_modified(|lease| {
+    pub(crate) fn set(&self, until: Option<Instant>) {
+        self.0.send_if_modified(|lease| {
             // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease.
             let now = Instant::now();
             let held = lease.is_none_or(|until| now < until);
@@ -139,115 +104,23 @@ impl Ledger {
         });
     }
 
-    /// Whether this computer may act as leader now; see [`Self::set_lease`].
-    pub fn has_lease(&self) -> bool {
-        self.lease
-            .borrow()
-            .is_none_or(|until| Instant::now() < until)
+    /// Whether this computer may act as leader now; see [`Self::set`].
+    pub(crate) fn is_held(&self) -> bool {
+        self.0.borrow().is_none_or(|until| Instant::now() < until)
     }
 
     /// Signals when this computer may act as leader again.
-    pub(crate) fn lease_changed(&self) -> watch::Receiver<Option<Instant>> {
-        self.lease.subscribe()
+    pub(crate) fn changed(&self) -> watch::Receiver<Option<Instant>> {
+        self.0.subscribe()
     }
 
     /// Waits until this computer may act as leader.
-    pub(crate) async fn await_lease(&self) {
-        let mut changed = self.lease_changed();
-        while !self.has_lease() {
-            // This cannot fail: the ledger owns the sender.
+    pub(crate) async fn wait(&self) {
+        let mut changed = self.changed();
+        while !self.is_held() {
+            // This cannot fail: this owns the sender.
             let _ = changed.changed().await;
         }
-    }
-
-    /// Waits until the other computers have the record at `place`. False if this computer stopped leading before that.
-    pub(super) async fn agreed(&self, place: Agreed) -> bool {
-        let mut agreed = self.agreed.subscribe();
-        // This cannot fail: the ledger owns the sender.
-        let reached = agreed.wait_for(|reached| *reached >= place).await;
-        reached.is_ok_and(|reached| reached.times_led == place.times_led)
-    }
-
-    /// Applies and records the records of the computer that has the master.
-    ///
-    /// # Errors
-    ///
-    /// If this computer has the master itself.
-    pub fn follow(&self, records: &[Record]) -> Result<(), Superseded> {
-        let mut inner = self.lock();
-        if !inner.is_elsewhere() {
-            return Err(Superseded);
-        }
-        let entries: Vec<RecordContent> =
-            records.iter().map(|record| record.entry.clone()).collect();
-        for entry in &entries {
-            if let RecordContent::Call { call, .. } = entry {
-                inner
-                    .mirror
-                    .apply_telling(&Request::from(call.clone()), &mut ());
-                inner.version += 1;
-            }
-        }
-        inner.append(entries);
-        drop(inner);
-        self.write_soon();
-        self.work.notify_one();
-        Ok(())
-    }
-
-    /// Replaces the state by that of the computer that has the master.
-    ///
-    /// # Errors
-    ///
-    /// If this computer has the master itself.
-    pub fn follow_state(&self, state: Master) -> Result<(), Superseded> {
-        let mut inner = self.lock();
-        if !inner.is_elsewhere() {
-            return Err(Superseded);
-        }
-        inner.pending.clear();
-        inner.activity = Default::default();
-        (inner.doubted, inner.abandoned) = (false, false);
-        inner.adopt(state);
-        drop(inner);
-        self.work.notify_one();
-        Ok(())
-    }
-}
-
-impl Inner {
-    /// Whether another computer has the master.
-    pub(super) fn is_elsewhere(&self) -> bool {
-        matches!(self.shared, Shared::Elsewhere)
-    }
-
-    /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
-    pub(super) fn share(&mut self, entries: &[RecordContent], sources: &[&Source]) {
-        let Shared::Here { sharing, .. } = &mut self.shared else {
-            return;
-        };
-        for (index, entry) in entries.iter().enumerate() {
-            if let RecordContent::Call { call, .. } = entry {
-                let source = sources.get(index).copied().unwrap_or(&Source::Here);
-                sharing.record(&Request::from(call.clone()), source);
-            }
-        }
-    }
-
-    /// Notes that the state has changed without a call.
-    pub(super) fn share_state(&mut self) {
-        if let Shared::Here { sharing, .. } = &mut self.shared {
-            sharing.record_state(&self.mirror);
-            // The state takes a number in that journal, so the session's record must be written again: later calls have
-            // other numbers than that record tells.
-            self.session_unwritten = true;
-        }
-    }
-
-    /// See [`Session::cluster_seq`](crate::checkpoint::format::Session::cluster_seq).
-    pub(super) fn cluster_seq(&self) -> u64 {
-        let last = self.shared.last();
-        last.map_or(self.session.cluster_seq, |last| last.seq)
     }
 }
 
@@ -257,10 +130,14 @@ mod tests {
 
     use super::*;
     use crate::{
-        checkpoint::format::Session,
+        checkpoint::format::{Record, RecordContent, Session},
         cli::SyncPolicy,
-        ledger::durability::Mark,
-        master::Method,
+        cluster::{
+            merge::Verdict,
+            sharing::{Change, Source},
+        },
+        ledger::{Ledger, Mark},
+        master::{Master, Method, Request},
         xmlrpc::{Reply, Value},
     };
 
@@ -357,12 +234,12 @@ mod tests {
         assert_eq!(seqs(&ledger), [8, 9]);
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[0]).await, None);
-        ledger.agree(8);
+        ledger.agreement.reach(8);
         assert_eq!(acknowledged(&ledger, marks[0]).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, None);
-        ledger.agree(9);
+        ledger.agreement.reach(9);
         // A late acknowledgement undoes nothing.
-        ledger.agree(8);
+        ledger.agreement.reach(8);
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
     }
 
@@ -401,7 +278,7 @@ mod tests {
         ledger.leave();
         ledger.lead(0, &Master::default());
         let marks = [set(1), set(2)].map(|call| answer(&ledger, &call));
-        ledger.agree(1);
+        ledger.agreement.reach(1);
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
@@ -409,7 +286,7 @@ mod tests {
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));
-        ledger.agree(2);
+        ledger.agreement.reach(2);
         assert_eq!(acknowledged(&ledger, again).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
     }
@@ -483,21 +360,21 @@ mod tests {
     async fn who_waits_for_the_lease_goes_on_when_there_is_a_new_one() {
         let ledger = ledger();
         assert!(
-            ledger.has_lease(),
+            ledger.lease.is_held(),
             "without other computers it always holds"
         );
         let now = Instant::now();
-        ledger.set_lease(Some(now));
-        assert!(!ledger.has_lease());
-        let waits = async { ledger.await_lease().await };
+        ledger.lease.set(Some(now));
+        assert!(!ledger.lease.is_held());
+        let waits = async { ledger.lease.wait().await };
         let renews = async {
             tokio::task::yield_now().await;
-            ledger.set_lease(Some(now + Duration::from_secs(60)));
+            ledger.lease.set(Some(now + Duration::from_secs(60)));
         };
         tokio::join!(waits, renews);
-        assert!(ledger.has_lease());
-        ledger.set_lease(None);
-        assert!(ledger.has_lease());
+        assert!(ledger.lease.is_held());
+        ledger.lease.set(None);
+        assert!(ledger.lease.is_held());
     }
 
     #[tokio::test]
@@ -524,7 +401,7 @@ mod tests {
             panic!("{changes:?}");
         };
         assert!(**first == state_of([set(1)]) && **last == state_of([set(3)]));
-        ledger.agree(8);
+        ledger.agreement.reach(8);
         assert_eq!(acknowledged(&ledger, mark).await, None);
     }
 }

@@ -1,6 +1,7 @@
 //! Summaries of replies for the log.
 
-use super::Inner;
+use std::collections::HashSet;
+
 use crate::{
     master::Method,
     replay::Answered,
@@ -30,10 +31,15 @@ fn cut(text: &str) -> &str {
     text.get(..end.min(text.len())).unwrap_or(text)
 }
 
-impl Inner {
-    pub(super) fn report_divergence(&mut self, answered: &Answered<'_>, mirror: &Reply) {
+/// The methods for which the mirror has replied differently from a master.
+#[derive(Default)]
+pub(super) struct Divergences(HashSet<Method>);
+
+impl Divergences {
+    /// Logs the first divergence of each method.
+    pub(super) fn report(&mut self, answered: &Answered<'_>, mirror: &Reply) {
         let method = answered.call.method();
-        if self.diverged.insert(method.clone()) {
+        if self.0.insert(method.clone()) {
             let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
             tracing::warn!(
                 method = method.name(),

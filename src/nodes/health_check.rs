@@ -32,6 +32,7 @@ use crate::{
     replay::Token,
     resolver,
     ros_env::MasterUri,
+    task::boxed,
     write_queue::batch::{self, Precondition},
     xmlrpc::{Reply, Value},
 };
@@ -114,7 +115,7 @@ fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
     });
     let mut visits = JoinSet::new();
     for port in ports {
-        visits.spawn(visit(nodes, port));
+        visits.spawn(boxed(visit(nodes, port)));
     }
     visits
 }

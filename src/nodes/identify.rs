@@ -63,7 +63,7 @@ pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
     for name in due {
         let port = port_of(&name.api).to_owned();
         let names = new.entry(port.clone()).or_insert_with(|| {
-            tokio::spawn(identify(nodes.clone(), port));
+            crate::task::spawn(identify(nodes.clone(), port));
             Vec::new()
         });
         names.push(name);

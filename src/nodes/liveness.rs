@@ -119,7 +119,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         };
         let listening = Arc::new(listening);
         for port in due {
-            tokio::spawn(ask(nodes.clone(), port, listening.clone()));
+            crate::task::spawn(ask(nodes.clone(), port, listening.clone()));
         }
     }
 }

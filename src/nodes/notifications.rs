@@ -104,7 +104,7 @@ pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     for port in ports {
         match nodes.is_unreachable(&port) {
             true => nodes.ledger.with_order(|order, _| order.drop_port(&port)),
-            false => drop(tokio::spawn(deliver(nodes.clone(), port))),
+            false => drop(crate::task::spawn(deliver(nodes.clone(), port))),
         }
     }
 }
@@ -117,12 +117,15 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
     loop {
         // The semaphore is never closed.
         let permit = notifications.permits.acquire().await.ok();
-        nodes.ledger.await_lease().await;
+        nodes.ledger.lease.wait().await;
         if !nodes.may_tell(&port).await {
             return nodes.ledger.with_order(|order, _| order.drop_port(&port));
         }
         changed.mark_unchanged();
-        let (call, number) = match nodes.ledger.next_notification(&port) {
+        let (call, number) = match nodes
+            .ledger
+            .with_order(|order, mirror| order.next(Instant::now(), &port, mirror))
+        {
             NextNotification::Send { call, number } => (call, number),
             NextNotification::Wait { until } => {
                 drop(permit);
@@ -150,7 +153,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 asked.await
             }
         };
-        nodes.ledger.notification_ended(number);
+        nodes.ledger.release(|order| order.taken(number));
         if is_param && sign == Reaction::Silent && answers(&nodes, &port).await {
             nodes.set_mute(&port, true);
             continue;
@@ -175,12 +178,12 @@ async fn answers(nodes: &Nodes, port: &str) -> bool {
 /// listens at the address by now.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
-    tokio::spawn(async move {
+    crate::task::spawn(async move {
         for seconds in SHUTDOWN_PAUSES {
             tokio::time::sleep(Duration::from_secs(seconds)).await;
             let name = Subject::Name(displaced.node.clone());
             answers_are_written(&nodes, port_of(&displaced.api), &name).await;
-            nodes.ledger.await_lease().await;
+            nodes.ledger.lease.wait().await;
             if !nodes.may_tell(port_of(&displaced.api)).await {
                 return;
             }

@@ -10,10 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::{
-    task::spawn_blocking,
-    time::{MissedTickBehavior, interval},
-};
+use tokio::time::{MissedTickBehavior, interval};
 
 use super::{Stat, listeners};
 use crate::{
@@ -236,7 +233,7 @@ pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: Strin
         let Some(place) = MasterAddresses::of(&upstream.address()).await else {
             continue;
         };
-        let looked = spawn_blocking(move || {
+        let looked = crate::task::spawn_blocking(move || {
             let new = bypass.look(&place);
             (place.is_open(), new, bypass)
         });

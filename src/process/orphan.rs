@@ -220,7 +220,7 @@ mod tests {
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
-        let end = tokio::spawn(ended(orphan));
+        let end = crate::task::spawn(ended(orphan));
         signal_process(orphan, Signal::KILL);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is reported").unwrap().unwrap();
@@ -240,7 +240,6 @@ mod tests {
             numworkers: 1,
             timeout: 0.0,
             rosout: false,
-            log_dir: folder.path().to_owned(),
         };
         let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
         let mut ended = Command::new("sleep").arg("60").spawn().unwrap();

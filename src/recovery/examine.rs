@@ -118,7 +118,7 @@ pub(crate) struct Prepared {
 
 /// Prepares the injection into an empty master, in a thread of its own.
 pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
-    tokio::task::spawn_blocking(move || {
+    crate::task::spawn_blocking(move || {
         let (version, target, token) = ledger.next();
         let plan = Plan::new(&target, &Master::default(), &token);
         Prepared {
@@ -443,7 +443,7 @@ impl Examiner {
                     self.stats.masters_restored.count();
                 }
                 // Freeing thousands of small allocations takes time, so another thread does it.
-                tokio::task::spawn_blocking(move || drop(plan));
+                crate::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
             examination.mismatches = mismatches;
@@ -504,14 +504,14 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, Exami
 
 /// Runs [`sockets::may_run_a_call`] in another thread, because with 15,000 sockets it takes 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
-    let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
+    let looked = crate::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
 }
 
 /// Whether the process `pid` seems to listen at the port of `master`.
 async fn listens(pid: i32, master: SocketAddr) -> bool {
     let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
-    tokio::task::spawn_blocking(look).await.unwrap_or(false)
+    crate::task::spawn_blocking(look).await.unwrap_or(false)
 }
 
 /// Logs the differences between the master and the mirror.

@@ -88,7 +88,7 @@ impl MasterProcess {
     /// Waits for `end` in a task, then reports how `pid` ended.
     fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
         let ends = self.ends.0.clone();
-        tokio::spawn(async move {
+        crate::task::spawn(async move {
             // The receiver is gone only at shutdown.
             let _ = ends.send((pid, end.await)).await;
         });

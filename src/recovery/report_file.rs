@@ -56,7 +56,7 @@ pub(super) fn keep(checkpoint: PathBuf, kept: ReportRecord) {
     if LIMIT.pass(Instant::now()).is_none() {
         return;
     }
-    tokio::task::spawn_blocking(move || {
+    crate::task::spawn_blocking(move || {
         if let Err(error) = write(&checkpoint, &kept) {
             tracing::debug!(%error, "could not keep the report of this rescue");
         }

@@ -168,7 +168,7 @@ impl Driver {
                     }
                 }
             };
-            tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
+            crate::task::spawn(check.instrument(tracing::debug_span!("health_check")));
         }
     }
 

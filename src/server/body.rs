@@ -158,7 +158,7 @@ pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result
 async fn in_a_thread<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Option<T> {
-    tokio::task::spawn_blocking(work).await.ok()?.ok()
+    crate::task::spawn_blocking(work).await.ok()?.ok()
 }
 
 #[cfg(test)]

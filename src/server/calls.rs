@@ -268,7 +268,7 @@ impl Calls {
             }
         };
         let before = last.take();
-        let encoding = tokio::task::spawn_blocking(move || encode(before));
+        let encoding = crate::task::spawn_blocking(move || encode(before));
         let answer = encoding.await.ok()??;
         let text = answer.text.clone();
         *last = Some(answer).filter(|answer| answer.text.len() <= KEPT_MOST);
@@ -298,7 +298,7 @@ impl Calls {
         let patience = self.patience();
         loop {
             changed.mark_unchanged();
-            if let Ok(delivery) = self.ledger.begin_read(Instant::now(), read) {
+            if let Ok(delivery) = Delivery::of_read(&self.ledger, Instant::now(), read) {
                 return delivery;
             }
             if tokio::time::timeout_at(patience, changed.changed())
@@ -306,7 +306,7 @@ impl Calls {
                 .is_err()
             {
                 self.slow.notify_one();
-                return self.ledger.begin_read_now(read?);
+                return Delivery::of_read_now(&self.ledger, read?);
             }
         }
     }
@@ -352,7 +352,7 @@ impl Calls {
                             if let Some(reply) = self.stand_in(known_now).await {
                                 // The read continues, because its end shows that the master answers again.
                                 let pool = self.pool.clone();
-                                tokio::spawn(async move {
+                                crate::task::spawn(async move {
                                     let _stalled = pool.stalled();
                                     let _ = forwarding.await;
                                 });

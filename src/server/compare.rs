@@ -52,7 +52,7 @@ impl Calls {
             return;
         }
         let (ledger, read, body) = (self.ledger.clone(), read.clone(), raw.body.clone());
-        tokio::task::spawn_blocking(move || {
+        crate::task::spawn_blocking(move || {
             let Ok(Reply::Value(shown)) = xmlrpc::decode_reply(&body) else {
                 return;
             };

@@ -23,7 +23,7 @@ use super::{
     deadlines::{Deadlines, Timed},
     service,
 };
-use crate::limit::rarely;
+use crate::{limit::rarely, task::boxed};
 
 /// Number of connections that the kernel holds while rosrescue is busy or restarting.
 const BACKLOG: i32 = 1024;
@@ -163,7 +163,8 @@ pub async fn run(
                     connection.await;
                     drop(permit);
                 };
-                connections.spawn(served.instrument(tracing::debug_span!("connection", %peer)));
+                let span = tracing::debug_span!("connection", %peer);
+                connections.spawn(boxed(served.instrument(span)));
             }
             Err(error) => {
                 if !std::mem::replace(&mut failed, true) {

@@ -260,7 +260,7 @@ impl Others {
                                 let number = HeaderValue::from(number);
                                 reply.headers_mut().insert(peer::ANSWER_HEADER, number);
                             }
-                            let seq = HeaderValue::from(calls.ledger.last_agreed());
+                            let seq = HeaderValue::from(calls.ledger.agreement.last());
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
                         }
@@ -439,7 +439,7 @@ impl Call<'_> {
         // is back.
         let mut asked = {
             let (leader, head, body) = (leader.clone(), self.head.clone(), self.body.clone());
-            tokio::spawn(async move { leader.forward(term, &head, &body).await })
+            crate::task::spawn(async move { leader.forward(term, &head, &body).await })
         };
         let reply: Result<RawReply, PeerError> =
             match tokio::time::timeout(PATIENCE, &mut asked).await {

@@ -269,6 +269,6 @@ async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
             }
         }
     };
-    let made = tokio::task::spawn_blocking(work).await;
+    let made = crate::task::spawn_blocking(work).await;
     made.unwrap_or_else(|error| text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")))
 }

@@ -248,5 +248,5 @@ async fn decode(
     }
     body::room_for_values(&body, room).await?;
     let work = move || master::Request::decode_for(&body, python).ok();
-    Ok(tokio::task::spawn_blocking(work).await.ok().flatten())
+    Ok(crate::task::spawn_blocking(work).await.ok().flatten())
 }

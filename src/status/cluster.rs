@@ -63,8 +63,6 @@ pub struct MemberFacts {
 }
 
 impl MemberFacts {
-    /// Pause between two reports of a computer to the others.
-    pub const SAYS_EVERY: Duration = Duration::from_secs(5);
     /// A computer counts as away if it has not reported for this long.
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
 

@@ -38,7 +38,7 @@ impl NextConnection {
             tokio::task::yield_now().await;
             connect.await
         };
-        let ahead = || AbortOnDropHandle::new(tokio::spawn(connect));
+        let ahead = || AbortOnDropHandle::new(crate::task::spawn(connect));
         useful.then(|| Self::Ahead(ahead(), Instant::now()))
     }
 

@@ -128,7 +128,7 @@ mod tests {
         let name = hyper::header::HeaderValue::from_static("test");
         let upstream = Upstream::new(uri, name, Duration::from_secs(1), 3);
         let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
-        let ended = tokio::spawn({
+        let ended = crate::task::spawn({
             let sentinel = sentinel.clone();
             async move { sentinel.ended().await }
         });

@@ -22,6 +22,7 @@ use crate::{
     ledger::{Ledger, Mark, delivery::Delivery},
     limit::rarely,
     master::{Master, Method, Request},
+    order::Order,
     status::stats::Stats,
     upstream::{RawReply, inspect::InspectError, next::NextConnection},
     wait,
@@ -50,12 +51,20 @@ struct InFlight {
     done: Pin<Box<dyn Future<Output = RoundTripResult> + Send>>,
 }
 
+/// What wakes the worker of the queue.
+struct Wakes {
+    gate: gate::Rx,
+    items: mpsc::Receiver<Item>,
+    order_changed: watch::Receiver<()>,
+    lease: watch::Receiver<Option<Instant>>,
+    resync_interval: Option<Duration>,
+}
+
+/// The worker of the write queue.
 pub(crate) struct Drain {
     pub(super) link: Link,
-    gate: gate::Rx,
+    wakes: Wakes,
     stats: &'static Stats,
-    resync_interval: Option<Duration>,
-    items: mpsc::Receiver<Item>,
     pub(super) queue: VecDeque<Item>,
     connection: Option<(u64, NextConnection)>,
     in_flight: Option<InFlight>,
@@ -78,8 +87,6 @@ pub(crate) struct Drain {
     retry_at: Option<tokio::time::Instant>,
     /// Latest time to retry calls that wait until other calls are answered.
     pub(super) held_until: Option<tokio::time::Instant>,
-    order_changed: watch::Receiver<()>,
-    lease: watch::Receiver<Option<Instant>>,
     /// Successful calls that rosrescue does not understand. Their answers wait until the mirror has
     /// been read from the master again and includes their effects.
     opaque: Opaque,
@@ -106,13 +113,15 @@ impl Drain {
     ) -> Self {
         Self {
             held_until: None,
-            order_changed: link.ledger.order_changed(),
-            lease: link.ledger.lease_changed(),
+            wakes: Wakes {
+                gate,
+                items,
+                order_changed: link.ledger.order_changed(),
+                lease: link.ledger.lease.changed(),
+                resync_interval,
+            },
             link,
-            gate,
             stats,
-            resync_interval,
-            items,
             queue: VecDeque::new(),
             connection: None,
             in_flight: None,
@@ -132,16 +141,15 @@ impl Drain {
 
     /// Runs until every [`WriteQueue`](super::WriteQueue) is gone.
     pub(crate) async fn run(mut self) {
-        let mut gate = self.gate.clone();
-        let mut interval = self.resync_interval.map(tokio::time::interval);
+        let mut interval = self.wakes.resync_interval.map(tokio::time::interval);
         loop {
             let mut changed = false;
             tokio::select! {
-                item = self.items.recv() => match item {
+                item = self.wakes.items.recv() => match item {
                     Some(item) => self.queue.push_back(item),
                     None => return,
                 },
-                () = gate.changed() => changed = true,
+                () = self.wakes.gate.changed() => changed = true,
                 done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
                     // A read that takes longer than the interval must leave time for calls.
                     if matches!(done.result, Ok(Received::Held(_))) && let Some(interval) = &mut interval {
@@ -152,8 +160,8 @@ impl Drain {
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = wait::until(self.held_until) => {}
                 // The ledger lives as long as this task.
-                _ = self.order_changed.changed() => {}
-                _ = self.lease.changed() => {}
+                _ = self.wakes.order_changed.changed() => {}
+                _ = self.wakes.lease.changed() => {}
                 () = wait::until(self.grace) => {}
                 () = wait::until(self.late_at) => {}
                 () = wait::tick(&mut interval) => {
@@ -163,20 +171,20 @@ impl Drain {
                 }
                 () = wait::until(self.resync.wake_at()) => self.resync.wake(),
             }
-            while let Ok(item) = self.items.try_recv() {
+            while let Ok(item) = self.wakes.items.try_recv() {
                 self.queue.push_back(item);
             }
             // Drops calls that are answered or whose client has gone.
             self.queue.retain(|item| !item.is_dropped());
             // Checked on every wake-up: once seen, a change is not notified again.
-            let (state, unseen) = gate.look_changed();
+            let (state, unseen) = self.wakes.gate.look_changed();
             if changed || unseen {
                 (self.retry_at, self.lost) = (None, false);
             }
             self.late_over &= state == State::Late;
             match state {
                 State::Elsewhere => self.send_elsewhere(),
-                _ if !self.link.ledger.has_lease() => {}
+                _ if !self.link.ledger.lease.is_held() => {}
                 State::Open { incarnation } => self.send(incarnation),
                 State::StandingIn => self.stand_in(),
                 State::Late => self.stand_in_for_late(),
@@ -254,7 +262,7 @@ impl Drain {
         };
         if items.is_empty() && self.queue.is_empty() {
             // No call is left: the callers of lost calls have gone.
-            self.link.ledger.settled_calls();
+            self.link.ledger.release(Order::settled);
         }
         if items.is_empty() && !inspects {
             return;
@@ -317,7 +325,7 @@ impl Drain {
         }
         // A master that ran a lost batch may have notified nodes, and the mirror does not know yet of what.
         if !self.lost {
-            self.link.ledger.settled_calls();
+            self.link.ledger.release(Order::settled);
         }
     }
 
@@ -336,7 +344,7 @@ impl Drain {
                 self.signals.lost.notify_one();
             }
         }
-        self.link.ledger.settled_calls();
+        self.link.ledger.release(Order::settled);
     }
 
     fn resync(&mut self, incarnation: u64, version: u64, state: Master) {
@@ -500,7 +508,7 @@ impl Drain {
             self.take_back(batch.items);
         }
         self.answer_queue();
-        self.link.ledger.settled_calls();
+        self.link.ledger.release(Order::settled);
     }
 
     /// Answers from the mirror the batch that the master is late with, then the queue. The batch continues. When the
@@ -567,7 +575,7 @@ impl Drain {
     fn send_elsewhere(&mut self) {
         (self.grace, self.connection) = (None, None);
         let in_flight = self.in_flight.take().map(|batch| batch.items);
-        self.link.ledger.settled_calls();
+        self.link.ledger.release(Order::settled);
         let opaque = std::mem::take(&mut self.opaque).answers;
         let items = in_flight.into_iter().flatten();
         let items = items.chain(opaque.into_iter().map(|(item, _)| item));
@@ -592,7 +600,7 @@ impl Drain {
             return send(true);
         }
         let ledger = self.link.ledger.clone();
-        tokio::spawn(async move {
+        crate::task::spawn(async move {
             let is_safe = match mark {
                 Some(mark) => ledger.durable(mark).await,
                 None => true,

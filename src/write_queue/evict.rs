@@ -79,7 +79,7 @@ pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
 
 fn own(eviction: Eviction, by: String) -> Item {
     let (item, answered) = Item::new(None, Some(Arc::new(eviction.call)));
-    tokio::spawn(async move {
+    crate::task::spawn(async move {
         if let Ok((CallAnswer::Raw(_) | CallAnswer::Made(_), _)) = answered.await {
             say(&eviction.nodes, &by);
         }

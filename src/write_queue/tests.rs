@@ -28,7 +28,7 @@ use crate::{
     health::port_of,
     ledger::{Ledger, delivery::Delivery, late::CatchUp},
     master::{Kind, Master, Notice, Request},
-    order::{NextNotification, Subject},
+    order::{NextNotification, Order, Subject},
     status::stats::Stats,
     upstream::Head,
     xmlrpc::{Call, Reply, Value},
@@ -231,7 +231,7 @@ impl World {
         if call.kind() == Kind::Read {
             let begun = match self.mutant {
                 Mutant::NoOrder => Ok(None),
-                _ => self.ledger.begin_read(self.instant(), Some(&call)),
+                _ => Delivery::of_read(&self.ledger, self.instant(), Some(&call)),
             };
             match begun {
                 Ok(delivery) => {
@@ -389,7 +389,7 @@ impl World {
         (self.in_flight, self.late) = (None, false);
         let now = self.instant();
         self.ledger.late_answered(now);
-        self.ledger.settled_calls();
+        self.ledger.release(Order::settled);
         match self.ledger.begin_catch_up(now) {
             Some(CatchUp::Nothing) => {}
             Some(CatchUp::Run(missed)) => {
@@ -420,7 +420,7 @@ impl World {
         for (item, reply) in items.into_iter().zip(replies) {
             item.reply(CallAnswer::Made(reply));
         }
-        self.ledger.settled_calls();
+        self.ledger.release(Order::settled);
     }
 
     /// Lets the mirror answer what is queued, as `Drain::stand_in` does.
@@ -429,7 +429,7 @@ impl World {
             self.answer_item(item);
         }
         if !self.late {
-            self.ledger.settled_calls();
+            self.ledger.release(Order::settled);
         }
     }
 

@@ -125,10 +125,10 @@ fn named<'a>(code: &'a str, root: &str) -> Vec<&'a str> {
 
 /// The modules, each above all that it may import: `docs/decisions/0020`.
 #[rustfmt::skip]
-const LAYERS: [&str; 33] = [
-    "clock", "dice", "limit", "log", "regular_file", "wait", "xmlrpc", "master", "hide", "replay", "lifecycle", "health", "order", "checkpoint", "cli", "ros_env",
+const LAYERS: [&str; 35] = [
+    "clock", "dice", "limit", "log", "regular_file", "task", "wait", "xmlrpc", "master", "hide", "replay", "lifecycle", "health", "order", "checkpoint", "cli", "ros_env",
     "config", "resolver", "cluster", "gate", "status", "ledger", "upstream", "write_queue", "guardian", "process", "nodes",
-    "recovery", "roscore", "server", "app", "commands", "main",
+    "recovery", "roscore", "server", "app", "commands", "program", "main",
 ];
 
 #[test]

@@ -1,4 +1,5 @@
-//! Keeps files under other names: damaged files, foreign files at the checkpoint's path, and files of ended sessions.
+//! The checkpoint's path and lock, and the files that are kept under other names: damaged files, foreign files at the
+//! path, and files of ended sessions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,20 +7,62 @@ use std::path::{Path, PathBuf};
 use super::generation::{append_all, failed};
 use super::names::previous;
 use super::storage::FileId;
-use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
+use super::{BROKEN, Loaded, Names, OpenError, Storage, StoreError, open_failed};
 
-impl<S: Storage> Store<S> {
-    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes the
-    /// previous generation, or renames it too if the present file may lack records. Afterwards nothing can be recorded
-    /// before the next [`begin`](Self::begin). Returns the new path, if there was a file.
-    ///
-    /// # Errors
-    ///
-    /// If the files cannot be renamed. They may then still have their old names.
-    pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
-        self.active = None;
-        self.overtake();
-        self.unprotected = Some("its file has been set aside".to_owned());
+/// The file at the checkpoint's path, as this store has read or written it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Present {
+    pub(super) id: FileId,
+    /// False if the file may lack records of the previous generation, which it must not replace in that case.
+    pub(super) usable: bool,
+}
+
+/// The checkpoint's path, its lock, and the file that is there.
+pub(super) struct LockedPath<S: Storage> {
+    pub(super) storage: S,
+    pub(super) names: Names,
+    /// The file at the path, as this store has read or written it. Any other file there is kept under another name
+    /// before it is replaced.
+    pub(super) present: Option<Present>,
+    /// Part of the name under which the next foreign file is kept.
+    pub(super) aside_kind: &'static str,
+    /// The name under which the last foreign file was kept.
+    pub(super) kept: Option<PathBuf>,
+    lock: S::Lock,
+    pub(super) lock_id: FileId,
+}
+
+impl<S: Storage> LockedPath<S> {
+    /// Locks `path` without reading the file there.
+    pub(super) fn lock(storage: S, path: &Path) -> Result<Self, OpenError> {
+        let path = storage
+            .locate(path)
+            .map_err(open_failed("create the folder of", path))?;
+        let names = Names { path };
+        let lock_path = names.lock();
+        let lock = storage
+            .lock(&names.path, &lock_path)
+            .map_err(open_failed("lock", &lock_path))?
+            .map_err(|holder| OpenError::Locked {
+                path: names.path.clone(),
+                holder,
+            })?;
+        let lock_id = storage
+            .lock_id(&lock)
+            .map_err(open_failed("lock", &lock_path))?;
+        Ok(Self {
+            storage,
+            names,
+            present: None,
+            aside_kind: BROKEN,
+            kept: None,
+            lock,
+            lock_id,
+        })
+    }
+
+    /// Renames the present file; see [`Store::set_aside`](super::Store::set_aside).
+    pub(super) fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
         // A usable file contains everything that the previous generation contains.
         let whole = self.present.take().is_some_and(|present| present.usable);
         let kind: String = reason
@@ -46,9 +89,7 @@ impl<S: Storage> Store<S> {
         });
         moved.map_err(failed("set aside", path))
     }
-}
 
-impl<S: Storage> Store<S> {
     /// Moves the file at `fresh` to the checkpoint's path. If a file is already at that path, renames it first. Does
     /// not rename it if it is the `previous` generation, which is kept already, or an unusable file of this store.
     pub(super) fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
@@ -64,6 +105,24 @@ impl<S: Storage> Store<S> {
         self.aside_kind = BROKEN;
         self.kept = Some(aside);
         Ok(())
+    }
+
+    /// Makes sure that the lock at the path is held, before anything is written there.
+    pub(super) fn hold_lock(&mut self) -> Result<(), StoreError> {
+        let path = self.names.lock();
+        let renewed = self.storage.renew_lock(&mut self.lock, &path);
+        let renewed = renewed.and_then(|renewed| {
+            self.lock_id = self.storage.lock_id(&self.lock)?;
+            Ok(renewed)
+        });
+        match renewed {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(holder)) => Err(StoreError::Taken {
+                path: self.names.path.clone(),
+                holder,
+            }),
+            Err(error) => Err(failed("lock", &path)(error)),
+        }
     }
 }
 

@@ -223,7 +223,7 @@ impl<S: Storage> Store<S> {
         if self.is_busy() {
             return Err(StoreError::Busy);
         }
-        self.hold_lock()?;
+        self.place.hold_lock().map_err(|error| self.latch(error))?;
         self.seq = seq;
         self.generation += 1;
         let generation = self.generation;
@@ -236,10 +236,11 @@ impl<S: Storage> Store<S> {
         });
         let unsettled = self.active.as_ref().is_some_and(|active| !active.named);
         Ok(Plan {
-            storage: self.storage.clone(),
-            names: self.names.clone(),
+            storage: self.place.storage.clone(),
+            names: self.place.names.clone(),
             generation,
             keep_present: self
+                .place
                 .present
                 .filter(|present| present.usable)
                 .map(|present| present.id),
@@ -274,7 +275,7 @@ impl<S: Storage> Store<S> {
     /// [`wants_compaction`](Self::wants_compaction) becomes true when its journal has doubled in size. If the new file
     /// could not be moved to the path, the store is [unprotected](Self::unprotected).
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
-        let fresh = self.names.fresh(done.generation);
+        let fresh = self.place.names.fresh(done.generation);
         let pending = self
             .pending
             .take_if(|pending| pending.generation == done.generation);
@@ -282,7 +283,7 @@ impl<S: Storage> Store<S> {
         let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
             // The new file may not exist. If it cannot be removed, the next start removes it.
-            let _ = self.storage.remove(&fresh);
+            let _ = self.place.storage.remove(&fresh);
             let journal = self
                 .active
                 .as_ref()
@@ -297,10 +298,10 @@ impl<S: Storage> Store<S> {
         pending: Option<PendingGeneration>,
         done: Compacted<S>,
     ) -> Result<(), StoreError> {
-        let fresh = self.names.fresh(done.generation);
+        let fresh = self.place.names.fresh(done.generation);
         let written = done.result?;
         let Some(pending) = pending.filter(|pending| !pending.superseded) else {
-            return Err(self.names.superseded());
+            return Err(self.place.names.superseded());
         };
         let mut journal = Vec::with_capacity(pending.meanwhile.len());
         for body in pending
@@ -312,20 +313,21 @@ impl<S: Storage> Store<S> {
             journal.extend_from_slice(body);
             format::seal(&mut journal, start, written.stamp);
         }
-        append_all(&self.storage, &written.file, &journal)
+        append_all(&self.place.storage, &written.file, &journal)
             .and_then(|()| match written.linked {
                 true => Ok(()),
                 // Only file systems without hard links, such as FAT, wait here.
-                false => self.storage.sync(&written.file),
+                false => self.place.storage.sync(&written.file),
             })
             .map_err(failed("write", &fresh))?;
         let status = self
+            .place
             .storage
             .status(&written.file)
             .map_err(failed("check", &fresh))?;
-        if let Err(source) = self.take_path(&fresh, written.previous) {
+        if let Err(source) = self.place.take_path(&fresh, written.previous) {
             // It is unknown which file is at the path now, so recording stops.
-            return Err(self.latch(failed("replace", &self.names.path)(source)));
+            return Err(self.latch(failed("replace", &self.place.names.path)(source)));
         }
         self.active = Some(Active {
             file: Arc::new(written.file),
@@ -340,22 +342,13 @@ impl<S: Storage> Store<S> {
             clean: journal.is_empty(),
             named: false,
         });
-        self.present = Some(Present {
+        self.place.present = Some(Present {
             id: status.id,
             usable: true,
         });
         self.unprotected = None;
         self.compact_above = COMPACTION_BYTES_MIN;
         Ok(())
-    }
-
-    /// Ends the [unprotected](Self::unprotected) state: writes `checkpoint` to a new file, like [`begin`](Self::begin).
-    ///
-    /// # Errors
-    ///
-    /// The errors of [`begin`](Self::begin). Try again later.
-    pub fn rearm(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
-        self.begin(checkpoint)
     }
 
     /// Writes `checkpoint`, which must be marked as closed, to a last new file, and stops recording.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::generation::failed;
 use super::storage::FileId;
+use super::watch::{CheckJob, Checked, Finding, ForeignChange};
 use super::{Names, Storage, Store, StoreError};
 use rescue_core::checkpoint::format::{self, RecordContent, Stamp};
 
@@ -66,14 +67,14 @@ impl<S: Storage> Store<S> {
             (_, reason) => {
                 let reason = reason.clone().unwrap_or_default();
                 return Err(StoreError::Unprotected {
-                    path: self.names.path.clone(),
+                    path: self.place.names.path.clone(),
                     reason,
                 });
             }
         };
         // Before a record is acknowledged, make sure that it is not in a truncated file or behind another process's
         // bytes.
-        if let Ok(status) = self.storage.status(&active.file)
+        if let Ok(status) = self.place.storage.status(&active.file)
             && let Err(change) = active.compare(&status)
         {
             return Err(self.changed(change));
@@ -83,7 +84,7 @@ impl<S: Storage> Store<S> {
         let appended = match length > self.file_bytes_max {
             // The next start could not read a larger file.
             true => Err(io::ErrorKind::FileTooLarge.into()),
-            false => self.storage.append(&active.file, &self.buffer),
+            false => self.place.storage.append(&active.file, &self.buffer),
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
@@ -98,7 +99,7 @@ impl<S: Storage> Store<S> {
             Ok(()) => {
                 active.journal_bytes += self.buffer.len() as u64;
                 active.crc = crc32c::crc32c_append(active.crc, &self.buffer);
-                if let Ok(status) = self.storage.status(&active.file) {
+                if let Ok(status) = self.place.storage.status(&active.file) {
                     active.modified = status.modified;
                     if let Err(change) = active.compare(&status) {
                         return Err(self.changed(change));
@@ -107,14 +108,14 @@ impl<S: Storage> Store<S> {
                 encoded?;
                 Ok(self.seq)
             }
-            Err(source) => Err(self.latch(failed("write", &self.names.path)(source))),
+            Err(source) => Err(self.latch(failed("write", &self.place.names.path)(source))),
         }
     }
 
     /// Stops recording to the present file for good, because the disk did not answer and the file lacks records.
     /// `reason` is shown to the user.
     pub fn give_up(&mut self, reason: &str) {
-        self.latch(failed("write", &self.names.path)(io::Error::new(
+        self.latch(failed("write", &self.place.names.path)(io::Error::new(
             io::ErrorKind::TimedOut,
             reason,
         )));
@@ -124,7 +125,7 @@ impl<S: Storage> Store<S> {
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());
         if self.active.take().is_some_and(|active| !active.named)
-            && let Some(present) = &mut self.present
+            && let Some(present) = &mut self.place.present
         {
             // It is unknown how much of the file is durable. The previous generation is durable, so this file must not
             // replace it.
@@ -140,9 +141,9 @@ impl<S: Storage> Store<S> {
             .as_ref()
             .filter(|active| !active.clean || !active.named)?;
         Some(SyncJob {
-            storage: self.storage.clone(),
+            storage: self.place.storage.clone(),
             file: Arc::clone(&active.file),
-            names: (!active.named).then(|| self.names.clone()),
+            names: (!active.named).then(|| self.place.names.clone()),
             generation: active.generation,
             seq: self.seq,
         })
@@ -167,10 +168,56 @@ impl<S: Storage> Store<S> {
                 }
                 Ok(())
             }
-            (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
+            (Err(source), Some(_)) => {
+                Err(self.latch(failed("sync", &self.place.names.path)(source)))
+            }
             // This sync belongs to a file that has been replaced since. The new file has the same records and is not
             // synced yet.
             (Err(_), None) => Ok(()),
+        }
+    }
+
+    /// A job that checks whether the file at the path and the lock are those of this store, and unchanged. `None` if
+    /// nothing is being recorded, or if the status of the open file is already wrong, which stops recording.
+    pub fn check_job(&mut self) -> Option<CheckJob<S>> {
+        let job = CheckJob::of(&self.place, self.active.as_mut()?);
+        job.map_err(|finding| self.lose(finding)).ok()
+    }
+
+    /// Notes the result of a check.
+    ///
+    /// # Errors
+    ///
+    /// If the check found a difference. The store is now [unprotected](Self::unprotected).
+    pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
+        let active = self.active.as_ref();
+        let current = active.is_some_and(|active| active.generation == done.generation);
+        match done.result {
+            Err(finding) if current => Err(self.lose(finding)),
+            // All is well, or the checked file has been replaced since.
+            _ => Ok(()),
+        }
+    }
+
+    /// Stops recording to the present file for good, because another process has made `change`.
+    fn changed(&mut self, change: ForeignChange) -> StoreError {
+        if matches!(change, ForeignChange::Lock) {
+            // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
+            // the lock cannot be taken, the next generation reports it.
+            let _ = self.place.hold_lock();
+        } else {
+            // Another process's file may be at the path now. Without `present`, that file is kept under another name
+            // when it is replaced.
+            self.place.present = None;
+        }
+        let path = self.place.names.path.clone();
+        self.latch(StoreError::Changed { path, change })
+    }
+
+    fn lose(&mut self, finding: Finding) -> StoreError {
+        match finding {
+            Finding::Changed(change) => self.changed(change),
+            Finding::Io(error) => self.latch(failed("check", &self.place.names.path)(error)),
         }
     }
 }

@@ -10,7 +10,7 @@
 //!
 //! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only once that
 //! data was lost. The store is then [unprotected](Store::unprotected), which means that it records nothing, until
-//! [`Store::rearm`] has written a new file. If another process changes the file, its folder or its lock, writes still
+//! [`Store::begin`] has written a new file. If another process changes the file, its folder or its lock, writes still
 //! succeed. A [`CheckJob`] notices the change, which latches as well.
 
 mod aside;
@@ -32,7 +32,7 @@ mod watch;
 
 use std::path::{Path, PathBuf};
 
-use aside::{keep_aside, set_aside_previous};
+use aside::{LockedPath, Present, keep_aside, set_aside_previous};
 pub use error::{OpenError, StoreError};
 use generation::{COMPACTION_BYTES_MIN, PendingGeneration};
 pub use generation::{Compacted, CompactionJob};
@@ -50,18 +50,9 @@ const BROKEN: &str = "broken";
 /// Part of the name under which an unreadable file is kept.
 const UNREADABLE: &str = "unreadable";
 
-/// The file at the checkpoint's path, as this store has read or written it.
-#[derive(Clone, Copy, Debug)]
-struct Present {
-    id: FileId,
-    /// False if the file may lack records of the previous generation, which it must not replace in that case.
-    usable: bool,
-}
-
 /// A checkpoint that is locked and open.
 pub struct Store<S: Storage = Disk> {
-    storage: S,
-    names: Names,
+    place: LockedPath<S>,
     /// The file that receives the records.
     active: Option<Active<S>>,
     /// Why nothing is being recorded. `None` only if `active` is set.
@@ -72,18 +63,9 @@ pub struct Store<S: Storage = Disk> {
     synced_seq: u64,
     /// The number of the last generation (checkpoint file) that was begun.
     generation: u64,
-    /// The file at the path, as this store has read or written it. Any other file there is kept under another name
-    /// before it is replaced.
-    present: Option<Present>,
-    /// Part of the name under which the next foreign file is kept.
-    aside_kind: &'static str,
-    /// The name under which the last foreign file was kept.
-    kept: Option<PathBuf>,
     compact_above: u64,
     file_bytes_max: u64,
     buffer: Vec<u8>,
-    lock: S::Lock,
-    lock_id: FileId,
 }
 
 /// Reads the checkpoint at `path` without changing anything: takes no lock, creates no folder, makes no copies. It
@@ -144,7 +126,7 @@ impl<S: Storage> Store<S> {
     /// newer version wrote it. In all these cases the file is unchanged.
     pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         let mut store = Self::lock_on(storage, path)?;
-        let (storage, names) = (&store.storage, &store.names);
+        let (storage, names) = (&store.place.storage, &store.place.names);
         let Some(found) = load::load(storage, names)? else {
             // The operator has removed the file to start without it, so the previous generation must not be restored
             // later.
@@ -155,13 +137,13 @@ impl<S: Storage> Store<S> {
             return Ok((store, None));
         };
         let mut loaded = found.loaded;
-        store.present = found.present;
-        if store.present.is_none() {
-            store.aside_kind = UNREADABLE;
+        store.place.present = found.present;
+        if store.place.present.is_none() {
+            store.place.aside_kind = UNREADABLE;
         }
         // A failure here does not matter: a read-only disk can still be read.
         let _ = names.remove_unfinished(storage);
-        let kept = match store.present {
+        let kept = match store.place.present {
             Some(_) => keep_aside(storage, names, &mut loaded, found.torn),
             None => Ok(()),
         };
@@ -173,7 +155,7 @@ impl<S: Storage> Store<S> {
                 "the damaged part of `{path}` could not be kept: {error}"
             ));
             // Without `present`, the damaged file is kept under another name when it is replaced.
-            store.present = store.present.filter(|present| present.usable);
+            store.place.present = store.place.present.filter(|present| present.usable);
         }
         store.set_counts(found.seq, found.generation);
         Ok((store, Some(loaded)))
@@ -187,51 +169,30 @@ impl<S: Storage> Store<S> {
     /// The errors of [`open_on`](Self::open_on). In all these cases no file is renamed.
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
-        let (storage, names) = (&store.storage, &store.names);
+        let (storage, names) = (&store.place.storage, &store.place.names);
         // Numbers that the old file has used must not be used again.
         let found = load::load(storage, names)?.unwrap_or_default();
         let _ = names.remove_unfinished(storage);
         set_aside_previous(storage, names, UNREADABLE)
             .map_err(open_failed("clear the folder of", &names.path))?;
-        store.aside_kind = UNREADABLE;
+        store.place.aside_kind = UNREADABLE;
         store.set_counts(found.seq, found.generation);
         Ok(store)
     }
 
     /// Locks `path` without reading the file there.
     fn lock_on(storage: S, path: &Path) -> Result<Self, OpenError> {
-        let path = storage
-            .locate(path)
-            .map_err(open_failed("create the folder of", path))?;
-        let names = Names { path };
-        let lock_path = names.lock();
-        let lock = storage
-            .lock(&names.path, &lock_path)
-            .map_err(open_failed("lock", &lock_path))?
-            .map_err(|holder| OpenError::Locked {
-                path: names.path.clone(),
-                holder,
-            })?;
-        let lock_id = storage
-            .lock_id(&lock)
-            .map_err(open_failed("lock", &lock_path))?;
         Ok(Self {
-            storage,
-            names,
+            place: LockedPath::lock(storage, path)?,
             active: None,
             unprotected: Some("recording has not begun yet".to_owned()),
             pending: None,
             seq: 0,
             synced_seq: 0,
             generation: 0,
-            present: None,
-            aside_kind: BROKEN,
-            kept: None,
             compact_above: COMPACTION_BYTES_MIN,
             file_bytes_max: load::FILE_BYTES_MAX,
             buffer: Vec::new(),
-            lock,
-            lock_id,
         })
     }
 
@@ -241,7 +202,7 @@ impl<S: Storage> Store<S> {
 
     /// The path of the file, with links resolved.
     pub fn path(&self) -> &Path {
-        &self.names.path
+        &self.place.names.path
     }
 
     /// Number of the last entry, recorded or not.
@@ -276,5 +237,24 @@ impl<S: Storage> Store<S> {
     /// Why nothing is being recorded. `None` if records are written.
     pub fn unprotected(&self) -> Option<&str> {
         self.unprotected.as_deref()
+    }
+
+    /// Returns the name under which another process's file at the checkpoint's path was kept. Returns each name once.
+    pub fn take_kept(&mut self) -> Option<PathBuf> {
+        self.place.kept.take()
+    }
+
+    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next session. Removes the
+    /// previous generation, or renames it too if the present file may lack records. Afterwards nothing can be recorded
+    /// before the next [`begin`](Self::begin). Returns the new path, if there was a file.
+    ///
+    /// # Errors
+    ///
+    /// If the files cannot be renamed. They may then still have their old names.
+    pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
+        self.active = None;
+        self.overtake();
+        self.unprotected = Some("its file has been set aside".to_owned());
+        self.place.set_aside(reason)
     }
 }

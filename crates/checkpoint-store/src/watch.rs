@@ -5,14 +5,13 @@
 //! what the store knows. A difference *latches*, as a failed write does: the store records nothing more to this file.
 
 use std::io;
-use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::generation::failed;
+use super::aside::LockedPath;
 use super::journal::Active;
 use super::storage::{FileId, FileStatus};
-use super::{Names, Storage, Store, StoreError};
+use super::{Names, Storage};
 
 /// A change made by another process.
 #[derive(Debug, Error)]
@@ -36,7 +35,7 @@ pub enum ForeignChange {
 
 /// Why the file cannot be trusted.
 #[derive(Debug)]
-enum Finding {
+pub(super) enum Finding {
     Changed(ForeignChange),
     Io(io::Error),
 }
@@ -61,11 +60,26 @@ pub struct CheckJob<S: Storage> {
 
 #[must_use = "give it to `Store::checked`"]
 pub struct Checked {
-    generation: u64,
-    result: Result<(), Finding>,
+    pub(super) generation: u64,
+    pub(super) result: Result<(), Finding>,
 }
 
 impl<S: Storage> CheckJob<S> {
+    /// A check of the `active` file at `place`. Compares the status of the open file at once.
+    pub(super) fn of(place: &LockedPath<S>, active: &mut Active<S>) -> Result<Self, Finding> {
+        let status = place.storage.status(&active.file)?;
+        active.compare(&status).map_err(Finding::Changed)?;
+        let content = std::mem::take(&mut active.suspect);
+        Ok(Self {
+            storage: place.storage.clone(),
+            names: place.names.clone(),
+            generation: active.generation,
+            id: active.id,
+            lock_id: place.lock_id,
+            content: content.then(|| (active.length(), active.crc)),
+        })
+    }
+
     /// Runs the check with a few system calls. Reads the file only if it may have been overwritten.
     pub fn run(self) -> Checked {
         Checked {
@@ -111,94 +125,5 @@ impl<S: Storage> Active<S> {
             self.suspect = true;
         }
         Ok(())
-    }
-}
-
-impl<S: Storage> Store<S> {
-    /// A job that checks whether the file at the path and the lock are those of this store, and unchanged. `None` if
-    /// nothing is being recorded, or if the status of the open file is already wrong, which stops recording.
-    pub fn check_job(&mut self) -> Option<CheckJob<S>> {
-        let active = self.active.as_mut()?;
-        let status = self.storage.status(&active.file);
-        let compared = match status {
-            Ok(status) => active.compare(&status).map_err(Finding::Changed),
-            Err(error) => Err(Finding::Io(error)),
-        };
-        let content = std::mem::take(&mut active.suspect);
-        let content = content.then(|| (active.length(), active.crc));
-        let (generation, id) = (active.generation, active.id);
-        if let Err(finding) = compared {
-            self.lose(finding);
-            return None;
-        }
-        Some(CheckJob {
-            storage: self.storage.clone(),
-            names: self.names.clone(),
-            generation,
-            id,
-            lock_id: self.lock_id,
-            content,
-        })
-    }
-
-    /// Notes the result of a check.
-    ///
-    /// # Errors
-    ///
-    /// If the check found a difference. The store is now [unprotected](Self::unprotected).
-    pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
-        let active = self.active.as_ref();
-        let current = active.is_some_and(|active| active.generation == done.generation);
-        match done.result {
-            Err(finding) if current => Err(self.lose(finding)),
-            // All is well, or the checked file has been replaced since.
-            _ => Ok(()),
-        }
-    }
-
-    /// Stops recording to the present file for good, because another process has made `change`.
-    pub(super) fn changed(&mut self, change: ForeignChange) -> StoreError {
-        if matches!(change, ForeignChange::Lock) {
-            // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
-            // the lock cannot be taken, the next generation reports it.
-            let _ = self.hold_lock();
-        } else {
-            // Another process's file may be at the path now. Without `present`, that file is kept under another name
-            // when it is replaced.
-            self.present = None;
-        }
-        let path = self.names.path.clone();
-        self.latch(StoreError::Changed { path, change })
-    }
-
-    fn lose(&mut self, finding: Finding) -> StoreError {
-        match finding {
-            Finding::Changed(change) => self.changed(change),
-            Finding::Io(error) => self.latch(failed("check", &self.names.path)(error)),
-        }
-    }
-
-    /// Makes sure that this store holds the lock at the path, before anything is written there.
-    pub(super) fn hold_lock(&mut self) -> Result<(), StoreError> {
-        let path = self.names.lock();
-        let renewed = self.storage.renew_lock(&mut self.lock, &path);
-        let renewed = renewed.and_then(|renewed| {
-            self.lock_id = self.storage.lock_id(&self.lock)?;
-            Ok(renewed)
-        });
-        let error = match renewed {
-            Ok(Ok(())) => return Ok(()),
-            Ok(Err(holder)) => StoreError::Taken {
-                path: self.names.path.clone(),
-                holder,
-            },
-            Err(error) => failed("lock", &path)(error),
-        };
-        Err(self.latch(error))
-    }
-
-    /// Returns the name under which another process's file at the checkpoint's path was kept. Returns each name once.
-    pub fn take_kept(&mut self) -> Option<PathBuf> {
-        self.kept.take()
     }
 }

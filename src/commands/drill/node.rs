@@ -151,7 +151,7 @@ impl DrillNode {
             port: listener.local_addr()?.port(),
         };
         let heard = Arc::new(NodeLog::default());
-        let server = tokio::spawn(serve(listener, heard.clone()));
+        let server = crate::task::spawn(serve(listener, heard.clone()));
         Ok(Self {
             name,
             api: api.to_string(),
@@ -176,7 +176,7 @@ async fn serve(listener: TcpListener, heard: Arc<NodeLog>) {
         let heard = heard.clone();
         let service = service_fn(move |request| answer(heard.clone(), request));
         // It does not matter if a caller closes the connection.
-        tokio::spawn(http1::Builder::new().serve_connection(TokioIo::new(stream), service));
+        crate::task::spawn(http1::Builder::new().serve_connection(TokioIo::new(stream), service));
     }
 }
 

@@ -140,7 +140,7 @@ impl Topic {
             let link = link.map_err(|_| "no answer".to_owned()).flatten();
             let seen = Arc::<Mutex<Seen>>::default();
             let task = match link {
-                Ok(link) => tokio::spawn(read(link, seen.clone())),
+                Ok(link) => crate::task::spawn(read(link, seen.clone())),
                 Err(why) => {
                     return Err(format!("{topic}: cannot connect to {publisher}: {why}"));
                 }

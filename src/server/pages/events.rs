@@ -112,7 +112,7 @@ pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     let mut latest = feed.latest.subscribe();
     latest.mark_changed();
     let stop = server.pages.stop.clone();
-    let task = tokio::spawn(async move {
+    let task = crate::task::spawn(async move {
         tokio::select! {
             () = tell(latest, &events) => {}
             () = events.closed() => {}
@@ -121,7 +121,7 @@ pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     });
     listeners.push_back((Instant::now(), task.abort_handle()));
     if !feed.running.swap(true, Ordering::AcqRel) {
-        tokio::spawn(look(server.clone()));
+        crate::task::spawn(look(server.clone()));
     }
     Response::new(ReplyBody::Events(body))
 }
@@ -165,7 +165,7 @@ async fn look(server: Arc<Server>) {
             let latest = known.look(&asked, shut);
             (known, latest)
         };
-        let Ok((same, latest)) = tokio::task::spawn_blocking(look).await else {
+        let Ok((same, latest)) = crate::task::spawn_blocking(look).await else {
             // The task panicked. The next listener starts another one.
             pages.state.feed.running.store(false, Ordering::Release);
             break;

@@ -21,9 +21,10 @@ const PUBLISHER: &str = "http://b:1/";
 
 /// The publishers in the notification that is sent now, if one is.
 fn told(ledger: &Ledger) -> Option<Value> {
-    match ledger.next_notification(port_of(SUBSCRIBER)) {
+    match ledger.with_order(|order, mirror| order.next(Instant::now(), port_of(SUBSCRIBER), mirror))
+    {
         Notification::Send { call, number } => {
-            ledger.notification_ended(number);
+            ledger.release(|order| order.taken(number));
             call.params.get(2).cloned()
         }
         _ => None,

@@ -153,7 +153,7 @@ fn a_file_removed_under_a_running_store_is_noticed_by_the_next_check() {
             .contains("removed")
     );
     assert!(store.unprotected().is_some());
-    store.rearm(&checkpoint(1)).unwrap();
+    store.begin(&checkpoint(1)).unwrap();
     assert!(store.unprotected().is_none() && path.is_file());
 }
 

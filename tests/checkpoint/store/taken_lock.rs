@@ -24,7 +24,7 @@ fn assert_refused(path: &Path) {
 fn assert_whole(path: &Path, mut store: Store) {
     let reason = store.unprotected().unwrap().to_owned();
     assert!(reason.contains("c.yaml"), "{reason}");
-    store.rearm(&checkpoint(store.seq())).unwrap();
+    store.begin(&checkpoint(store.seq())).unwrap();
     store.append(&[entry(9)]).unwrap();
     check(&mut store);
     assert_eq!(store.unprotected(), None);
@@ -48,7 +48,7 @@ fn recording_resumes_when_another_process_gives_the_lock_back() {
     other.lock().unwrap();
     check(&mut store);
     for _ in 0..2 {
-        let error = store.rearm(&checkpoint(store.seq())).unwrap_err();
+        let error = store.begin(&checkpoint(store.seq())).unwrap_err();
         assert!(matches!(
             error,
             StoreError::Taken {

@@ -43,7 +43,7 @@ fn an_unprotected_store_reports_it_and_can_be_rearmed() {
         // The store does not try that file again, and a new file fails as well.
         model.append(&mut store, 1);
         assert!(store.sync_job().is_none() && !store.wants_compaction());
-        assert!(store.rearm(&model.checkpoint(store.seq())).is_err());
+        assert!(store.begin(&model.checkpoint(store.seq())).is_err());
         assert!(store.unprotected().is_some());
         fs.disarm();
 
@@ -76,7 +76,7 @@ fn record_numbers_from_an_unprotected_time_are_never_used_again() {
     fs.arm(0, Fault::Short(ENOSPC));
     model.append(&mut store, 10);
     fs.disarm();
-    store.rearm(&model.checkpoint(store.seq())).unwrap();
+    store.begin(&model.checkpoint(store.seq())).unwrap();
     model.append(&mut store, 1);
     assert_eq!(model.acked, 12);
     drop(store);
@@ -205,7 +205,7 @@ fn a_file_that_would_become_too_large_is_rewritten() {
     model.append(&mut store, 1);
     assert_eq!(model.acked, 1);
     assert!(store.unprotected().unwrap().contains("too large"));
-    store.rearm(&model.checkpoint(store.seq())).unwrap();
+    store.begin(&model.checkpoint(store.seq())).unwrap();
     drop(store);
     assert_eq!(state(&open(&fs).unwrap().1.unwrap()), [1, 2]);
 }
@@ -219,7 +219,7 @@ fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
     for _ in 0..3 {
         assert!(model.begin(&mut store));
     }
-    let names = store.names.clone();
+    let names = store.place.names.clone();
     assert!(fs.read(&names.previous(), 1 << 20).is_ok());
     fs.arm(0, Fault::Once(ENOSPC));
     assert!(model.begin(&mut store));

@@ -84,7 +84,7 @@ fn any_change_of_the_file_by_another_process_is_noticed_and_repaired() {
         let reason = store.unprotected().expect(what);
         assert!(reason.contains(word) && reason.contains(PATH), "{reason}");
 
-        store.rearm(&model.checkpoint(store.seq())).unwrap();
+        store.begin(&model.checkpoint(store.seq())).unwrap();
         model.append(&mut store, 1);
         check(&mut store);
         assert_eq!(store.unprotected(), None, "{what}");

@@ -1,0 +1,277 @@
+//! What the ledger's lock protects.
+
+use std::time::Instant;
+
+use tokio::sync::Notify;
+
+use super::{
+    activity::{Activity, Noticed},
+    durability::{Mark, Whole},
+    journal::Journal,
+    late::LateState,
+    pending::PendingWrites,
+    shared::Shared,
+    summary::Divergences,
+};
+use crate::{
+    checkpoint::format::{Checkpoint, RecordContent, Session},
+    cluster::sharing::Source,
+    health::port_of,
+    master::{Master, Request},
+    order::Order,
+    replay::{self, Token},
+    xmlrpc::Reply,
+};
+
+/// The mirror, the journal, and what keeps them consistent.
+pub(super) struct Inner {
+    pub(super) mirror: Master,
+    /// The answers to `getPid` and `getUri`, which are not part of the state.
+    pub(super) identity: (i32, String),
+    pub(super) session: Session,
+    /// `None` if no checkpoint could be opened. Then the state is unprotected.
+    pub(super) journal: Option<Journal>,
+    pub(super) shared: Shared,
+    /// Changes whenever the mirror changes.
+    pub(super) version: u64,
+    pub(super) whole: Whole,
+    pub(super) pending: PendingWrites,
+    pub(super) activity: Activity,
+    pub(super) order: Order,
+    pub(super) diverged: Divergences,
+    /// Whether a master is being brought to the mirror's state (an injection), so that the mirror must not change.
+    pub(super) injecting: bool,
+    /// Whether the present master may differ from the mirror and must be read again.
+    pub(super) doubted: bool,
+    /// Whether the present master may still run a batch whose reply is no longer awaited.
+    pub(super) abandoned: bool,
+    /// The state that a late master will have once it has answered its outstanding calls.
+    pub(super) behind: Option<LateState>,
+    /// The number of the last master to which calls have passed.
+    pub(super) served: Option<u64>,
+    /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
+    /// be newer than the mirror.
+    pub(super) unconfirmed: bool,
+    /// Whether the session has changed and the change is not in the journal yet.
+    pub(super) session_unwritten: bool,
+}
+
+impl Inner {
+    /// See [`Ledger::new`](super::Ledger::new).
+    pub(super) fn new(mirror: Master, session: Session, pending: Vec<Request>) -> Self {
+        let mut inner = Self {
+            mirror,
+            identity: (-1, String::new()),
+            session,
+            journal: None,
+            shared: Shared::Nobody,
+            version: 0,
+            whole: Whole::default(),
+            pending: PendingWrites::default(),
+            activity: Activity::default(),
+            order: Order::default(),
+            diverged: Divergences::default(),
+            injecting: false,
+            doubted: false,
+            abandoned: false,
+            behind: None,
+            served: None,
+            unconfirmed: false,
+            session_unwritten: false,
+        };
+        inner.add_pending(pending);
+        inner.pending.are_restored();
+        inner
+    }
+
+    /// Applies `call` to the mirror. `standing_in` is `None` if a master notifies the nodes. Otherwise rosrescue must
+    /// notify them, and the value says whether `call` changes the mirror.
+    pub(super) fn apply(
+        &mut self,
+        now: Instant,
+        call: &Request,
+        standing_in: Option<bool>,
+        outbox_changed: &Notify,
+    ) -> Reply {
+        let mut noticed = Noticed::new(standing_in.is_some());
+        noticed.displaced = self.activity.displaced_by(&self.mirror, call);
+        self.activity.note_lost(&self.mirror, call);
+        let reply = self.mirror.apply_telling(call, &mut noticed);
+        self.version += u64::from(standing_in.unwrap_or(true));
+        match noticed.take_calls() {
+            Some(calls) => {
+                for (api, subject, call) in calls {
+                    self.order.notify(port_of(&api), subject, call);
+                    outbox_changed.notify_one();
+                }
+            }
+            None => {
+                for (subject, nodes) in noticed.subjects() {
+                    self.order.told_by_master(now, &subject, nodes);
+                }
+                if self.order.has_new_repeat() {
+                    outbox_changed.notify_one();
+                }
+            }
+        }
+        let registered = |node: &str| self.mirror.api_of(node).is_some();
+        if self.activity.applied(now, call, noticed, registered) {
+            outbox_changed.notify_one();
+        }
+        reply
+    }
+
+    pub(super) fn set_identity(&mut self, identity: (i32, String)) {
+        self.mirror.set_identity(identity.0, identity.1.clone());
+        self.identity = identity;
+    }
+
+    pub(super) fn adopt(&mut self, state: Master) -> Vec<String> {
+        let mut difference = Vec::new();
+        let differs = self.mirror != state;
+        if differs {
+            difference = replay::difference(&self.mirror, &state);
+            self.version += 1;
+        }
+        let (python, old) = (self.mirror.python(), self.mirror.is_old());
+        // An equal `state` replaces the mirror too, because the new one may be known more exactly.
+        self.mirror = state;
+        self.mirror.set_python(python);
+        self.mirror.set_old(old);
+        if differs {
+            self.changed_unrecorded();
+        }
+        self.set_identity(self.identity.clone());
+        difference
+    }
+
+    pub(super) fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
+        if self.pending.extend(writes).is_err() {
+            // If the present master answers again, it gets the mirror's whole state.
+            self.raise_incarnation();
+            self.write_session();
+        }
+    }
+
+    pub(super) fn raise_incarnation(&mut self) {
+        self.behind = None;
+        self.pending.clear();
+        self.session.incarnation += 1;
+        self.session.delivered = self.seq();
+        self.session_unwritten = true;
+    }
+
+    pub(super) fn update_session(&mut self, change: impl FnOnce(&mut Session)) {
+        change(&mut self.session);
+        self.session_unwritten = true;
+        self.write_session();
+    }
+
+    pub(super) fn write_session(&mut self) {
+        if std::mem::take(&mut self.session_unwritten) {
+            // While a complete checkpoint is due, the file lacks changes that have no record.
+            self.session.cluster_seq = match self.whole.is_due() {
+                true => 0,
+                false => self.cluster_seq(),
+            };
+            let entry = RecordContent::Session(self.session.clone());
+            self.append(vec![entry]);
+        }
+    }
+
+    pub(super) fn token(&self) -> Token {
+        Token::new(&self.session.mark, self.session.incarnation)
+    }
+
+    /// Notes that the mirror has changed without a record. The next complete checkpoint is due.
+    pub(super) fn changed_unrecorded(&mut self) {
+        self.whole.unrecorded = self.version;
+        self.share_state();
+    }
+
+    /// Number of the journal's last record.
+    pub(super) fn seq(&self) -> u64 {
+        self.last_seq().unwrap_or_default()
+    }
+
+    /// Number of the journal's last record. `None` without a journal.
+    pub(super) fn last_seq(&self) -> Option<u64> {
+        self.journal.as_ref().map(Journal::seq)
+    }
+
+    /// Identifies the last record, so that an answer can wait for it.
+    pub(super) fn mark(&self) -> Mark {
+        Mark {
+            disk: self.last_seq(),
+            shared: self.shared.last(),
+        }
+    }
+
+    /// Passes `entries` to the journal. A failure is kept in the store, and does not fail the call.
+    pub(super) fn append(&mut self, entries: Vec<RecordContent>) {
+        self.append_from(entries, &[]);
+    }
+
+    /// Like [`Self::append`], with the source of each call. Missing sources stand for this computer.
+    pub(super) fn append_from(&mut self, entries: Vec<RecordContent>, sources: &[&Source]) {
+        // The session's record comes first, because it names the incarnation of the following entries.
+        self.write_session();
+        self.share(&entries, sources);
+        if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {
+            journal.append(entries);
+        }
+    }
+
+    /// Whether another computer has the master.
+    pub(super) fn is_elsewhere(&self) -> bool {
+        matches!(self.shared, Shared::Elsewhere)
+    }
+
+    /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
+    pub(super) fn share(&mut self, entries: &[RecordContent], sources: &[&Source]) {
+        let Shared::Here { sharing, .. } = &mut self.shared else {
+            return;
+        };
+        for (index, entry) in entries.iter().enumerate() {
+            if let RecordContent::Call { call, .. } = entry {
+                let source = sources.get(index).copied().unwrap_or(&Source::Here);
+                sharing.record(&Request::from(call.clone()), source);
+            }
+        }
+    }
+
+    /// Notes that the state has changed without a call.
+    pub(super) fn share_state(&mut self) {
+        if let Shared::Here { sharing, .. } = &mut self.shared {
+            sharing.record_state(&self.mirror);
+            // The state takes a number in that journal, so the session's record must be written again: later calls have
+            // other numbers than that record tells.
+            self.session_unwritten = true;
+        }
+    }
+
+    /// See [`Session::cluster_seq`](crate::checkpoint::format::Session::cluster_seq).
+    pub(super) fn cluster_seq(&self) -> u64 {
+        let last = self.shared.last();
+        last.map_or(self.session.cluster_seq, |last| last.seq)
+    }
+
+    pub(super) fn checkpoint(&self) -> Checkpoint {
+        Checkpoint {
+            seq: self.seq(),
+            session: Session {
+                cluster_seq: self.cluster_seq(),
+                ..self.session.clone()
+            },
+            pending: self
+                .pending
+                .calls()
+                .iter()
+                .cloned()
+                .map(Into::into)
+                .collect(),
+            snapshot: self.mirror.snapshot(),
+            displaced: self.activity.displaced_lately(Instant::now()),
+        }
+    }
+}

@@ -1,0 +1,235 @@
+//! Arguments, logging, signals and exit statuses of the program `rosrescue`.
+
+use std::{
+    error::Error,
+    io::{IsTerminal, Write},
+    process::ExitCode,
+    time::{Duration, Instant},
+};
+
+use crate::{
+    app,
+    cli::{Cli, Command, CommonArgs, LogFormat},
+    commands,
+    config::Config,
+    guardian::{
+        self,
+        handover::{Guard, Sockets},
+    },
+    log::Stderr,
+    server::listener,
+    task::boxed,
+};
+use clap::{CommandFactory, error::ErrorKind};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+use tracing_subscriber::{
+    Layer, filter::Targets, fmt, layer::SubscriberExt, util::SubscriberInitExt,
+};
+
+/// How long other threads may finish slow work, such as a name lookup, after rosrescue has stopped serving.
+const LAST_JOBS: Duration = Duration::from_millis(500);
+/// A signal to all processes named rosrescue, as sent by killall, reaches a worker twice: directly
+/// and through its guardian. A second signal within this time counts as the first one.
+const SAME_SIGNAL: Duration = Duration::from_millis(250);
+
+/// Runs the program.
+///
+/// It is here and not in `main.rs`, so that the compiler generates the code of the whole program once.
+pub fn main() -> ExitCode {
+    // This must come first: it removes variables from the environment, which is only safe with a
+    // single thread.
+    let sockets = match Sockets::inherited() {
+        Ok(sockets) => sockets,
+        Err(error) => {
+            eprintln!("rosrescue: {error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    if sockets.is_some() {
+        // The worker is started as /proc/self/exe, so without this its name would be `exe`.
+        let _ = rustix::thread::set_name(c"rosrescue");
+    }
+    let cli = Cli::read();
+    let env = |name: &str| std::env::var(name).ok();
+    let hostname = rustix::system::uname()
+        .nodename()
+        .to_string_lossy()
+        .into_owned();
+    let local = listener::local_address();
+    let (config, common, verbose) = match &cli.command {
+        Some(Command::Tool(tool)) => return commands::run(tool),
+        Some(Command::Proxy(args)) => (
+            Config::proxy(args, &env, &hostname, local),
+            &args.common,
+            args.verbose,
+        ),
+        Some(Command::Core(args)) => (
+            Config::core(args, &env, &hostname, local),
+            &args.common,
+            args.verbose,
+        ),
+        None => {
+            let args = &cli.core;
+            (
+                Config::core(args, &env, &hostname, local),
+                &args.common,
+                args.verbose,
+            )
+        }
+    };
+    let mut config = match config {
+        Ok(config) => config,
+        // Exit status 2, as for all usage errors.
+        Err(error) => Cli::command()
+            .error(ErrorKind::ValueValidation, error)
+            .exit(),
+    };
+    if let Err(error) = start_log(common, verbose) {
+        Cli::command()
+            .error(ErrorKind::ValueValidation, error)
+            .exit();
+    }
+    if let Some(sockets) = &sockets
+        && matches!(sockets.guard, Guard::Systemd)
+    {
+        config.serve_at(sockets.addresses(), &env);
+    }
+    match start(config, sockets, common.no_guardian, hostname) {
+        Ok(status) => ExitCode::from(u8::try_from(status).unwrap_or(1)),
+        Err(error) => {
+            eprintln!("rosrescue: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Serves `sockets`, or runs the guardian of a worker that serves them.
+fn start(
+    mut config: Config,
+    sockets: Option<Sockets>,
+    no_guardian: bool,
+    hostname: String,
+) -> Result<i32, Box<dyn Error>> {
+    let sockets = match sockets {
+        Some(sockets) => sockets,
+        None => {
+            let listeners = listener::bind(&config.listen, config.port_option())?;
+            if !no_guardian {
+                return Ok(guardian::run(&listeners)?);
+            }
+            Sockets::own(listeners)
+        }
+    };
+    config.fit_into(raise_file_limit());
+    run(config, sockets, hostname)?;
+    Ok(0)
+}
+
+fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
+    // One thread: with more, each call wakes other threads, which costs a third more CPU time. One thread answers tens
+    // of thousands of reads per second. Slow work runs elsewhere (`block_in_place`, `spawn_blocking`).
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()?;
+    let ended = runtime.block_on(boxed(serve(config, sockets, hostname)));
+    // The closing checkpoint is on the disk and newer than any write that still runs. A thread may be waiting for a
+    // dead name server. Dropping the runtime would wait for that thread; ending the process does not.
+    runtime.shutdown_timeout(LAST_JOBS);
+    ended
+}
+
+async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
+    let stop = CancellationToken::new();
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
+    // SIGHUP: the terminal was closed. It is ignored under nohup.
+    let mut hangup = match guardian::is_hangup_ignored() {
+        true => None,
+        false => Some(signal(SignalKind::hangup())?),
+    };
+    sockets.guard.handles_signals();
+    let stopper = stop.clone();
+    let guarded = matches!(sockets.guard, Guard::Guardian { .. });
+    crate::task::spawn(async move {
+        let mut first = None;
+        loop {
+            let status = tokio::select! {
+                _ = interrupt.recv() => 130,
+                _ = terminate.recv() => 143,
+                _ = async { hangup.as_mut()?.recv().await }, if hangup.is_some() => 129,
+            };
+            let first = *first.get_or_insert_with(Instant::now);
+            if stopper.is_cancelled() && !(guarded && first.elapsed() < SAME_SIGNAL) {
+                std::process::exit(status);
+            }
+            stopper.cancel();
+        }
+    });
+    let mut names = vec![hostname, config.advertised.host.clone()];
+    names.extend(std::env::var("ROS_HOSTNAME").ok());
+    app::run(config, sockets, names, stop, say).await?;
+    Ok(())
+}
+
+/// Prints a line. A closed stdout is not an error.
+fn say(line: &str) {
+    let mut stdout = std::io::stdout();
+    let colour = stdout.is_terminal() && colour_is_welcome();
+    let (on, off) = if colour {
+        ("\x1b[1m", "\x1b[0m")
+    } else {
+        ("", "")
+    };
+    let _ = writeln!(stdout, "{on}{line}{off}").and_then(|()| stdout.flush());
+}
+
+fn colour_is_welcome() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+}
+
+fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
+    let default = if verbose {
+        "warn,rosrescue=debug,etcd_kv=debug"
+    } else {
+        "warn,rosrescue=info"
+    };
+    let filter = args.log.as_deref().unwrap_or(default);
+    let filter: Targets = filter
+        .parse()
+        .map_err(|error| format!("--log: `{filter}`: {error}"))?;
+    let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
+    let log = fmt::layer()
+        .with_writer(Stderr::of(std::env::var("JOURNAL_STREAM").ok().as_deref()))
+        .with_target(false)
+        // These errors would go to stderr, and panic if the terminal is gone.
+        .log_internal_errors(false)
+        .with_ansi(ansi);
+    match args.log_format {
+        LogFormat::Text => tracing_subscriber::registry()
+            .with(log.with_filter(filter))
+            .init(),
+        LogFormat::Json => tracing_subscriber::registry()
+            .with(log.json().with_filter(filter))
+            .init(),
+    }
+    Ok(())
+}
+
+/// Raises the limit on open files as far as allowed, because the usual 1,024 are soon reached.
+/// Returns the limit.
+fn raise_file_limit() -> u64 {
+    use rustix::process::{Resource, getrlimit, setrlimit};
+    let mut limit = getrlimit(Resource::Nofile);
+    let before = limit.current;
+    limit.current = limit.maximum;
+    let now = if setrlimit(Resource::Nofile, limit).is_ok() {
+        limit.maximum
+    } else {
+        before
+    };
+    now.unwrap_or(u64::MAX)
+}
