@@ -5,7 +5,7 @@
 //! style. `docs/checkpoint.md` describes the format for readers.
 //!
 //! * `emit` converts values to YAML that YAML 1.1 and YAML 1.2 readers read alike.
-//! * `yaml` converts YAML to values, from the events of granit-parser.
+//! * `yaml` converts YAML to values, from the events of serde-saphyr's parser.
 //! * `frame` handles the first line and the check sums, and finds the undamaged parts of a damaged file.
 //! * `document` defines which value stands under which key.
 

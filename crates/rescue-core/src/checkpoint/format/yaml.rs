@@ -1,13 +1,13 @@
 //! Converts YAML to values.
 //!
-//! This module reads the events of granit-parser, the parser below serde-saphyr, and does not use serde: serde's data
-//! model lacks scalar styles, tags, and integers beyond 64 bits, which distinguish the values. The module accepts only
-//! what `emit` writes: no anchors, no aliases, no other tags. So no text can expand to more than its own length. No
-//! function recurses.
+//! This module reads the events of serde-saphyr's parser and does not use serde, because serde's data model lacks
+//! scalar styles, tags, and integers beyond 64 bits, which distinguish the values. The module accepts only what `emit`
+//! writes: no anchors, no aliases, no other tags. So no text can expand to more than its own length. No function
+//! recurses.
 
 use std::borrow::Cow;
 
-use granit_parser::{Event, Parser, ScalarStyle, Tag};
+use serde_saphyr::granit_parser::{self, Event, Parser, ScalarStyle, Tag};
 
 use super::DEPTH_MAX;
 use super::emit::{BIG_DECIMAL, BIG_INT, DATE_TIME, date_time};
