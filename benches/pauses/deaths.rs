@@ -4,7 +4,7 @@
 use std::{process::Command, time::Duration};
 
 use clap::ValueEnum;
-use rustix::process::{Signal, setpriority_process};
+use rustix::process::Signal;
 
 use crate::{
     KILLS_A_LIFE,
@@ -107,10 +107,6 @@ pub(crate) fn measure(victims: Victims, count: usize, nodes: usize, load: usize)
         Process::start("busy", command.args(["-c", "while :; do :; done"]))
     };
     let _busy: Vec<_> = (0..load).map(busy).collect();
-    // Otherwise callers wait for the processor longer than for rosrescue.
-    if load > 0 && setpriority_process(None, -20).is_err() {
-        eprintln!("the callers have no priority: their times contain their own waits");
-    }
     let mut deaths = Vec::new();
     while deaths.len() < count {
         let stage = Stage::start(nodes);
