@@ -154,6 +154,10 @@ export function draw(graph, placed) {
   const size = { x: -MARGIN, y: -MARGIN, width: placed.width + 2 * MARGIN, height: placed.height + 2 * MARGIN };
   const svg = shape("svg", { viewBox: `${size.x} ${size.y} ${size.width} ${size.height}` },
     shape("defs", {}, arrow), shape("g", { class: "lines" }, ...lines), ...boxes);
+  // What to show first: a node that needs attention, or else the top box of a tall graph or the leftmost of a wide one.
+  // The corner may be empty.
   const ill = graph.boxes.findIndex((box) => box.ill);
-  return { svg, size, ill: placed.boxes[ill] };
+  const side = size.height > size.width ? "y" : "x";
+  const begin = placed.boxes.reduce((best, next) => (best && best[side] <= next[side] ? best : next), undefined);
+  return { svg, size, first: placed.boxes[ill] ?? begin };
 }

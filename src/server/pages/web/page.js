@@ -425,9 +425,9 @@ function selectGraph() {
   showGraph();
 }
 
-function showPicture({ svg, size, ill }) {
+function showPicture({ svg, size, first }) {
   const isSame = whole?.width === size.width && whole?.height === size.height;
-  whole = { ...size, ill };
+  whole = { ...size, first };
   // On a wide screen as high as the graph needs, so that all of it is visible.
   const needed = Math.ceil(size.height * Math.max(least(), Math.min(1, picture.clientWidth / size.width)));
   picture.style.height = `${Math.max(160, Math.min(needed, isTall() ? 0.6 * window.innerHeight : 1600))}px`;
@@ -444,12 +444,12 @@ function fit(smallest = 0) {
   const scale = Math.max(smallest, Math.min(1, clientWidth / whole.width, clientHeight / whole.height));
   const width = clientWidth / scale;
   const height = clientHeight / scale;
-  // A graph that is too large is shown from its beginning, or around a node that needs attention.
+  // A graph that is too large is shown around the box that matters first.
   const from = (start, length, shown, at) => {
     if (shown >= length) return start - (shown - length) / 2;
     return at === undefined ? start : Math.max(start, Math.min(at - shown / 2, start + length - shown));
   };
-  show({ x: from(whole.x, whole.width, width, whole.ill?.x), y: from(whole.y, whole.height, height, whole.ill?.y), width, height });
+  show({ x: from(whole.x, whole.width, width, whole.first?.x), y: from(whole.y, whole.height, height, whole.first?.y), width, height });
 }
 
 function show(next) {
