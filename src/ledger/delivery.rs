@@ -20,8 +20,8 @@ impl std::fmt::Debug for Delivery {
 }
 
 impl Delivery {
-    /// Tracks the answer with this number in the [`Order`](crate::order::Order) of `ledger`. The handle must not be dropped under the
-    /// ledger's lock.
+    /// Tracks the answer with this number in the [`Order`](crate::order::Order) of `ledger`. The handle must not be
+    /// dropped under the ledger's lock.
     pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
         let ledger = Some(ledger.clone());
         Self { ledger, number }

@@ -18,8 +18,8 @@ pub(super) enum Shared {
     Here { times_led: u64, sharing: Sharing },
 }
 
-/// A position in the journal that all computers share: a record's number, and a count of [`Ledger::leave`](super::Ledger::leave) calls, which
-/// tells the terms of this computer apart.
+/// A position in the journal that all computers share: a record's number, and a count of
+/// [`Ledger::leave`](super::Ledger::leave) calls, which tells the terms of this computer apart.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
     times_led: u64,

@@ -51,9 +51,8 @@ class Page:
             if answer.get("id") == self.count:
                 return answer["result"]
 
-    def is_true(self, expression):
-        found = self.call("Runtime.evaluate", expression=f"Boolean({expression})", returnByValue=True)
-        return found["result"].get("value")
+    def value(self, expression):
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
 
 def main():
@@ -71,11 +70,14 @@ def main():
             page.call("Emulation.setEmulatedMedia", features=[feature])
             page.call("Page.navigate", url=uri)
             end = time.monotonic() + 60
-            while not page.is_true(READY):
+            while not page.value(f"Boolean({READY})"):
                 if time.monotonic() > end:
                     sys.exit(f"screenshot.py: {uri} does not show a robot")
                 time.sleep(0.2)
-            shot = page.call("Page.captureScreenshot", format="png")
+            # On a phone the graph is below the edge of the screen.
+            bottom = page.value("document.querySelector('#picture').getBoundingClientRect().bottom + 24")
+            clip = {"x": 0, "y": 0, "width": width, "height": max(height, bottom if width < 600 else 0), "scale": 1}
+            shot = page.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
             with open(file, "wb") as out:
                 out.write(base64.b64decode(shot["data"]))
         finally:

@@ -33,6 +33,6 @@ pngquant --force --output "$file" 64 "$scratch/page.png"
 took "$(stat -c %s "$file") bytes"
 
 step "${file%.png}-phone.png"
-/usr/bin/python3 tests/page/screenshot.py "$ROS_MASTER_URI" "$scratch/phone.png" 390 1400 dark ||
+/usr/bin/python3 tests/page/screenshot.py "$ROS_MASTER_URI" "$scratch/phone.png" 390 844 dark ||
     give_up "no picture"
 pngquant --force --output "${file%.png}-phone.png" 64 "$scratch/phone.png"

@@ -4,8 +4,8 @@
 //! * [`Request`]: a call, parsed once, with its [`Method`] and its [`Kind`].
 //!
 //! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that clients can
-//! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that no ROS client causes
-//! have other texts than in rosmaster.
+//! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that no ROS client
+//! causes have other texts than in rosmaster.
 
 mod api;
 mod checks;

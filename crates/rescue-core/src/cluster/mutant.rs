@@ -26,6 +26,8 @@ pub(crate) enum Mutant {
     KeepsForwarded,
     /// Every write made while cut off is kept, instead of the last one of each subject.
     KeepsEachWrite,
+    /// A leader that was alone deletes its file of lone writes before the journal has them.
+    DeletesKeptWrites,
     /// An etcd that has lost its data is not recognised.
     TrustsLostEtcd,
     /// Two computers of one name do not notice each other.

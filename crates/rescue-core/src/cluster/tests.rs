@@ -281,6 +281,7 @@ fn every_defect_of_the_past_is_found_within_10_000_schedules() {
         Mutant::JudgesOnce,
         Mutant::KeepsForwarded,
         Mutant::KeepsEachWrite,
+        Mutant::DeletesKeptWrites,
         Mutant::TrustsLostEtcd,
         Mutant::IgnoresNamesake,
         Mutant::WaitsForEver,

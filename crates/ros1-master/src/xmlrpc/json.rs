@@ -5,8 +5,8 @@ use serde::{Serialize, Serializer};
 
 use super::{Struct, Value};
 
-/// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, decimal numbers, infinities and NaN become strings,
-/// because JSON lacks them.
+/// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, decimal numbers, infinities and NaN
+/// become strings, because JSON lacks them.
 impl Serialize for Value {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {

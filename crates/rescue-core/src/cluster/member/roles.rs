@@ -54,9 +54,9 @@ impl Member {
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
                 if self.cut_off.is_empty() {
-                    let last = self.outgoing.changes().last();
-                    self.chores
-                        .keep_until(last.map_or(0, |change| change.seq()));
+                    let last = self.outgoing.changes().last().map_or(0, |of| of.seq());
+                    let at_once = Mutant::DeletesKeptWrites.lives();
+                    self.chores.keep_until(if at_once { 0 } else { last });
                 }
             }
         }

@@ -188,6 +188,26 @@ impl History {
         self.of(call).held = true;
     }
 
+    /// Whether the journal has the value of a write that was kept, or the write's fate is known.
+    pub(super) fn is_settled(&self, call: &Request, etcd: &Etcd) -> bool {
+        let Some(number) = self.find(call.params()) else {
+            return true;
+        };
+        let call = &self.calls[number];
+        let same = |of: &[Value]| {
+            let of = self.find(of).map(|of| &self.calls[of]);
+            of.is_some_and(|of| (of.key, of.value) == (call.key, call.value))
+        };
+        let in_log = etcd.log.iter().any(|(_, held)| match held {
+            Held::State(state) => value_of(state, call.key) == Some(call.value),
+            Held::Records(records) => records.iter().any(|record| match &record.entry {
+                JournalEntry::Call { call, .. } => same(&call.params),
+                _ => false,
+            }),
+        });
+        in_log || call.reported || call.held || call.unchanged || etcd.lost
+    }
+
     /// Notes that a leader has made `call` for the computer `from`.
     pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
         // A value that the merge sets again, to notify nodes, is no call of a node.
@@ -313,13 +333,14 @@ impl History {
                     let mut changed = places.changed[number].iter();
                     !changed.any(|at| *at >= log * 1000)
                 });
-            // The others had the same value when this computer was cut off or later, so nothing was lost when they
-            // replaced it.
+            // Others had or set the same value, so this write was not sent, and nothing was lost when they replaced it.
             let equalled = call.alone.is_some_and(|cut| {
-                let value = Some(call.value);
-                let later = places.of_value(self, key, value);
-                let later = later.is_some_and(|(_, last)| last >= cut * 1000);
-                later || etcd.value_at(key, cut * 1000) == value
+                let others = self.calls.iter().enumerate().any(|(of, other)| {
+                    let same = (other.key, other.value) == (key, call.value) && of != number;
+                    same && places.changed[of].iter().any(|at| *at >= cut * 1000)
+                });
+                let sent = !places.changed[number].is_empty();
+                !sent && (others || etcd.value_at(key, cut * 1000) == Some(call.value))
             });
             let unchanged = call.unchanged || in_vain || equalled;
             let excused = call.reported || call.unsynced || superseded || unchanged;

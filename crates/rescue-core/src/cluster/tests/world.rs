@@ -605,7 +605,7 @@ impl World {
                     kept.extend(calls);
                 }
             }
-            Action::KeepNothing => self.computers[at].disk.kept = None,
+            Action::KeepNothing => self.forget_kept(at),
             Action::Merge { number, ask, to } => {
                 let delay = self.delay();
                 let (to, term) = match to {
