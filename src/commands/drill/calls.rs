@@ -209,15 +209,15 @@ impl Callers {
         let (topic, api) = (self.topic.as_str(), self.node_api.as_str());
         while !stop.is_cancelled() {
             let register = [topic.into(), "*".into(), api.into()];
-            // The node claims the subscription before it registers, as real nodes do. Otherwise a health check would
-            // remove the registration.
+            // The node claims the subscription before it registers, and until it has unregistered. Otherwise a health
+            // check could remove the registration, which would count as a failure here.
             self.heard.subscribes(topic, true);
             let answer = self.api.ask("registerSubscriber", &register).await;
             waits.add(answer);
             sleep(PAUSE).await;
-            self.heard.subscribes(topic, false);
             let unregister = [topic.into(), api.into()];
             let answer = self.api.ask("unregisterSubscriber", &unregister).await;
+            self.heard.subscribes(topic, false);
             // The first call may have run although its answer was lost with the connection.
             let again = answer.again;
             if waits.add(answer) == Some(Value::Int(0)) && !again {

@@ -5,7 +5,14 @@ mod etcd;
 mod history;
 mod world;
 
-use std::time::{Duration, Instant};
+use std::{
+    num::NonZero,
+    sync::{
+        Mutex,
+        atomic::{AtomicU64, Ordering::Relaxed},
+    },
+    time::{Duration, Instant},
+};
 
 use self::world::{Counts, Plan, World};
 use super::{
@@ -59,17 +66,26 @@ fn play(seed: u64) -> World {
 
 #[test]
 fn no_schedule_of_failures_breaks_a_promise() {
-    let mut totals = Counts::default();
+    let seeds = first()..first() + schedules();
+    let next = AtomicU64::new(seeds.start);
+    let (totals, broken) = (Mutex::new(Counts::default()), AtomicU64::new(0));
     let began = Instant::now();
-    let mut broken = 0;
-    for seed in first()..first() + schedules() {
-        let world = play(seed);
-        totals.add(&world.counts);
-        if let Err(why) = world.verdict() {
-            println!("seed {seed}: {why}");
-            broken += 1;
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, NonZero::get) {
+            scope.spawn(|| {
+                let take = || Some(next.fetch_add(1, Relaxed)).filter(|seed| seeds.contains(seed));
+                for seed in std::iter::from_fn(take) {
+                    let world = play(seed);
+                    totals.lock().unwrap().add(&world.counts);
+                    if let Err(why) = world.verdict() {
+                        println!("seed {seed}: {why}");
+                        broken.fetch_add(1, Relaxed);
+                    }
+                }
+            });
         }
-    }
+    });
+    let (totals, broken) = (totals.into_inner().unwrap(), broken.into_inner());
     assert_eq!(broken, 0, "schedules that break a promise");
     let rate = schedules() as f64 / began.elapsed().as_secs_f64() * 60.0;
     println!("{} schedules, {rate:.0} a minute: {totals:?}", schedules());

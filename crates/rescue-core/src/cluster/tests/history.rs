@@ -369,7 +369,7 @@ impl History {
                 continue;
             };
             // A comparison of states does not show that others set a value and set it back, nor that they set what this
-            // computer's nodes set, too.
+            // computer's nodes set, too, or what it answered as the leader before it was cut off.
             let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
             let mut skipped = self.skipped.iter();
             let compared =
@@ -381,7 +381,8 @@ impl History {
             let back = first.is_some_and(|(first, _)| first < cut * 1000);
             let mut own = self.calls.iter();
             let own = own.any(|of| {
-                (of.computer, of.key) == (call.computer, call.key) && Some(of.value) == before
+                let own = of.computer == call.computer || of.by == Some(call.computer);
+                own && of.key == call.key && Some(of.value) == before
             });
             if compared && (back || own) {
                 continue;
