@@ -337,12 +337,21 @@ impl Ledger {
     /// Notes that another computer has the master, or may have it. From now on only the records given to
     /// [`Self::follow`] are recorded. Calls whose records the other computers lack are not acknowledged. No node is
     /// notified, because the other computer does that.
-    pub fn leave(&self) {
+    ///
+    /// Returns the number of the last record that the mirror shows, if this computer had the master.
+    pub fn leave(&self) -> Option<u64> {
         let mut inner = self.lock();
+        let last = inner.shared.last();
         inner.shared = Shared::Elsewhere;
         inner.order.forget_notifications();
         drop(inner);
         self.agreement.lost();
+        last.map(|last| last.seq)
+    }
+
+    /// The number of the last record that the mirror shows. The other computers may not have it yet.
+    pub(crate) fn last_shared(&self) -> u64 {
+        self.lock().shared.last().map_or(0, |last| last.seq)
     }
 
     /// Notes that this computer has the master. The other computers get its records, numbered after `seq`. `held` is

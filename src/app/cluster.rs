@@ -47,7 +47,7 @@ use crate::{
     process::ProcessError,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
-    server::others::{Forwarded, Handover},
+    server::others::{Forwarded, Handover, Shown},
     status::cluster::MemberFacts,
     task::boxed,
     upstream::{Head, peer::Peers},
@@ -75,6 +75,7 @@ pub(super) struct ClusterDriver {
     standing: watch::Sender<Standing>,
     /// The place in the journal up to which the mirror is current.
     place: watch::Sender<Place>,
+    shown: Arc<Shown>,
     peers: Arc<Peers>,
     /// Writes of this computer that a leader has not answered yet.
     forwarded: Arc<Forwarded>,
@@ -221,7 +222,12 @@ impl ClusterDriver {
                 tracing::debug!(?standing, "this computer's standing has changed");
                 self.standing.send_replace(standing);
             }
-            Action::Leave => ledger.leave(),
+            Action::Leave { binds } => {
+                if let Some(seq) = ledger.leave().filter(|_| binds) {
+                    let led = *self.place.borrow();
+                    self.shown.raise(Place { seq, ..led });
+                }
+            }
             Action::Lead { seq, held, state } => {
                 if let Some(state) = state {
                     // This fails only if this computer already has the master.

@@ -64,11 +64,29 @@ pub(crate) struct Others {
     pub(crate) forwarded: Arc<Forwarded>,
     /// The last place in the journal of all computers that the mirror includes.
     pub(crate) followed: watch::Receiver<Place>,
-    /// The latest place in the journal that a leader's answer has reported. The mirror must not answer before it has
-    /// reached that place.
-    pub(crate) told: Arc<Mutex<Place>>,
+    pub(crate) shown: Arc<Shown>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
+}
+
+/// The furthest place in the journal that an answer on this computer has shown. The mirror must not answer before it has
+/// reached that place.
+#[derive(Debug)]
+pub(crate) struct Shown(Mutex<Place>);
+
+impl Shown {
+    pub(crate) fn new() -> Self {
+        Self(Mutex::new(Place::at_the_start()))
+    }
+
+    fn get(&self) -> Place {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(crate) fn raise(&self, place: Place) {
+        let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        *shown = shown.max(place);
+    }
 }
 
 /// rosrescue's own method by which a follower tells the leader that it has passed an answer on to its caller.
@@ -260,7 +278,10 @@ impl Others {
                                 let number = HeaderValue::from(number);
                                 reply.headers_mut().insert(peer::ANSWER_HEADER, number);
                             }
-                            let seq = HeaderValue::from(calls.ledger.agreement.last());
+                            let agreed = calls.ledger.agreement.last();
+                            let last = calls.ledger.last_shared();
+                            let seq = Place::shown_seq(call.kind == Kind::Read, agreed, last);
+                            let seq = HeaderValue::from(seq);
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
                         }
@@ -340,10 +361,6 @@ impl Others {
         }
     }
 
-    fn told(&self) -> MutexGuard<'_, Place> {
-        self.told.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     async fn hand_over(&self, to: &str) -> HttpReply {
         let (tell, told) = oneshot::channel();
         // The channel closes only when rosrescue stops.
@@ -392,9 +409,7 @@ impl Call<'_> {
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
         let seq = seq.unwrap_or(0);
         let epoch = self.others.followed.borrow().epoch;
-        let mut told = self.others.told();
-        *told = told.max(Place { epoch, term, seq });
-        drop(told);
+        self.others.shown.raise(Place { epoch, term, seq });
         let number = raw.headers.get(peer::ANSWER_HEADER);
         let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
         let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);
@@ -488,8 +503,8 @@ impl Call<'_> {
     /// the mirror is behind the leader's earlier answers, so that no later read shows an older state.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let call = self.call.as_ref()?;
-        let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
-        if !followed.shows(told) {
+        let followed = *self.others.followed.borrow();
+        if !followed.shows(self.others.shown.get()) {
             return None;
         }
         match self.kind {
@@ -504,7 +519,7 @@ impl Call<'_> {
             return None;
         }
         let mut followed = self.others.followed.clone();
-        let fresh = followed.wait_for(|followed| followed.shows(*self.others.told()));
+        let fresh = followed.wait_for(|followed| followed.shows(self.others.shown.get()));
         fresh.await.ok()?;
         self.by_mirror().await
     }

@@ -33,6 +33,8 @@ pub struct ClusterFacts {
     /// Number of writes that this computer answered while it was cut off and that were then lost, because other
     /// computers had changed the same data.
     pub lost_writes: u64,
+    /// How often this computer was cut off since this process started.
+    pub times_cut_off: u64,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -122,6 +124,7 @@ impl ClusterFacts {
             takeovers: 0,
             last_takeover: None,
             lost_writes: 0,
+            times_cut_off: 0,
         }
     }
 }

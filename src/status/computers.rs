@@ -35,6 +35,9 @@ pub(crate) struct Computers {
     pub(crate) last_takeover: Option<Taken>,
     /// Number of writes that this computer answered while it was cut off and that were then lost.
     pub(crate) lost_writes: u64,
+    /// How often this computer was cut off since its rosrescue started.
+    #[serde(default)]
+    pub(crate) times_cut_off: u64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -112,6 +115,7 @@ impl From<&ClusterFacts> for Computers {
             takeovers: facts.takeovers,
             last_takeover: last.map(Taken::from),
             lost_writes: facts.lost_writes,
+            times_cut_off: facts.times_cut_off,
         }
     }
 }

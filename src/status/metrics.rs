@@ -65,7 +65,7 @@ fn add_cluster(text: &mut String, of: &Computers) {
     let term = of.leader.as_ref().map_or(0, |leader| leader.term);
     let last = of.last_takeover.as_ref();
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 10] = [
+    let values: [(&str, &str, Option<f64>); 11] = [
         ("cluster_leader", "whether any computer leads, as far as this one knows", Some(u8::from(of.leads().is_some()).into())),
         ("cluster_term", "number of the leader's term, which grows with each leader", Some(term as f64)),
         ("cluster_behind_records", "records of the journal that this computer's mirror lacks", Some(of.behind as f64)),
@@ -76,6 +76,7 @@ fn add_cluster(text: &mut String, of: &Computers) {
         ("cluster_takeovers_total", "takeovers by this computer", Some(of.takeovers as f64)),
         ("cluster_last_takeover_seconds", "duration of the last takeover, from the last sign of the previous leader to the first write answered here", last.map(|last| last.seconds)),
         ("cluster_lost_writes_total", "changes made while cut off that were lost, because others had changed the same data", Some(of.lost_writes as f64)),
+        ("cluster_times_cut_off_total", "how often this computer was cut off since its rosrescue started", Some(of.times_cut_off as f64)),
     ];
     for (name, help, value) in values {
         if let Some(value) = value {

@@ -138,6 +138,10 @@ fn judge(fleet: &Fleet, clients: &Clients, name: &str) {
             let history = clients.history(fleet);
             let file = fleet.scratch.path(format!("{name}.txt"));
             fs::write(&file, format!("{history:#?}")).unwrap();
+            for computer in &fleet.computers {
+                let log = fleet.scratch.path(format!("{name}-{}.log", computer.name));
+                fs::write(log, computer.ever_logged("").join("\n")).unwrap();
+            }
             let all = wrong.join("\n");
             panic!(
                 "{name}: {} promises are broken (all calls: {file:?}):\n{all}",

@@ -25,6 +25,7 @@ pub(super) struct Known {
     takeovers: u64,
     last_takeover: Option<Takeover>,
     pub(super) lost_writes: u64,
+    pub(super) times_cut_off: u64,
 }
 
 impl Known {
@@ -38,6 +39,7 @@ impl Known {
             takeovers: 0,
             last_takeover: None,
             lost_writes: 0,
+            times_cut_off: 0,
         }
     }
 
@@ -194,6 +196,7 @@ impl ClusterDriver {
             takeovers: known.takeovers,
             last_takeover: known.last_takeover.clone(),
             lost_writes: known.lost_writes,
+            times_cut_off: known.times_cut_off,
         };
         let board = &self.setup.context.board;
         board.update(|board| board.cluster = Some(facts));

@@ -1,11 +1,6 @@
 //! Creates what this process needs to run as one of several computers.
 
-use std::{
-    collections::VecDeque,
-    net::IpAddr,
-    sync::{Arc, Mutex},
-    time::Duration,
-};
+use std::{collections::VecDeque, net::IpAddr, sync::Arc, time::Duration};
 
 use hyper::header::HeaderValue;
 use tokio::{
@@ -29,7 +24,7 @@ use crate::{
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     hide::Hide,
     process::Rosmaster,
-    server::others::{Forwarded, Others},
+    server::others::{Forwarded, Others, Shown},
     upstream::peer::Peers,
 };
 
@@ -95,6 +90,7 @@ pub(in crate::app) async fn join(
     let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
     let place = watch::Sender::new(Place::default());
+    let shown = Arc::new(Shown::new());
     let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(setup.instance.clone(), context.probe_timeout));
     let others = Others {
@@ -105,7 +101,7 @@ pub(in crate::app) async fn join(
         forwarded: forwarded.clone(),
         served: setup.context.served.clone(),
         followed: place.subscribe(),
-        told: Arc::new(Mutex::new(Place::at_the_start())),
+        shown: shown.clone(),
         // A call may have to wait for the next leader. That takes the time to live, and longer if etcd must elect its
         // own leader first.
         hold: setup.hold.max(2 * config.ttl),
@@ -131,6 +127,7 @@ pub(in crate::app) async fn join(
         setup,
         standing,
         place,
+        shown,
         peers,
         forwarded,
         handovers,

@@ -23,7 +23,10 @@ impl ClusterDriver {
     /// Logs an event.
     pub(super) fn tell(&mut self, news: News) {
         match news {
-            News::Alone { serves } => self.tell_alone(serves),
+            News::Alone { serves } => {
+                self.known.times_cut_off += 1;
+                self.tell_alone(serves);
+            }
             News::NotAlone => {
                 let role = self.member.role().as_str();
                 all_clear!(info, ALONE, role, "no longer cut off");

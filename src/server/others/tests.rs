@@ -81,7 +81,7 @@ impl Computer {
         );
         let (standing, standing_rx) = watch::channel(standing);
         let (handovers_tx, handovers) = mpsc::channel(1);
-        let (tell_followed, followed) = watch::channel(Place::default());
+        let (tell_followed, followed) = watch::channel(Place::at_the_start());
         let calls = Calls {
             pool: Arc::new(Pool::new(1, upstream, ledger.clone(), gate.clone())),
             gate,
@@ -102,7 +102,7 @@ impl Computer {
                 forwarded: Arc::default(),
                 served: Default::default(),
                 followed,
-                told: Arc::default(),
+                shown: Arc::new(Shown::new()),
                 hold: second,
             }),
         };
@@ -395,11 +395,11 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
     let computer = Computer::new(Standing::Nobody { known: true });
     let others = computer.calls.others.clone().unwrap();
-    let told = |term, seq| *others.told() = place(term, seq);
+    let shown = |term, seq| others.shown.raise(place(term, seq));
     let follows = |term, seq| computer.followed.send_replace(place(term, seq));
     let later = others.hold / 2;
     let get = get();
-    told(TERM, 7);
+    shown(TERM, 7);
     // The last position comes from a second leader. The first leader announced records that it did not commit, so those
     // records are gone.
     for (term, seq) in [(TERM, 7), (TERM + 1, 8)] {
@@ -412,9 +412,9 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
         let (answer, _) = tokio::join!(computer.ask("/", &get), behind);
         assert_eq!(reply(answer.unwrap()).await, made_by(&get));
         assert_eq!(start.elapsed(), later);
-        told(TERM, 8);
+        shown(TERM, 8);
     }
-    told(TERM + 1, 9);
+    shown(TERM + 1, 9);
     assert!(computer.ask("/", &get).await.is_err(), "it is never fresh");
 }
 

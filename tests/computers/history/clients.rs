@@ -331,12 +331,26 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
         wire.send(&get).ok()?;
         serde_json::from_slice(&wire.response().ok()?.body).ok()
     };
+    // The process that answered last, how often it had been alone, and when it answered.
+    let mut before = (None, 0, 0);
     while !shared.finish.load(Ordering::Relaxed) {
         let from = shared.now();
         let page = ask();
         let to = shared.now();
         if let Some(page) = page {
             let cluster = &page["cluster"];
+            let (pid, times) = (page["pid"].as_u64(), cluster["times_cut_off"].as_u64());
+            let known = if pid == before.0 { before.1 } else { 0 };
+            if times > Some(known) {
+                // It may be over already.
+                shared.samples.lock().unwrap().push(Sample {
+                    computer,
+                    from: before.2,
+                    to,
+                    says: Says::Alone,
+                });
+            }
+            before = (pid, times.unwrap_or(0), to);
             let says = match cluster["role"].as_str() {
                 Some("alone") => Says::Alone,
                 Some("leading") if page["open"] == true => {

@@ -12,6 +12,8 @@ pub(crate) enum Mutant {
     MasterWhileAlone,
     /// A follower's mirror answers although it is out of date.
     StaleReads,
+    /// An answer to a read, which may show a record that the journal lacks, counts as one that shows the journal.
+    ShowsAhead,
     /// The mirror of a computer that starts answers before etcd's journal has been read.
     AnswersUnread,
     /// Nobody corrects what nodes have heard from a former leader, or from a computer that was cut off.

@@ -71,6 +71,16 @@ impl Place {
         }
     }
 
+    /// The number of the last record that a leader's answer may show. `agreed` is the last record that the journal has,
+    /// `last` the last one that the leader's mirror has. The answer to a write waits for the journal, and that to a read
+    /// does not.
+    pub fn shown_seq(is_read: bool, agreed: u64, last: u64) -> u64 {
+        match is_read && !Mutant::ShowsAhead.lives() {
+            true => last,
+            false => agreed,
+        }
+    }
+
     /// Whether a mirror at this place may answer reads after earlier answers have shown the place `told`. On one
     /// computer, no read goes back in time.
     pub fn shows(self, told: Self) -> bool {

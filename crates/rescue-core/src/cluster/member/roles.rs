@@ -172,7 +172,9 @@ impl Member {
         if self.records() {
             self.chores.notifying.stop();
         }
-        self.act(Action::Leave);
+        // A computer that is cut off has its own history.
+        let binds = self.role != Role::Alone;
+        self.act(Action::Leave { binds });
         let known = self.knows();
         self.stand(Standing::Nobody { known });
         self.end_master();

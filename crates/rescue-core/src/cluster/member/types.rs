@@ -245,8 +245,11 @@ pub enum Action {
     },
     /// Publish who has the master and where calls go.
     Stand(Standing),
-    /// Stop recording and acknowledging calls, and stop notifying nodes.
-    Leave,
+    /// Stop recording and acknowledging calls, and stop notifying nodes. If it `binds`, no later read on this computer
+    /// may show less than the mirror has shown.
+    Leave {
+        binds: bool,
+    },
     /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
     /// the ledger's state, if set.
     Lead {

@@ -46,6 +46,11 @@ pub(super) struct Ledger {
 }
 
 impl Ledger {
+    /// The number of the last record. The mirror shows it, even if the journal lacks it.
+    pub(super) fn last(&self) -> u64 {
+        self.sharing.as_ref().map_or(0, Sharing::last)
+    }
+
     pub(super) fn has_lease(&self, now: Instant) -> bool {
         self.lease.is_none_or(|until| now < until)
     }
@@ -67,8 +72,7 @@ impl Ledger {
         Some((sharing.last(), changes, notices))
     }
 
-    /// Stops recording. Returns the merged portions that are not answered.
-    pub(super) fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
+    fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {
         self.sharing = None;
         self.leadership += 1;
         self.agreed = 0;
@@ -131,6 +135,8 @@ pub(super) struct Computer {
     pub(super) waiting: Vec<(usize, u64)>,
     /// The furthest place in the journal that a leader's answer has shown.
     pub(super) told: Place,
+    /// The place in the journal up to which the mirror is current.
+    pub(super) followed: Place,
     /// Whether there is a watch. Its number, time and content follow.
     pub(super) watching: bool,
     pub(super) watch: u64,
@@ -190,6 +196,7 @@ impl Computer {
             standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
             told: Place::at_the_start(),
+            followed: Place::default(),
             watching: false,
             watch: 0,
             watch_at: 0,
@@ -204,7 +211,7 @@ impl Computer {
         self.hangs_until = 0;
         self.disk.own.restored = true;
         let own = &self.disk.own;
-        self.told = Place::at_the_start();
+        (self.told, self.followed) = (Place::at_the_start(), Place::default());
         self.ledger = Ledger {
             mirror: own.state.clone(),
             leadership: self.ledger.leadership + 1,
@@ -219,8 +226,20 @@ impl Computer {
 
     /// Notes the place in the journal that a leader's answer shows.
     pub(super) fn tell_of(&mut self, place: Place) {
-        let epoch = self.member.place().epoch;
+        let epoch = self.followed.epoch;
         self.told = self.told.max(Place { epoch, ..place });
+    }
+
+    /// Stops recording. Returns the merged portions that are not answered.
+    pub(super) fn leave(&mut self, binds: bool) -> Vec<(u64, Asker, wire::MergeAnswer)> {
+        if binds && self.ledger.sharing.is_some() {
+            let seq = self.ledger.last();
+            self.tell_of(Place {
+                seq,
+                ..self.followed
+            });
+        }
+        self.ledger.leave()
     }
 
     /// The computer's clock at a moment of the simulation, in microseconds.

@@ -51,6 +51,8 @@ pub(super) struct Etcd {
     pub(super) claims: Vec<usize>,
     /// All entries that were added to the journal, and when.
     pub(super) log: Vec<(u64, Held)>,
+    /// The term of each entry of the log.
+    pub(super) terms: Vec<u64>,
     pub(super) now: u64,
     /// Whether all data was lost once.
     pub(super) lost: bool,
@@ -68,6 +70,7 @@ impl Etcd {
             members: BTreeMap::new(),
             claims: Vec::new(),
             log: Vec::new(),
+            terms: Vec::new(),
             now: 0,
             lost: false,
         }
@@ -117,6 +120,7 @@ impl Etcd {
         *self = Self {
             claims: std::mem::take(&mut self.claims),
             log: std::mem::take(&mut self.log),
+            terms: std::mem::take(&mut self.terms),
             now: self.now,
             lost: true,
             ..Self::new()
@@ -237,6 +241,7 @@ impl Etcd {
             }
         }
         self.log.push((self.now, held.clone()));
+        self.terms.push(self.view.guard().leader);
         self.entries.insert(seq, (held, bytes));
         seq
     }

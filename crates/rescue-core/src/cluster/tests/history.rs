@@ -78,9 +78,18 @@ pub(super) struct Read {
     pub(super) began: u64,
     pub(super) done: Option<u64>,
     pub(super) value: Option<i32>,
-    /// Whether the read does not count, because a computer that was cut off answered it, or a leader whose journal
-    /// lacked something that it showed.
-    pub(super) alone: bool,
+    pub(super) shows: Shows,
+}
+
+/// What an answer to a read may show.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Shows {
+    /// What the journal has.
+    Agreed,
+    /// The state of the leader of this term, whose journal lacked something.
+    Early(u64),
+    /// The state of a computer that was cut off. The read does not count.
+    Alone,
 }
 
 impl Read {
@@ -91,7 +100,7 @@ impl Read {
             began,
             done: None,
             value: None,
-            alone: false,
+            shows: Shows::Agreed,
         }
     }
 }
@@ -103,6 +112,8 @@ pub(super) struct History {
     pub(super) reads: Vec<Read>,
     /// The value of each parameter in the last notification to each computer's node.
     pub(super) told: [[Option<i32>; KEYS]; COMPUTERS],
+    /// Each run of a write that was answered and changed something: the write, the computer and the moment.
+    runs: Vec<(usize, usize, u64)>,
     /// When the nodes of a computer died.
     died: Vec<(usize, u64)>,
     /// When a computer did not read each change of the others, because it started or got a whole state.
@@ -226,6 +237,9 @@ impl History {
         alone: Option<(u64, usize)>,
         changed: bool,
     ) {
+        if changed {
+            self.runs.push((call, by, now));
+        }
         let call = &mut self.calls[call];
         call.unchanged |= !changed;
         call.by.get_or_insert(by);
@@ -319,8 +333,10 @@ impl History {
                 continue;
             };
             let superseded = self.calls.iter().enumerate().any(|(of, later)| {
-                let own = (later.computer, later.key) == (call.computer, call.key);
-                own && of > number && later.heard.is_some()
+                let own = later.computer == call.computer && of > number;
+                // A leader that was cut off answered it after `call`, whichever computer forwarded it.
+                let there = later.by == call.by && later.ran > call.ran;
+                later.key == key && (own || there) && later.heard.is_some()
             });
             let recorded = !places.of[number].is_empty();
             // Another write of the same value in the log is as good.
@@ -425,8 +441,9 @@ impl History {
     ) -> Result<(), String> {
         // With `interval`, the journal may lack an answered write until its leader is back and sends it again.
         let brought_back = |call: &Call| commit == Commit::Interval && call.held;
-        // From the moment in each of these entries, no read may be older than its place in the log.
-        let mut floors: Vec<(u64, usize, String)> = Vec::new();
+        // What a node has seen, and when. No read that begins after the second moment may be older than the place in the
+        // log.
+        let mut floors: Vec<(u64, u64, usize, String)> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
             // A write that changed nothing may have been run again later.
             let counts = !call.reported && !call.unchanged;
@@ -443,10 +460,12 @@ impl History {
             let same = same.filter(|of| (of.key, of.value) == (key, call.value));
             let in_state = places.of[number].first().filter(|_| same.count() == 1);
             if let Some(first) = places.changed[number].first().or(in_state) {
-                floors.push((heard, *first, format!("{call:?}")));
+                floors.push((heard, heard, *first, format!("{call:?}")));
             }
         }
-        let of = |read: &&Read| (read.computer, read.key) == (computer, key) && !read.alone;
+        let of = |read: &&Read| {
+            (read.computer, read.key) == (computer, key) && read.shows != Shows::Alone
+        };
         let reads = self
             .reads
             .iter()
@@ -463,7 +482,15 @@ impl History {
         };
         for read in reads.iter().filter(|read| !lost(read.value)) {
             if let Some((first, _)) = places.of_value(self, key, read.value) {
-                floors.push((read.done.unwrap(), first, format!("{read:?}")));
+                // What a leader showed early counts once the journal has it. If it was lost with the leader and made
+                // again, it may have been gone in between.
+                let entry = first / 1000;
+                let done = read.done.unwrap();
+                let since = done.max(etcd.log[entry].0);
+                let lost = matches!(read.shows, Shows::Early(term) if term != etcd.terms[entry]);
+                if !lost {
+                    floors.push((done, since, first, format!("{read:?}")));
+                }
             }
         }
         // The same value may also come from a write that is in no journal, or was answered while cut off. Then it is
@@ -476,11 +503,12 @@ impl History {
                 same && in_vain && Some(call.made) <= read.done
             })
         };
-        for read in reads.into_iter().filter(|read| !in_vain(read)) {
+        let counts = |read: &&Read| read.shows == Shows::Agreed && !in_vain(read);
+        for read in reads.into_iter().filter(counts) {
             let Some((_, last)) = places.of_value(self, key, read.value) else {
                 continue;
             };
-            for (moment, floor, why) in &floors {
+            for (moment, since, floor, why) in &floors {
                 // The floor's write may have been shown before the journal had it, or by a leader that has started
                 // again.
                 let (added, held) = &etcd.log[floor / 1000];
@@ -491,11 +519,23 @@ impl History {
                 if commit == Commit::Interval && (early || restarted) {
                     continue;
                 }
+                // A write that was sent again runs again. With `interval`, the journal may lack the second run.
+                let mut runs = self
+                    .runs
+                    .iter()
+                    .map(|(call, by, at)| (&self.calls[*call], by, at));
+                let again = runs.any(|(call, by, at)| {
+                    let same = (call.key, Some(call.value), *by) == (key, read.value, computer);
+                    same && moment <= at && *at <= read.done.unwrap()
+                });
+                if commit == Commit::Interval && again {
+                    continue;
+                }
                 let died = self
                     .died
                     .iter()
                     .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
-                if *moment < read.began && last < *floor && !died {
+                if *since < read.began && last < *floor && !died {
                     return Err(format!("{read:?} is older than {why}: {last} < {floor}"));
                 }
             }

@@ -10,7 +10,7 @@ use std::{
 use super::{
     computer::{Asker, Computer, Unanswered, uri},
     etcd::{Etcd, Sent},
-    history::{History, KEYS, Read, key, subscriptions, value_of},
+    history::{History, KEYS, Read, Shows, key, subscriptions, value_of},
 };
 use crate::{
     cluster::{
@@ -58,7 +58,7 @@ enum Event {
     /// A read forwarded by the first computer reaches the second.
     Ask(usize, u64, usize, u64, usize),
     /// The answer to a read arrives: the value, and whether the journal may lack it.
-    Told(usize, u64, usize, (Option<i32>, bool), Place),
+    Told(usize, u64, usize, (Option<i32>, Shows), Place),
     /// The leader has not answered a read in time.
     Late(usize, u64, usize),
     Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
@@ -262,19 +262,18 @@ impl World {
                     && computer.standing.answers_others(term)
                 {
                     let value = self.value(to, self.history.reads[read].key);
-                    let seq = computer.ledger.agreed;
-                    let early = self.is_early(to);
+                    let ledger = &computer.ledger;
+                    let seq = Place::shown_seq(true, ledger.agreed, ledger.last());
+                    let shows = self.shows(to);
                     let delay = self.delay();
-                    self.after(
-                        delay,
-                        Event::Told(from, life, read, (value, early), place(term, seq)),
-                    );
+                    let told = Event::Told(from, life, read, (value, shows), place(term, seq));
+                    self.after(delay, told);
                 }
             }
-            Event::Told(at, life, read, (value, early), place) => {
+            Event::Told(at, life, read, (value, shows), place) => {
                 if self.lives(at, life) && self.history.reads[read].done.is_none() {
                     self.computers[at].tell_of(place);
-                    self.read_done(read, value, early);
+                    self.read_done(read, value, shows);
                 }
             }
             Event::Late(at, life, read) => {
@@ -475,6 +474,7 @@ impl World {
                 self.act(at, action, &mut inputs);
             }
             let computer = &mut self.computers[at];
+            computer.followed = computer.member.place();
             computer.write_disk();
             if inputs.is_empty()
                 && let Some(sharing) = &mut computer.ledger.sharing
@@ -543,8 +543,8 @@ impl World {
                 self.after(delay, Event::Input(at, life, input));
             }
             Action::Stand(standing) => self.stand(at, standing),
-            Action::Leave => {
-                for (_, asker, _) in self.computers[at].ledger.leave() {
+            Action::Leave { binds } => {
+                for (_, asker, _) in self.computers[at].leave(binds) {
                     self.merge_answered(asker, at, None);
                 }
                 self.owed[at] = Default::default();

@@ -125,7 +125,8 @@ impl World {
             let cut = self.computers[at].cut;
             self.history
                 .answered(at, call, self.now, alone.then_some(cut), recorded);
-            let place = place(term.unwrap_or(0), agreed);
+            let shown = Place::shown_seq(false, agreed, self.computers[at].ledger.last());
+            let place = place(term.unwrap_or(0), shown);
             let life = self.computers[origin].life;
             if origin == at {
                 self.done(at, call);
@@ -234,12 +235,17 @@ impl World {
         self.flush(at);
     }
 
-    /// Whether the mirror of a leader, or of one that was cut off, may show changes that the journal lacks.
-    pub(super) fn is_early(&self, at: usize) -> bool {
+    /// What the mirror of a leader, or of one that was cut off, may show.
+    pub(super) fn shows(&self, at: usize) -> Shows {
         let computer = &self.computers[at];
         let sharing = computer.ledger.sharing.as_ref();
         let committed = computer.member.machine().committed();
-        sharing.is_some_and(|of| of.last() > committed) || computer.member.uncommitted() > 0
+        let early =
+            sharing.is_some_and(|of| of.last() > committed) || computer.member.uncommitted() > 0;
+        match early {
+            true => Shows::Early(computer.member.machine().term().unwrap_or_default()),
+            false => Shows::Agreed,
+        }
     }
 
     pub(super) fn value(&self, at: usize, key: usize) -> Option<i32> {
@@ -268,7 +274,7 @@ impl World {
     pub(super) fn read_late(&mut self, at: usize, life: u64, read: usize) {
         let key = self.history.reads[read].key;
         let computer = &self.computers[at];
-        let fresh = computer.member.place().shows(computer.told);
+        let fresh = computer.followed.shows(computer.told);
         let (may, alone) = match &computer.standing {
             Standing::Alone => (true, true),
             Standing::Leads {
@@ -280,16 +286,17 @@ impl World {
         };
         if may {
             let value = self.value(at, key);
-            let early = alone || self.is_early(at);
-            self.read_done(read, value, early);
+            let alone = alone || computer.member.role() == Role::Alone;
+            let shows = if alone { Shows::Alone } else { self.shows(at) };
+            self.read_done(read, value, shows);
         } else if self.now < self.history.reads[read].began + 8_000 * MS {
             self.after(POLL, Event::Late(at, life, read));
         }
     }
 
-    pub(super) fn read_done(&mut self, read: usize, value: Option<i32>, alone: bool) {
+    pub(super) fn read_done(&mut self, read: usize, value: Option<i32>, shows: Shows) {
         let read = &mut self.history.reads[read];
-        (read.value, read.done, read.alone) = (value, Some(self.now), alone);
+        (read.value, read.done, read.shows) = (value, Some(self.now), shows);
         self.counts.reads += 1;
     }
 
