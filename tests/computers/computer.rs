@@ -255,15 +255,21 @@ impl Computer {
         fs::remove_dir_all(self.path("etcd")).unwrap();
     }
 
-    /// The process ids, seen from outside, of all that runs there but for its first process.
+    /// The process ids, seen from outside, of all that runs there but for its first process, and of what started them.
     pub(crate) fn processes(&self) -> Vec<u32> {
         let power = self.power.as_ref().expect("the computer is off");
         let init = child_of(power).expect("the first process of a computer");
         let space = |pid: u32| fs::read_link(format!("/proc/{pid}/ns/pid")).ok();
         let own = space(init);
         let all = self.scratch.survivors().into_iter().map(|(pid, _)| pid);
-        all.filter(|&pid| pid != init && space(pid) == own)
-            .collect()
+        let inside: Vec<u32> = all
+            .filter(|&pid| pid != init && space(pid) == own)
+            .collect();
+        // `nsenter` outside stops itself when its child stops, and nobody would continue it. It stops first, so that it
+        // notices nothing.
+        let parents = inside.iter().filter_map(|&pid| parent_of(pid));
+        let outside = parents.filter(|pid| *pid != init && !inside.contains(pid));
+        [outside.collect(), inside.clone()].concat()
     }
 
     /// SIGKILL.
@@ -476,6 +482,12 @@ pub(crate) fn endpoints() -> Vec<String> {
 /// What was started by `ip netns exec … unshare` or `nsenter`, which stay as its parents.
 fn child_of(parent: &Process) -> Option<u32> {
     children(parent.pid()).first().copied()
+}
+
+fn parent_of(pid: u32) -> Option<u32> {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let parent = status.lines().find_map(|line| line.strip_prefix("PPid:"))?;
+    parent.trim().parse().ok()
 }
 
 fn children(pid: u32) -> Vec<u32> {

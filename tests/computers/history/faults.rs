@@ -186,7 +186,7 @@ impl Fault {
             }
         }
         for pid in &lasting.pids {
-            signal(*pid, Signal::STOP);
+            stop(*pid);
         }
         Some(lasting)
     }
@@ -214,7 +214,8 @@ impl Lasting {
 
     #[track_caller]
     pub(super) fn end(self, fleet: &mut Fleet) {
-        for pid in &self.pids {
+        // `nsenter` goes on last. See `Computer::processes`.
+        for pid in self.pids.iter().rev() {
             signal(*pid, Signal::CONT);
         }
         match self.fault {

@@ -441,9 +441,7 @@ impl History {
     ) -> Result<(), String> {
         // With `interval`, the journal may lack an answered write until its leader is back and sends it again.
         let brought_back = |call: &Call| commit == Commit::Interval && call.held;
-        // What a node has seen, and when. No read that begins after the second moment may be older than the place in the
-        // log.
-        let mut floors: Vec<(u64, u64, usize, String)> = Vec::new();
+        let mut floors: Vec<Floor> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
             // A write that changed nothing may have been run again later.
             let counts = !call.reported && !call.unchanged;
@@ -460,7 +458,13 @@ impl History {
             let same = same.filter(|of| (of.key, of.value) == (key, call.value));
             let in_state = places.of[number].first().filter(|_| same.count() == 1);
             if let Some(first) = places.changed[number].first().or(in_state) {
-                floors.push((heard, heard, *first, format!("{call:?}")));
+                floors.push(Floor {
+                    shown: heard,
+                    since: heard,
+                    early: false,
+                    place: *first,
+                    why: format!("{call:?}"),
+                });
             }
         }
         let of = |read: &&Read| {
@@ -489,7 +493,13 @@ impl History {
                 let since = done.max(etcd.log[entry].0);
                 let lost = matches!(read.shows, Shows::Early(term) if term != etcd.terms[entry]);
                 if !lost {
-                    floors.push((done, since, first, format!("{read:?}")));
+                    floors.push(Floor {
+                        shown: done,
+                        since,
+                        early: read.shows != Shows::Agreed,
+                        place: first,
+                        why: format!("{read:?}"),
+                    });
                 }
             }
         }
@@ -508,15 +518,17 @@ impl History {
             let Some((_, last)) = places.of_value(self, key, read.value) else {
                 continue;
             };
-            for (moment, since, floor, why) in &floors {
+            for floor in &floors {
                 // The floor's write may have been shown before the journal had it, or by a leader that has started
                 // again.
-                let (added, held) = &etcd.log[floor / 1000];
+                let (added, held) = &etcd.log[floor.place / 1000];
                 let early = *added >= read.began || matches!(held, Held::State(_));
                 let mut restarts = self.skipped.iter();
-                let restarted = restarts
-                    .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
-                if commit == Commit::Interval && (early || restarted) {
+                let between = |at: &u64| floor.shown <= *at && *at <= read.done.unwrap();
+                let restarted = restarts.any(|(of, at)| *of == computer && between(at));
+                // A process that starts does not know what an earlier one has shown before the journal had it.
+                let interval = commit == Commit::Interval;
+                if interval && (early || restarted) || floor.early && restarted {
                     continue;
                 }
                 // A write that was sent again runs again. With `interval`, the journal may lack the second run.
@@ -526,22 +538,35 @@ impl History {
                     .map(|(call, by, at)| (&self.calls[*call], by, at));
                 let again = runs.any(|(call, by, at)| {
                     let same = (call.key, Some(call.value), *by) == (key, read.value, computer);
-                    same && moment <= at && *at <= read.done.unwrap()
+                    same && between(at)
                 });
-                if commit == Commit::Interval && again {
+                if interval && again {
                     continue;
                 }
                 let died = self
                     .died
                     .iter()
-                    .any(|(of, at)| *of == computer && moment <= at && *at <= read.done.unwrap());
-                if *since < read.began && last < *floor && !died {
-                    return Err(format!("{read:?} is older than {why}: {last} < {floor}"));
+                    .any(|(of, at)| *of == computer && between(at));
+                if floor.since < read.began && last < floor.place && !died {
+                    let Floor { place, why, .. } = floor;
+                    return Err(format!("{read:?} is older than {why}: {last} < {place}"));
                 }
             }
         }
         Ok(())
     }
+}
+
+/// What a node has seen. No read that begins later may be older.
+struct Floor {
+    shown: u64,
+    /// From when on it counts.
+    since: u64,
+    /// Whether the journal lacked it when it was shown.
+    early: bool,
+    /// Its place in the log.
+    place: usize,
+    why: String,
 }
 
 /// The places of each write in the log.
