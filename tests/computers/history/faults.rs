@@ -185,7 +185,7 @@ impl Fault {
                 return None;
             }
         }
-        for pid in &lasting.pids {
+        for pid in lasting.pids.iter().filter(|pid| alive(**pid)) {
             stop(*pid);
         }
         Some(lasting)

@@ -190,6 +190,31 @@ fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
     }
 }
 
+/// The checkpoint of a computer that led before may name a term that the new etcd has not reached yet.
+#[test]
+fn a_computer_that_starts_after_etcd_has_lost_its_data_follows_at_once() {
+    for seed in first()..first() + schedules().min(100) {
+        let mut world = calm(seed);
+        world.run(Duration::from_secs(5));
+        let before = world.leaders()[0];
+        world.hand_over(before);
+        world.until_another_leads(before);
+        world.lose_etcd();
+        while world.counts.etcds_lost < 3 || world.leaders().len() != 1 {
+            world.run(Duration::from_millis(500));
+        }
+        world.run(Duration::from_secs(1));
+        let leader = world.leaders()[0];
+        for at in (0..3).filter(|at| *at != leader) {
+            world.kill(at);
+        }
+        world.heal();
+        world.run(Duration::from_secs(8));
+        assert_eq!(world.counts.etcds_lost, 3, "seed {seed}");
+        world.check();
+    }
+}
+
 /// A schedule in which etcd loses its data while nothing else fails.
 fn lost(seed: u64) -> World {
     let mut world = calm(seed);

@@ -289,7 +289,8 @@ impl Member {
         let seq = self.journal.progress.seq;
         // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
         // lacks.
-        let differs = self.own.seq > seq || !self.cut_off.is_empty();
+        let lost = self.lost.since().is_some();
+        let differs = self.own.seq > seq || lost || !self.cut_off.is_empty();
         if self.own_wins && differs && !self.records() {
             return;
         }

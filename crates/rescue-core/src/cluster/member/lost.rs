@@ -88,18 +88,21 @@ impl Member {
         self.reading.forget(&view);
         self.drive(now, machine::Input::Lost { view, until });
         self.machine.hold_claims(until);
+        self.lost.times += 1;
+        let epoch = self.lost.times;
         let journal = std::mem::take(&mut self.journal);
-        if std::mem::take(&mut self.reading.loaded) && !self.own_wins {
-            (self.own.state, self.own.restored) = (journal.state, true);
+        if std::mem::take(&mut self.reading.loaded) {
+            if !self.own_wins {
+                (self.own.state, self.own.restored) = (journal.state, true);
+            }
+            // The mirror goes on answering. That of a process which has just started may be older than the new journal.
+            self.place = Place {
+                epoch,
+                ..Place::default()
+            };
         }
         (self.own_wins, self.own.term) = (true, 0);
         self.reading.load_by(now);
-        self.lost.times += 1;
-        let epoch = self.lost.times;
-        self.place = Place {
-            epoch,
-            ..Place::default()
-        };
         self.lost.now = Some((now, holds, 0));
         self.lost.second = false;
         self.act(Action::Say);

@@ -226,6 +226,13 @@ impl Member {
         if self.machine.role() != Role::Following || self.role != Role::Following {
             return;
         }
+        // After a restart, a term that etcd has not reached would mean that etcd has lost its data.
+        if let Some((_, term)) = self.leader()
+            && term != self.own.term
+        {
+            self.own.term = term;
+            self.act(Action::Term(term));
+        }
         let standing = match self.leader() {
             // Writes answered while cut off must be merged before new calls.
             Some((uri, term)) if self.cut_off.is_empty() => {

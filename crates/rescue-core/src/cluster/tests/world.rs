@@ -666,7 +666,7 @@ impl World {
                 }
                 News::Leads { .. } => self.counts.leaderships += 1,
                 // Reads may have shown data that etcd has lost.
-                News::EtcdLost => self.history.forgets(at, self.now),
+                News::EtcdLost => self.etcd_is_lost(at),
                 _ => {}
             },
             Action::EndRosout => inputs.push_back(Input::RosoutEnded),

@@ -120,7 +120,10 @@ impl World {
                     self.history
                         .breaks("a leader answers what no journal holds");
                 }
-                self.term = self.term.max(term);
+                // A leader of the etcd that was lost may not know of the loss yet.
+                if term <= self.etcd.view().revision {
+                    self.term = self.term.max(term);
+                }
             }
             let cut = self.computers[at].cut;
             self.history

@@ -29,6 +29,8 @@ pub(in super::super) struct Counts {
     pub(in super::super) reads: u64,
     pub(in super::super) merged: u64,
     pub(in super::super) reported: u64,
+    /// How often a computer noticed that etcd had lost its data.
+    pub(in super::super) etcds_lost: u64,
     /// The longest time that a call waited on a computer that did not hang, with `--alone serve`.
     pub(in super::super) waited: Duration,
 }
@@ -41,6 +43,7 @@ impl Counts {
         self.reads += other.reads;
         self.merged += other.merged;
         self.reported += other.reported;
+        self.etcds_lost += other.etcds_lost;
         self.waited = self.waited.max(other.waited);
     }
 }
@@ -125,6 +128,11 @@ impl Network {
 }
 
 impl World {
+    pub(super) fn etcd_is_lost(&mut self, at: usize) {
+        self.counts.etcds_lost += 1;
+        self.history.forgets(at, self.now);
+    }
+
     /// Begins a random failure that ends after a while.
     pub(super) fn fault(&mut self) {
         if !self.plan.faults || self.network.healed.is_some() {
@@ -232,6 +240,8 @@ impl World {
         let time = (20 + self.dice.below(6000)) * MS;
         self.strike(Fault::EtcdAway, time);
         self.etcd.lose();
+        // Its terms start over.
+        self.term = 0;
     }
 
     pub(super) fn end(&mut self, fault: Fault) {
