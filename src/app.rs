@@ -203,7 +203,7 @@ fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
     tasks.spawn(boxed(nodes::liveness::watch(context.nodes.clone())));
     tasks.spawn(boxed(nodes::watch(
         context.nodes.clone(),
-        config.reap_interval,
+        config.reap.interval,
     )));
     if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(boxed(bypass::watch(

@@ -11,7 +11,7 @@
 //! another computer is waited for no longer than a minute; see `docs/decisions/0003-no-call-in-flight.md`.
 
 use std::{
-    collections::HashSet,
+    collections::HashMap,
     fs::{self, File},
     io::{BufRead, BufReader},
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
@@ -34,15 +34,38 @@ pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
     })
 }
 
-/// The addresses at which processes in this network namespace listen. IPv4 addresses are not in their IPv6 form.
-pub(crate) fn listening() -> HashSet<SocketAddr> {
+/// The addresses at which processes in this network namespace listen, with the inodes of their sockets. IPv4 addresses
+/// are not in their IPv6 form.
+pub(crate) fn listening() -> HashMap<SocketAddr, Vec<u64>> {
+    let mut all = HashMap::<_, Vec<u64>>::new();
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
         // The kernel lists listening sockets first. Tens of thousands of others may follow.
         let lines = BufReader::new(table).lines().skip(1);
         lines.map_while(|line| listens_at(&line.ok()?))
     });
-    sockets.collect()
+    for (address, inode) in sockets {
+        all.entry(address).or_default().push(inode);
+    }
+    all
+}
+
+/// The inodes of the sockets of `listening` that accept connections to `address`. A socket with a specific address takes
+/// precedence over one for any address.
+pub(crate) fn accepting(
+    listening: &HashMap<SocketAddr, Vec<u64>>,
+    address: SocketAddr,
+) -> Vec<u64> {
+    if let Some(sockets) = listening.get(&address) {
+        return sockets.clone();
+    }
+    let port = address.port();
+    let any = [([0; 4], port).into(), ([0; 16], port).into()];
+    any.iter()
+        .filter_map(|any| listening.get(any))
+        .flatten()
+        .copied()
+        .collect()
 }
 
 /// One end of a connection in this network namespace.
@@ -80,12 +103,15 @@ fn end_in(line: &str) -> Option<Established> {
     })
 }
 
-/// The address in one line of the table, if the socket listens.
-fn listens_at(line: &str) -> Option<SocketAddr> {
+/// Address and inode in one line of the table, if the socket listens.
+fn listens_at(line: &str) -> Option<(SocketAddr, u64)> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, state) = (columns.next()?, columns.nth(1)?);
-    let listens = u8::from_str_radix(state, 16).ok()? == LISTEN;
-    address(local).filter(|_| listens)
+    if u8::from_str_radix(state, 16).ok()? != LISTEN {
+        return None;
+    }
+    let inode = columns.nth(5)?.parse().ok()?;
+    Some((address(local)?, inode))
 }
 
 fn is_in_table(table: &str, master: SocketAddr) -> bool {

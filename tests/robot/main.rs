@@ -63,6 +63,7 @@ mod recovery {
     mod injection;
     mod liveness;
     mod no_shutdown;
+    mod reap;
     mod reconciliation;
     mod taken_port;
     mod two_robots;

@@ -174,6 +174,7 @@ mod tests {
         let mut facts = Facts::new(Mode::Core);
         facts.cluster = Some(cluster.clone());
         let situation = Situation {
+            feuds: Vec::new(),
             gate,
             gate_since: facts.started,
             unprotected: None,
