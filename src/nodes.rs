@@ -1,5 +1,6 @@
 //! Watches the nodes, and keeps facts about them that their registrations do not contain.
 
+pub(crate) mod addresses;
 pub(crate) mod client;
 pub(crate) mod health_check;
 mod identify;

@@ -213,7 +213,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
 }
 
 /// The addresses of `api` that belong to this computer. `None` if it has no address within `limit`.
-async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
+pub(super) async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;
     let mut found = found.ok()?.ok()?;

@@ -3,7 +3,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Instant,
 };
@@ -14,8 +14,8 @@ use super::{Nodes, health_check};
 use crate::{
     clock,
     health::{
-        Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, Reap, Registrants, first_taking,
-        port_of,
+        AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
+        Reap, Registrants, first_taking, port_of,
     },
     ledger::{Ledger, activity::LastCalls},
     limit::rarely,
@@ -49,6 +49,7 @@ struct Known {
     evidence: BTreeMap<String, Evidence>,
     /// Dead nodes that were reported or unregistered, each with the number of its last registration.
     handled: BTreeMap<String, u64>,
+    addresses: NodeAddresses,
 }
 
 /// A registered name.
@@ -100,6 +101,9 @@ impl LocalNodes {
     /// computer.
     pub(super) fn set_here(&self, port: &str, addresses: Vec<SocketAddr>) {
         let mut known = self.lock();
+        known
+            .addresses
+            .set(port, addresses.iter().map(SocketAddr::ip));
         match addresses.is_empty() {
             true => known.here.remove(port),
             false => known.here.insert(port.to_owned(), addresses),
@@ -115,6 +119,7 @@ impl LocalNodes {
         known
             .here
             .retain(|port, _| registered.contains(port.as_str()));
+        known.addresses.retain(|port| registered.contains(port));
         let here = known.here.iter();
         let sockets: BTreeMap<_, _> = here
             .map(|(port, addresses)| (port.as_str(), accepting(listening, addresses)))
@@ -144,6 +149,31 @@ impl LocalNodes {
         listens
             .map(|(port, sockets)| (port.to_owned(), !sockets.is_empty()))
             .collect()
+    }
+
+    /// The ports of nodes that are registered at a lost address.
+    pub(super) fn lost_ports(&self) -> Vec<String> {
+        let known = self.lock();
+        let lost = known.addresses.lost();
+        lost.map(|(port, ..)| port.to_owned()).collect()
+    }
+
+    /// The addresses that this computer has lost and that nodes are registered at, each with their ports and the time.
+    pub(crate) fn lost(&self) -> BTreeMap<IpAddr, (Instant, BTreeSet<String>)> {
+        let mut lost = BTreeMap::new();
+        for (port, address, since) in self.lock().addresses.lost() {
+            let (at, ports) = lost
+                .entry(address)
+                .or_insert_with(|| (since, BTreeSet::new()));
+            *at = since.min(*at);
+            ports.insert(port.to_owned());
+        }
+        lost
+    }
+
+    /// Looks which nodes' addresses this computer has lost or got back.
+    pub(super) fn look_at_addresses(&self, is_own: impl Fn(IpAddr) -> bool) -> AddressChanges {
+        self.lock().addresses.look(is_own, Instant::now())
     }
 
     /// The sockets of nodes whose owners have not been looked for yet.

@@ -25,7 +25,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 28] = [
+    let values: [(&str, &str, Option<f64>); 29] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -47,6 +47,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("dead_nodes", "registered nodes whose process has ended or whose port refuses connections", Some(status.nodes.dead_nodes.len() as f64)),
         ("unchecked_nodes", "registered nodes without a check in the last two minutes", Some(status.nodes.unchecked_nodes.len() as f64)),
         ("feuds", "node names that two programs take from each other", Some(status.nodes.feuds.len() as f64)),
+        ("lost_addresses", "addresses that this computer has lost and at which nodes are registered", Some(status.nodes.lost_addresses.len() as f64)),
         ("bypassing", "processes and computers that bypass rosrescue and talk to the master directly", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
         ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),

@@ -1,6 +1,6 @@
 //! The complete status at one moment, for `/status.json` and `rosrescue status`.
 
-use std::{collections::BTreeMap, fmt};
+use std::{collections::BTreeMap, fmt, net::IpAddr};
 
 use serde::{Deserialize, Serialize};
 
@@ -72,6 +72,19 @@ pub(crate) struct NodesStatus {
     /// Names that two programs take from each other.
     #[serde(default)]
     pub(crate) feuds: Vec<Feud>,
+    /// Addresses that this computer has lost, and at which nodes are registered.
+    #[serde(default)]
+    pub(crate) lost_addresses: Vec<LostAddress>,
+}
+
+/// An address that this computer has lost.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct LostAddress {
+    pub(crate) address: IpAddr,
+    /// When rosrescue noticed it, in seconds since 1970.
+    pub(crate) since: f64,
+    /// The nodes that are registered there.
+    pub(crate) nodes: Vec<String>,
 }
 
 /// The health of a node that is not known to be alive.

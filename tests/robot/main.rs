@@ -58,6 +58,7 @@ mod master {
 
 /// A new master is given the state, and the health check examines the nodes.
 mod recovery {
+    mod addresses;
     mod health_check;
     mod host_names;
     mod injection;

@@ -4,6 +4,7 @@
 //! The answering node counts as the one that has registered unless there is evidence against that, because losing a
 //! healthy node is worse than keeping a dead one.
 
+mod addresses;
 mod backoff;
 mod feuds;
 mod kernel;
@@ -17,6 +18,7 @@ mod simulation;
 mod taken_port;
 mod unreachable;
 
+pub use addresses::{AddressChanges, NodeAddresses};
 pub use feuds::{Feud, Feuds};
 pub use kernel::{Death, Evidence, LocalName, Owner, Process, Registrants};
 pub use liveness::{Health, Liveness};

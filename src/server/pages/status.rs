@@ -9,7 +9,7 @@ use super::Pages;
 use crate::{
     clock,
     gate::State,
-    health::{Feud, Health},
+    health::Health,
     ledger::journal::StoreState,
     master::Master,
     status::{
@@ -77,6 +77,7 @@ impl Pages {
             unprotected: unprotected.clone(),
             master: master.clone(),
             feuds: self.nodes.local.feuds(),
+            lost_addresses: self.nodes.lost_addresses(),
         };
         let rescues = facts.reports.iter().filter(|report| report.is_rescue());
         let last = (facts.recoveries > 0)
@@ -110,7 +111,7 @@ impl Pages {
             guarded: facts.guarded.is_guarded(),
             guarded_by: facts.guarded.to_string(),
             state: self.ledger.with_mirror(Master::counts),
-            nodes: self.nodes_status(situation.feuds),
+            nodes: self.nodes_status(situation),
             recoveries: facts.recoveries,
             last_recovery: last.cloned(),
             rescues: facts.rescues,
@@ -123,7 +124,7 @@ impl Pages {
         }
     }
 
-    fn nodes_status(&self, feuds: Vec<Feud>) -> NodesStatus {
+    fn nodes_status(&self, situation: Situation) -> NodesStatus {
         let lives = self.nodes.lives();
         let of = |health| {
             let names = lives.iter().filter(|(_, life)| life.health == health);
@@ -145,7 +146,8 @@ impl Pages {
             unchecked_nodes: of(Health::Unchecked),
             alive_nodes: of(Health::Alive).len(),
             node_health: ill.collect(),
-            feuds,
+            feuds: situation.feuds,
+            lost_addresses: situation.lost_addresses,
         }
     }
 

@@ -175,6 +175,7 @@ mod tests {
         facts.cluster = Some(cluster.clone());
         let situation = Situation {
             feuds: Vec::new(),
+            lost_addresses: Vec::new(),
             gate,
             gate_since: facts.started,
             unprotected: None,
