@@ -31,6 +31,8 @@ use crate::{
 
 /// Pause between two reads of the socket table.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
+/// Pause before it is noted again since when each node's health has been the same. It costs as much as a look.
+const NOTE_AGAIN: Duration = Duration::from_secs(5);
 /// Pause before the table is read again because nodes register.
 const SETTLE: Duration = Duration::from_millis(100);
 /// Number of nodes asked at the same time.
@@ -123,6 +125,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut looks = interval(LOOK_AGAIN);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut next = Instant::now();
+    let mut noted = None;
     loop {
         tokio::select! {
             _ = looks.tick() => {
@@ -137,8 +140,13 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
                 nodes.local.registered.notified().await;
             } => {}
         }
-        next = Instant::now() + SETTLE;
+        let now = Instant::now();
+        next = now + SETTLE;
         look(&nodes);
+        if noted.is_none_or(|noted| noted + NOTE_AGAIN <= now) {
+            nodes.note_lives();
+            noted = Some(now);
+        }
     }
 }
 
@@ -151,14 +159,15 @@ fn look(nodes: &Arc<Nodes>) {
         true => HashMap::new(),
         false => sockets::listening(),
     };
-    let listens = nodes.local.look(&names, &listening);
+    let listens = nodes
+        .local
+        .look(&names, &listening, nodes.gate.state() != State::Elsewhere);
     let due = nodes.liveness.lock().liveness.round(
         &registered,
         |port| listens.get(port).copied(),
         Instant::now(),
     );
     local::bury(nodes, &names);
-    nodes.note_lives();
     let listening = Arc::new(listening);
     for port in due {
         crate::task::spawn(ask(nodes.clone(), port, listening.clone()));

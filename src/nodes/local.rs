@@ -111,10 +111,19 @@ impl LocalNodes {
     }
 
     /// Looks at all nodes, with `listening` as the socket table, which must be read after `names`. Returns whether a
-    /// process listens at each port of this computer.
-    pub(super) fn look(&self, names: &[Named], listening: &Listening) -> BTreeMap<String, bool> {
+    /// process listens at each port of this computer. Without `proves`, as on a computer that does not see all
+    /// registrations, the table proves nothing about single names.
+    pub(super) fn look(
+        &self,
+        names: &[Named],
+        listening: &Listening,
+        proves: bool,
+    ) -> BTreeMap<String, bool> {
         let now = Instant::now();
         let known = &mut *self.lock();
+        if !proves {
+            known.registrants = Registrants::default();
+        }
         let registered: BTreeSet<_> = names.iter().map(|name| name.port.as_str()).collect();
         known
             .here
@@ -126,7 +135,9 @@ impl LocalNodes {
             .collect();
         let local: Vec<_> = names.iter().map(Named::local).collect();
         let at = |port| sockets.get(port).map(Vec::as_slice);
-        known.registrants.look(&local, at);
+        if proves {
+            known.registrants.look(&local, at);
+        }
         known.evidence.clear();
         for name in names {
             let evidence = match at(name.port.as_str()) {
@@ -349,6 +360,14 @@ pub(super) fn bury(nodes: &Arc<Nodes>, names: &[Named]) {
         let Evidence::Ended(death) = nodes.local.evidence(&name.node) else {
             continue;
         };
+        let others: Vec<_> = names
+            .iter()
+            .filter(|other| other.port == name.port && other.node != name.node)
+            .map(|other| other.node.as_str())
+            .collect();
+        if !death.is_certain(!others.is_empty()) {
+            continue;
+        }
         let mut known = nodes.local.lock();
         if known.handled.get(&name.node) == Some(&death.registered) {
             continue;
@@ -356,7 +375,7 @@ pub(super) fn bury(nodes: &Arc<Nodes>, names: &[Named]) {
         known.handled.insert(name.node.clone(), death.registered);
         drop(known);
         let node = &name.node;
-        let how = how(&death, name, names);
+        let how = how(&death, &others);
         if nodes.local.reap == Reap::Report {
             rarely!(info, "would have unregistered {node}: {how} (--reap local)");
             continue;
@@ -382,20 +401,15 @@ async fn unregister(nodes: Arc<Nodes>, node: String, api: String, death: Death, 
     }
 }
 
-/// How a node has ended, as in `its process 7 ended at 14:03:01, nobody listens at its port`.
-fn how(death: &Death, name: &Named, names: &[Named]) -> String {
+/// How a node has ended, as in `its process 7 ended at 14:03:01, nobody listens at its port`. `others` are the other names
+/// at its port.
+fn how(death: &Death, others: &[&str]) -> String {
     let at = clock::wall_text(clock::wall_time_of(death.since));
     let time = at.get(11..19).unwrap_or(&at);
     let process = death.process.pid;
-    let others = names
-        .iter()
-        .filter(|other| other.port == name.port && other.node != name.node)
-        .map(|other| other.node.as_str());
-    let others: Vec<_> = others.collect();
-    let port = match (death.taken, others.as_slice()) {
-        (false, _) => "nobody listens at its port".to_owned(),
-        (true, []) => "another program listens at its port".to_owned(),
-        (true, others) => format!("{} uses its port now", others.join(", ")),
+    let port = match death.taken {
+        false => "nobody listens at its port".to_owned(),
+        true => format!("{} uses its port now", others.join(", ")),
     };
     format!("its process {process} ended at {time}, {port}")
 }

@@ -68,6 +68,14 @@ pub struct Death {
     pub taken: bool,
 }
 
+impl Death {
+    /// Whether the name itself can be unregistered. `others` says whether other names are registered at its port. If
+    /// not, the process that listens there may have the name, after a registration that rosrescue has not seen.
+    pub fn is_certain(&self, others: bool) -> bool {
+        !self.taken || others
+    }
+}
+
 /// The process behind a name, as the kernel showed it when the name registered.
 #[derive(Clone, Debug)]
 struct Registrant {
@@ -278,6 +286,8 @@ mod tests {
             };
             assert_eq!((death.process.pid, death.registered), (1, 1));
             assert_eq!(death.taken, taken);
+            assert_eq!(death.is_certain(false), !taken);
+            assert!(death.is_certain(true));
         }
     }
 

@@ -516,7 +516,9 @@ impl World {
 
     fn reap(&mut self, name: &str, api: &str, death: Death) {
         let is_same = self.mirror.api_of(name) == Some(api);
-        if !is_same || self.registered[name] != death.registered {
+        let is_other = |(other, at): (&str, &str)| other != name && at == api;
+        let others = self.mirror.nodes().any(is_other);
+        if !is_same || !death.is_certain(others) || self.registered[name] != death.registered {
             return;
         }
         let holder = &self.programs[self.holder[name]];
