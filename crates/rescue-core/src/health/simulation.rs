@@ -323,11 +323,11 @@ impl World {
         }
     }
 
-    /// The next look finds a dead node, if the kernel has watched its process and its socket is closed.
+    /// The next look finds a dead node, if the kernel has watched its process and nothing listens at its port.
     fn assert_known(&mut self, index: usize) {
         let program = &self.programs[index];
         let (api, process) = (Self::api(program), program.process);
-        let is_open = self.sockets.values().any(|socket| socket.program == index);
+        let is_open = !self.sockets_at(program.port).is_empty();
         let watched = |name: &&String| self.known.process(name, port_of(&api)) == Some(process);
         let dead: Vec<_> = program.names.iter().filter(watched).cloned().collect();
         if is_open || self.looking {
