@@ -201,9 +201,10 @@ fn accept(
 /// Starts the tasks that look after the nodes, and after clients that bypass this rosrescue.
 fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
     tasks.spawn(boxed(nodes::liveness::watch(context.nodes.clone())));
+    tasks.spawn(boxed(nodes::addresses::watch(context.nodes.clone())));
     tasks.spawn(boxed(nodes::watch(
         context.nodes.clone(),
-        config.reap_interval,
+        config.reap.interval,
     )));
     if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(boxed(bypass::watch(

@@ -18,7 +18,10 @@ pub use self::{
         RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
-    serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, RestoreChoice, SyncPolicy},
+    serve::{
+        CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, ReapArgs, ReapNodes, RestoreChoice,
+        SyncPolicy,
+    },
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
 };

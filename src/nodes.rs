@@ -1,9 +1,11 @@
 //! Watches the nodes, and keeps facts about them that their registrations do not contain.
 
+pub(crate) mod addresses;
 pub(crate) mod client;
 pub(crate) mod health_check;
 mod identify;
 pub(crate) mod liveness;
+pub(crate) mod local;
 pub(crate) mod notifications;
 mod removed;
 pub(crate) mod served;
@@ -26,6 +28,7 @@ use self::{
     health_check::CheckResult,
     identify::{IDENTIFY_AFTER, New},
     liveness::LivenessEvidence,
+    local::LocalNodes,
     notifications::Notifications,
     removed::Removed,
     served::Served,
@@ -65,6 +68,7 @@ pub struct Nodes {
     pub(super) notifications: Notifications,
     visits: Visits,
     liveness: LivenessEvidence,
+    pub(crate) local: Arc<LocalNodes>,
     new: New,
     unreachable: Mutex<Unreachable>,
     /// Ports of nodes that answer other calls but not `paramUpdate`.
@@ -82,14 +86,16 @@ pub struct Nodes {
 
 impl Nodes {
     /// Creates the state for the nodes of `ledger`. `timeout` is how long a node may take to
-    /// answer. `served` are the hosts whose nodes use this rosrescue as their master.
-    pub fn new(
+    /// answer. `served` are the hosts whose nodes use this rosrescue as their master. `local` are the nodes of this
+    /// computer.
+    pub(crate) fn new(
         ledger: Arc<Ledger>,
         gate: gate::Rx,
         write_queue: WriteQueue,
         stats: &'static Stats,
         timeout: Duration,
         served: Served,
+        local: Arc<LocalNodes>,
     ) -> Self {
         Self {
             ledger,
@@ -100,6 +106,7 @@ impl Nodes {
             notifications: Notifications::default(),
             visits: Visits::default(),
             liveness: LivenessEvidence::default(),
+            local,
             new: New::default(),
             unreachable: Mutex::default(),
             mute: Mutex::default(),

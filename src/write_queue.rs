@@ -19,7 +19,7 @@ use tokio::{
 };
 
 use self::batch::{CallAnswer, Item, Precondition};
-pub(crate) use self::drain::Drain;
+pub(crate) use self::{drain::Drain, evict::MoveJudge};
 use crate::{
     cluster::merge::wire::{self, Ask},
     gate,
@@ -124,15 +124,15 @@ struct Signals {
 }
 
 /// Creates a write queue and its worker. `resync_interval` is the pause between two comparisons of master and mirror;
-/// `None` for never. `evicts` says whether a node is unregistered when another node registers its port. `patience` is
-/// how long writes wait for the master.
+/// `None` for never. `judge` judges calls that could make the master shut down an innocent node. `patience` is how
+/// long writes wait for the master.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
     gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
-    evicts: bool,
+    judge: Arc<dyn MoveJudge>,
     patience: Patience,
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
@@ -143,8 +143,12 @@ pub(crate) fn write_queue(
         has_answered: Notify::new(),
     });
     let (tell_sent, sent) = watch::channel(None);
-    let link = Link { ledger, upstream };
-    let mut drain = Drain::new(
+    let link = Link {
+        ledger,
+        upstream,
+        judge,
+    };
+    let drain = Drain::new(
         rx,
         link,
         gate,
@@ -153,7 +157,6 @@ pub(crate) fn write_queue(
         signals.clone(),
         tell_sent,
     );
-    drain.evicts = evicts;
     let queue = WriteQueue {
         items,
         signals,
@@ -167,6 +170,7 @@ pub(crate) fn write_queue(
 struct Link {
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
+    judge: Arc<dyn MoveJudge>,
 }
 
 #[cfg(test)]

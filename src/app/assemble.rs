@@ -18,7 +18,7 @@ use crate::{
     guardian::handover,
     ledger::Ledger,
     lifecycle::{Patience, Supervision},
-    nodes::{Nodes, served::Served},
+    nodes::{Nodes, local::LocalNodes, served::Served},
     process::Rosmaster,
     recovery::report_file,
     ros_env::MasterUri,
@@ -106,13 +106,14 @@ pub(super) async fn assemble(
         config.probe_timeout,
         config.probing.count,
     ));
+    let local = Arc::new(LocalNodes::new(config.reap.nodes, stats));
     let (write_queue, drain) = write_queue::write_queue(
         ledger.clone(),
         upstream.clone(),
         gate.clone(),
         stats,
         config.resync_interval,
-        config.reap_interval.is_some(),
+        local.clone(),
         Patience::new(config.probing.patience),
     );
     let served = Served::default();
@@ -123,6 +124,7 @@ pub(super) async fn assemble(
         stats,
         config.node_timeout,
         served.clone(),
+        local,
     ));
     for (node, at) in removed {
         nodes.removed.add(&node, at);

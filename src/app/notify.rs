@@ -71,6 +71,8 @@ pub(super) fn start(
 impl Context {
     fn line(&self) -> String {
         let situation = Situation {
+            feuds: self.nodes.local.feuds(),
+            lost_addresses: self.nodes.lost_addresses(),
             gate: self.gate.state(),
             gate_since: self.gate.since().into_std(),
             unprotected: self.ledger.unprotected(),

@@ -176,16 +176,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
-    /// Unregister dead nodes: check every node at this interval, in seconds. With 0, only after a
-    /// rescue
-    #[arg(
-        long,
-        env = "ROSRESCUE_REAP_DEAD_NODES",
-        value_name = "SECONDS",
-        default_value_t = 0.0
-    )]
-    #[arg(allow_negative_numbers = true)]
-    pub reap_dead_nodes: f64,
+    #[command(flatten)]
+    pub reap: ReapArgs,
     /// Networks and addresses that may call, as in 10.0.0.0/24 or fd00::/64. This computer always may
     /// [default: all]
     #[arg(
@@ -284,6 +276,30 @@ fn network(text: &str) -> Result<IpNet, &'static str> {
     Ok(mapped.unwrap_or(net))
 }
 
+/// Options for dead nodes.
+#[derive(Args, Clone, Debug)]
+pub struct ReapArgs {
+    /// Which dead nodes to unregister between rescues
+    #[arg(
+        long,
+        env = "ROSRESCUE_REAP",
+        value_name = "NODES",
+        value_enum,
+        default_value_t = ReapNodes::Report
+    )]
+    pub reap: ReapNodes,
+    /// Like `--reap all`, with a health check of all nodes at this interval, in seconds. 0 leaves it to `--reap`
+    #[arg(
+        long,
+        env = "ROSRESCUE_REAP_DEAD_NODES",
+        value_name = "SECONDS",
+        default_value_t = 0.0,
+        hide = true
+    )]
+    #[arg(allow_negative_numbers = true)]
+    pub reap_dead_nodes: f64,
+}
+
 /// When a checkpoint is restored at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum RestoreChoice {
@@ -304,6 +320,17 @@ pub enum SyncPolicy {
     Interval,
     /// Leave it to the operating system
     Never,
+}
+
+/// The dead nodes that rosrescue unregisters between rescues.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ReapNodes {
+    /// None. The log says which nodes `local` would have unregistered
+    Report,
+    /// Nodes of this computer, within 2 s after their process has ended
+    Local,
+    /// Also nodes that fail a health check, and those whose port another node registers
+    All,
 }
 
 /// The side that answers reads.

@@ -25,7 +25,7 @@ use crate::{
         computers::Computers,
         condition::Condition,
         report::Report,
-        summary::{Caller, Status, some},
+        summary::{Caller, NodesStatus, Status},
     },
 };
 
@@ -56,8 +56,8 @@ struct Top {
     calls_without_master: u64,
     calls_unanswered: u64,
     state: Counts,
-    unreachable: Vec<String>,
-    dead_nodes: Vec<String>,
+    #[serde(flatten)]
+    nodes: NodesStatus,
     cluster: Option<Computers>,
     /// Callers, busiest first, then slowest first.
     callers: Vec<Row>,
@@ -142,8 +142,7 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
         uri: status.uri,
         condition: status.condition,
         state: status.state,
-        unreachable: status.unreachable,
-        dead_nodes: status.dead_nodes,
+        nodes: status.nodes,
         cluster: status.cluster,
         callers,
         rescues: status.rescues,
@@ -196,11 +195,12 @@ impl fmt::Display for Top {
              parameters {params}"
         )?;
         for (what, names) in [
-            ("no answer from", &self.unreachable),
-            ("dead but registered:", &self.dead_nodes),
+            ("no answer from", &self.nodes.unreachable),
+            ("dead but registered:", &self.nodes.dead_nodes),
+            ("not checked:", &self.nodes.unchecked_nodes),
         ] {
             if !names.is_empty() {
-                writeln!(head, "{what} {}", some(names))?;
+                writeln!(head, "{what} {}", self.nodes.since(names))?;
             }
         }
         if let Some(cluster) = &self.cluster {

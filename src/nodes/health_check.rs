@@ -467,7 +467,12 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
 
 /// Unregisters a node as the node itself would. Does nothing if the node has come back since it was asked: its address
 /// has changed, or `same` rejects its last calls.
-async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
+pub(super) async fn remove(
+    nodes: &Nodes,
+    node: &str,
+    api: &str,
+    same: impl Fn(LastCalls) -> bool,
+) -> bool {
     // Lets the node's queued calls run first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {

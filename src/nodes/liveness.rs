@@ -2,7 +2,7 @@
 //! port, which the kernel's socket table shows. Other nodes are asked every 30 s.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashSet},
+    collections::{BTreeMap, BTreeSet, HashMap},
     net::SocketAddr,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
@@ -16,10 +16,11 @@ use tokio::{
 use super::{
     Nodes,
     client::{self, Reaction},
+    local::{self, Listening},
 };
 use crate::{
     gate::State,
-    health::{self, Health, port_of},
+    health::{self, Evidence, Health, port_of},
     limit::rarely,
     master,
     replay::Token,
@@ -29,7 +30,11 @@ use crate::{
 };
 
 /// Pause between two reads of the socket table.
-const LOOK_AGAIN: Duration = Duration::from_secs(2);
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
+/// Pause before it is noted again since when each node's health has been the same. It costs as much as a look.
+const NOTE_AGAIN: Duration = Duration::from_secs(5);
+/// Pause before the table is read again because nodes register.
+const SETTLE: Duration = Duration::from_millis(100);
 /// Number of nodes asked at the same time.
 const AT_ONCE: usize = 8;
 
@@ -43,8 +48,8 @@ pub(super) struct LivenessEvidence {
 #[derive(Debug, Default)]
 struct Known {
     liveness: health::Liveness,
-    /// For each port of a node on this computer, the addresses at which the node may listen.
-    here: BTreeMap<String, Vec<SocketAddr>>,
+    /// Health of each node at the last look, and since when.
+    since: BTreeMap<String, (Health, Instant)>,
 }
 
 /// Whether a registered node is alive, as far as known.
@@ -53,6 +58,10 @@ pub(crate) struct Life {
     pub(crate) health: Health,
     /// When rosrescue last found out whether the node is alive. `None` if it never has.
     pub(crate) checked: Option<Instant>,
+    /// Since when the node's health has been the same.
+    pub(crate) since: Instant,
+    /// The process on this computer whose end would prove the node dead.
+    pub(crate) process: Option<u32>,
 }
 
 impl Default for LivenessEvidence {
@@ -85,56 +94,94 @@ impl Nodes {
         let known = self.liveness.lock();
         let lives = nodes.into_iter().map(|(name, port)| {
             let seen = known.liveness.seen(&port);
+            let evidence = self.local.evidence(&name);
+            let health = Health::of(seen, unreachable.contains(&port), now).with(evidence);
+            let noted = known.since.get(&name).filter(|(noted, _)| *noted == health);
             let life = Life {
-                health: Health::of(seen, unreachable.contains(&port), now),
+                process: self.local.process(&name, &port),
+                health,
                 checked: seen.map(|seen| seen.at),
+                since: match (evidence, noted) {
+                    (Evidence::Ended(death), _) => death.since,
+                    (_, Some((_, since))) => *since,
+                    (_, None) => now,
+                },
             };
             (name, life)
         });
         lives.collect()
     }
+
+    /// Remembers since when each node's health has been the same.
+    fn note_lives(&self) {
+        let lives = self.lives().into_iter();
+        let since = lives.map(|(name, life)| (name, (life.health, life.since)));
+        self.liveness.lock().since = since.collect();
+    }
 }
 
-/// Watches the nodes as long as it is polled.
+/// Watches the nodes as long as it is polled. Reads the socket table every second, and when a node has registered.
 pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut looks = interval(LOOK_AGAIN);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut next = Instant::now();
+    let mut noted = None;
     loop {
-        looks.tick().await;
-        let registered: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
-            let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-            nodes.map(|(_, api)| port_of(api).to_owned()).collect()
-        });
-        // This blocks for less than a millisecond: the kernel generates some kilobytes.
-        let listening = match registered.is_empty() {
-            true => HashSet::new(),
-            false => sockets::listening(),
-        };
-        let due = {
-            let mut known = nodes.liveness.lock();
-            let Known { liveness, here } = &mut *known;
-            here.retain(|port, _| registered.contains(port));
-            let listens = |port: &str| here.get(port).map(|at| is_among(at, &listening));
-            liveness.round(&registered, listens, Instant::now())
-        };
-        let listening = Arc::new(listening);
-        for port in due {
-            crate::task::spawn(ask(nodes.clone(), port, listening.clone()));
+        tokio::select! {
+            _ = looks.tick() => {
+                let unowned = nodes.local.unowned();
+                if !unowned.is_empty() {
+                    let local = nodes.local.clone();
+                    drop(crate::task::spawn_blocking(move || local.find_owners(&unowned)).await);
+                }
+            }
+            () = async {
+                tokio::time::sleep_until(next.into()).await;
+                nodes.local.registered.notified().await;
+            } => {}
+        }
+        let now = Instant::now();
+        next = now + SETTLE;
+        look(&nodes);
+        if noted.is_none_or(|noted| noted + NOTE_AGAIN <= now) {
+            nodes.note_lives();
+            noted = Some(now);
         }
     }
 }
 
+/// Looks at all nodes once.
+fn look(nodes: &Arc<Nodes>) {
+    let names = local::names(&nodes.ledger);
+    let registered: BTreeSet<_> = names.iter().map(|name| name.port.clone()).collect();
+    // This blocks for less than a millisecond: the kernel generates some kilobytes.
+    let listening = match registered.is_empty() {
+        true => HashMap::new(),
+        false => sockets::listening(),
+    };
+    let listens = nodes
+        .local
+        .look(&names, &listening, nodes.gate.state() != State::Elsewhere);
+    let due = nodes.liveness.lock().liveness.round(
+        &registered,
+        |port| listens.get(port).copied(),
+        Instant::now(),
+    );
+    local::bury(nodes, &names);
+    let listening = Arc::new(listening);
+    for port in due {
+        crate::task::spawn(ask(nodes.clone(), port, listening.clone()));
+    }
+}
+
 /// Whether a process listens at any of `addresses`.
-fn is_among(addresses: &[SocketAddr], listening: &HashSet<SocketAddr>) -> bool {
-    addresses.iter().any(|address| {
-        let port = address.port();
-        let any = [([0; 4], port).into(), ([0; 16], port).into()];
-        listening.contains(address) || any.iter().any(|any| listening.contains(any))
-    })
+fn is_among(addresses: &[SocketAddr], listening: &Listening) -> bool {
+    let sockets = |address: &SocketAddr| sockets::accepting(listening, *address);
+    addresses.iter().any(|address| !sockets(address).is_empty())
 }
 
 /// Asks the node at `port`, unless a process on this computer listens there.
-async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>>) {
+async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
     // The semaphore is never closed.
     let permit = nodes.liveness.permits.acquire().await;
     let here = addresses_here(&port, nodes.timeout).await;
@@ -147,29 +194,35 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
         },
     };
     drop(permit);
-    let has_died = {
-        let mut known = nodes.liveness.lock();
-        if let Some(here) = here.filter(|here| !here.is_empty()) {
-            known.here.insert(port.clone(), here);
-        }
-        known.liveness.answered(&port, sign, Instant::now())
-    };
+    if let Some(here) = here {
+        nodes.local.set_here(&port, here);
+        nodes.local.registered.notify_one();
+    }
+    let mut known = nodes.liveness.lock();
+    let has_died = known.liveness.answered(&port, sign, Instant::now());
+    drop(known);
     // Nothing is logged while the mirror stands in: the health check afterwards reports dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
         let names: Vec<_> = nodes.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
+        // The log has named those that the kernel proves dead.
+        let is_new = |name: &&String| !matches!(nodes.local.evidence(name), Evidence::Ended(_));
+        let names: Vec<_> = names.iter().filter(is_new).collect();
+        if names.is_empty() {
+            return;
+        }
         rarely!(
             info,
             ?names,
-            "a registered node is dead: its port refuses connections. It stays registered until it restarts, is unregistered, or fails a health check (--reap-dead-nodes)"
+            "a registered node is dead: its port refuses connections. It stays registered until it restarts, is unregistered, or fails a health check (--reap all)"
         );
     }
 }
 
 /// The addresses of `api` that belong to this computer. `None` if it has no address within `limit`.
-async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
+pub(super) async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;
     let mut found = found.ok()?.ok()?;

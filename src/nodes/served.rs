@@ -12,7 +12,7 @@ const MOST: usize = 1024;
 
 /// The hosts of nodes that have registered at this computer's rosrescue.
 #[derive(Clone, Debug, Default)]
-pub struct Served(Arc<Mutex<HashSet<String>>>);
+pub(crate) struct Served(Arc<Mutex<HashSet<String>>>);
 
 impl Served {
     fn lock(&self) -> MutexGuard<'_, HashSet<String>> {

@@ -120,7 +120,7 @@ impl MasterAddresses {
     /// rosrescue. False if it is not on this computer.
     pub(crate) fn is_open(&self) -> bool {
         let open = |at: &SocketAddr| at.port() == self.port && !at.ip().is_loopback();
-        self.is_here && sockets::listening().iter().any(open)
+        self.is_here && sockets::listening().keys().any(open)
     }
 }
 

@@ -1,11 +1,14 @@
 //! Finds the processes that listen at a port, as far as the system shows them.
 
 use std::{
-    collections::HashSet,
+    collections::{BTreeMap, BTreeSet, HashSet},
     fs::{self, File},
     io::{BufRead, BufReader},
     path::PathBuf,
 };
+
+use super::Stat;
+use crate::health::{Owner, Process};
 
 /// State of a listening socket in the kernel's tables.
 const LISTENING: &str = "0A";
@@ -122,6 +125,50 @@ pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
         inode.parse().ok()
     });
     sockets.collect()
+}
+
+/// The owner of each socket with one of these inodes; `None` if the kernel hides it. Of several processes that hold a
+/// socket, the owner is the one that was started first: the others have inherited it. Reads the open files of all
+/// processes, which takes some milliseconds.
+pub(crate) fn owners(sockets: &BTreeSet<u64>) -> BTreeMap<u64, Option<Owner>> {
+    let mut owners: BTreeMap<_, Option<Owner>> = sockets.iter().map(|it| (*it, None)).collect();
+    for pid in super::all() {
+        let open = open_sockets(pid);
+        for socket in sockets.iter().filter(|socket| open.contains(socket)) {
+            let Some(owner) = owner(pid) else { continue };
+            let known = owners.entry(*socket).or_default();
+            if known.is_none_or(|known| owner.process.started < known.process.started) {
+                *known = Some(owner);
+            }
+        }
+    }
+    owners
+}
+
+fn owner(pid: u32) -> Option<Owner> {
+    let started = Stat::of(pid)?.started;
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    // The last id is the one in the process's own namespace.
+    let ids = status.lines().find_map(|line| line.strip_prefix("NSpid:"));
+    let own_pid = ids.and_then(|ids| ids.split_whitespace().last()?.parse().ok());
+    Some(Owner {
+        process: Process { pid, started },
+        own_pid: own_pid.or_else(|| pid.try_into().ok())?,
+    })
+}
+
+/// Whether `process` has ended. False if the kernel does not tell.
+pub(crate) fn has_ended(process: Process) -> bool {
+    /// The kernel's error for a process that ends while its state is read.
+    const NO_SUCH_PROCESS: i32 = 3;
+    match fs::read_to_string(format!("/proc/{}/stat", process.pid)) {
+        Ok(line) => Stat::parse(&line)
+            .is_some_and(|stat| stat.started != process.started || stat.has_ended()),
+        Err(error) => {
+            let is_gone = error.raw_os_error() == Some(NO_SUCH_PROCESS);
+            error.kind() == std::io::ErrorKind::NotFound || is_gone
+        }
+    }
 }
 
 fn open_files(pid: u32) -> impl Iterator<Item = PathBuf> {

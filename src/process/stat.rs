@@ -9,6 +9,7 @@ use std::fs;
 pub(crate) struct Stat {
     state: char,
     pub(super) parent: u32,
+    threads: u32,
     /// When it was started, in clock ticks since boot. Start time and id together identify the process.
     pub(crate) started: u64,
     has_memory: bool,
@@ -20,16 +21,18 @@ impl Stat {
         Self::parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
     }
 
-    fn parse(line: &str) -> Option<Self> {
+    pub(super) fn parse(line: &str) -> Option<Self> {
         // The command's name in parentheses comes first and may contain anything.
         let mut fields = line.rsplit(')').next()?.split_whitespace();
         let state = fields.next()?.chars().next()?;
         let parent = fields.next()?.parse().ok()?;
-        let started = fields.nth(17)?.parse().ok()?;
+        let threads = fields.nth(15)?.parse().ok()?;
+        let started = fields.nth(1)?.parse().ok()?;
         let has_memory = fields.next()? != "0";
         Some(Self {
             state,
             parent,
+            threads,
             started,
             has_memory,
         })
@@ -38,6 +41,11 @@ impl Stat {
     /// Whether the process still runs. A process that ends frees its memory first, and then closes its sockets.
     pub(crate) fn is_alive(self) -> bool {
         self.has_memory && !matches!(self.state, 'Z' | 'X')
+    }
+
+    /// Whether no thread of the process runs any more. The first thread may end before the others.
+    pub(super) fn has_ended(self) -> bool {
+        !self.is_alive() && self.threads <= 1
     }
 
     /// Whether the process is stopped, by Ctrl-Z, SIGSTOP or a debugger.
@@ -60,6 +68,9 @@ mod tests {
         let with = |from: &str, to: &str| Stat::parse(&LINE.replace(from, to)).unwrap();
         assert!(!with(" S ", " Z ").is_alive());
         assert!(!with(" 8192 ", " 0 ").is_alive(), "it is ending");
+        assert!(!with(" S ", " Z ").has_ended(), "other threads run");
+        let alone = LINE.replace(" 20 0 9 ", " 20 0 1 ").replace(" S ", " Z ");
+        assert!(Stat::parse(&alone).unwrap().has_ended());
         for state in [" T ", " t "] {
             assert!(with(" S ", state).is_stopped());
             assert!(with(" S ", state).is_alive());

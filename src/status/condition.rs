@@ -6,8 +6,11 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Facts, Guarded, Mode, summary::some};
-use crate::{clock, gate::State};
+use super::{
+    Facts, Guarded, Mode,
+    summary::{LostAddress, some},
+};
+use crate::{clock, gate::State, health::Feud};
 
 /// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -125,6 +128,10 @@ pub(crate) struct Situation {
     /// Why changes are not recorded. `None` if they are recorded.
     pub(crate) unprotected: Option<String>,
     pub(crate) master: String,
+    /// Names that two programs take from each other.
+    pub(crate) feuds: Vec<Feud>,
+    /// Addresses that this computer has lost, and at which nodes are registered.
+    pub(crate) lost_addresses: Vec<LostAddress>,
 }
 
 /// Derives the condition from the situation and the facts.
@@ -203,6 +210,27 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         text += &format!(" {count} {verb} directly to the master, unprotected: {who}.");
         action.get_or_insert_with(|| "restart it with the ROS_MASTER_URI of rosrescue.".to_owned());
     }
+    for LostAddress { address, nodes, .. } in &now.lost_addresses {
+        text += &format!(
+            " This computer has lost the address {address}, so no node can connect to {}.",
+            some(nodes)
+        );
+        action.get_or_insert_with(|| {
+            format!(
+                "give this computer the address {address} back, or restart these nodes with its present address in ROS_IP."
+            )
+        });
+    }
+    if !now.feuds.is_empty() {
+        let names: Vec<_> = now.feuds.iter().map(ToString::to_string).collect();
+        text += &format!(
+            " Programs take a node name from each other, and shut each other down: {}.",
+            some(&names)
+        );
+        action.get_or_insert_with(|| {
+            "stop one of the two programs, or give it another name (__name:=).".to_owned()
+        });
+    }
     Condition {
         name,
         since: clock::wall_time_of(since),
@@ -267,6 +295,8 @@ mod tests {
             gate,
             gate_since: facts.started,
             unprotected: unprotected.map(str::to_owned),
+            feuds: Vec::new(),
+            lost_addresses: Vec::new(),
             master: "http://robot:11312/".to_owned(),
         };
         condition(&situation, facts)

@@ -5,8 +5,16 @@
 
 use std::fmt::{Display, Write};
 
-use super::{computers::Computers, condition::ConditionName, stats::Stats, summary::Status};
-use crate::cluster::machine::Role;
+use super::{
+    computers::Computers,
+    condition::ConditionName,
+    stats::Stats,
+    summary::{NodesStatus, Status},
+};
+use crate::{cluster::machine::Role, health::Health};
+
+/// Number of nodes that have a line of their own.
+const ILL_MOST: usize = 100;
 
 /// The text that `/metrics` answers with.
 pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
@@ -17,7 +25,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 27] = [
+    let values: [(&str, &str, Option<f64>); 29] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -34,10 +42,12 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("subscribers", "subscribers, counted once for each topic", Some(status.state.subscribers as f64)),
         ("services", "services registered", Some(status.state.services as f64)),
         ("params", "parameters set", Some(status.state.params as f64)),
-        ("unreachable_nodes", "nodes that do not answer and are not known to be dead", Some(status.unreachable.len() as f64)),
-        ("alive_nodes", "registered nodes that have a listening process or answered lately", Some(status.alive_nodes as f64)),
-        ("dead_nodes", "registered nodes whose port refuses connections", Some(status.dead_nodes.len() as f64)),
-        ("unchecked_nodes", "registered nodes without a check in the last two minutes", Some(status.unchecked_nodes.len() as f64)),
+        ("unreachable_nodes", "nodes that do not answer and are not known to be dead", Some(status.nodes.unreachable.len() as f64)),
+        ("alive_nodes", "registered nodes that have a listening process or answered lately", Some(status.nodes.alive_nodes as f64)),
+        ("dead_nodes", "registered nodes whose process has ended or whose port refuses connections", Some(status.nodes.dead_nodes.len() as f64)),
+        ("unchecked_nodes", "registered nodes without a check in the last two minutes", Some(status.nodes.unchecked_nodes.len() as f64)),
+        ("feuds", "node names that two programs take from each other", Some(status.nodes.feuds.len() as f64)),
+        ("lost_addresses", "addresses that this computer has lost and at which nodes are registered", Some(status.nodes.lost_addresses.len() as f64)),
         ("bypassing", "processes and computers that bypass rosrescue and talk to the master directly", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
         ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),
@@ -54,10 +64,33 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let names = ConditionName::ALL.map(|name| (name.as_str(), status.condition.name == name));
     let help = "1 for the present condition, as in /status.json, and 0 for the others";
     add_one_of(&mut text, "condition", help, "name", &names);
+    add_ill_nodes(&mut text, &status.nodes);
     if let Some(cluster) = &status.cluster {
         add_cluster(&mut text, cluster);
     }
     text
+}
+
+/// Adds a line for each node that is dead or unreachable.
+fn add_ill_nodes(text: &mut String, nodes: &NodesStatus) {
+    const NAME: &str = "node_since_seconds";
+    let help = "since when a node has been dead or unreachable, in seconds since 1970, a hundred nodes at most";
+    head(text, NAME, help, "gauge");
+    let ill = nodes.node_health.iter().filter_map(|(node, of)| {
+        let health = match of.health {
+            Health::Dead => "dead",
+            Health::Unreachable => "unreachable",
+            Health::Alive | Health::Unchecked => return None,
+        };
+        Some((node, health, of.since))
+    });
+    for (node, health, since) in ill.take(ILL_MOST) {
+        let _ = writeln!(
+            text,
+            "rosrescue_{NAME}{{node=\"{}\",health=\"{health}\"}} {since}",
+            escaped(node)
+        );
+    }
 }
 
 fn add_cluster(text: &mut String, of: &Computers) {
@@ -107,6 +140,12 @@ fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
     };
     head(text, name, help, kind);
     let _ = writeln!(text, "rosrescue_{name} {value}");
+}
+
+/// A label's value with the escapes of Prometheus' text format.
+fn escaped(value: &str) -> String {
+    let value = value.replace('\\', r"\\").replace('"', "\\\"");
+    value.replace('\n', r"\n")
 }
 
 /// The role's name in JSON and in metrics.

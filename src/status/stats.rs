@@ -49,5 +49,8 @@ counters! {
     requests_not_understood = "requests that rosrescue could not decode and forwarded unchanged",
     requests_refused = "requests that were refused, see security.md",
     divergences = "replies in which the mirror and the master differed",
+    dead_nodes_reaped = "dead nodes of this computer that were unregistered without a rescue",
+    shutdowns_prevented = "shutdown calls of the master that would have reached the wrong node and were prevented",
+    shutdowns_misdirected = "shutdown calls of the master that may have reached the wrong node",
     masters_restored = "masters to which the state was restored",
 }

@@ -1,11 +1,15 @@
 //! The complete status at one moment, for `/status.json` and `rosrescue status`.
 
-use std::fmt;
+use std::{collections::BTreeMap, fmt, net::IpAddr};
 
 use serde::{Deserialize, Serialize};
 
 use super::{Mode, computers::Computers, condition::Condition, report::Report};
-use crate::{clock, master::Counts};
+use crate::{
+    clock,
+    health::{Feud, Health},
+    master::Counts,
+};
 
 /// Version of the format. It changes when a field is removed or changes its meaning, not when a
 /// field is added.
@@ -46,6 +50,60 @@ pub(crate) struct JournalStatus {
     pub(crate) last_compaction: Option<f64>,
     /// Free bytes on the checkpoint's disk.
     pub(crate) disk_free_bytes: Option<u64>,
+}
+
+/// Which nodes are alive, and what is wrong with others.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct NodesStatus {
+    /// Nodes that do not answer but are not known to be dead.
+    pub(crate) unreachable: Vec<String>,
+    /// Registered nodes whose process has ended, or whose port refuses connections.
+    #[serde(default)]
+    pub(crate) dead_nodes: Vec<String>,
+    /// Registered nodes that have not been checked, or not in the last two minutes.
+    #[serde(default)]
+    pub(crate) unchecked_nodes: Vec<String>,
+    /// Number of registered nodes that are alive, by the kernel's socket table or an answer.
+    #[serde(default)]
+    pub(crate) alive_nodes: usize,
+    /// All registered nodes that are not known to be alive, by name.
+    #[serde(default)]
+    pub(crate) node_health: BTreeMap<String, NodeHealth>,
+    /// Names that two programs take from each other.
+    #[serde(default)]
+    pub(crate) feuds: Vec<Feud>,
+    /// Addresses that this computer has lost, and at which nodes are registered.
+    #[serde(default)]
+    pub(crate) lost_addresses: Vec<LostAddress>,
+}
+
+/// An address that this computer has lost.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct LostAddress {
+    pub(crate) address: IpAddr,
+    /// When rosrescue noticed it, in seconds since 1970.
+    pub(crate) since: f64,
+    /// The nodes that are registered there.
+    pub(crate) nodes: Vec<String>,
+}
+
+/// The health of a node that is not known to be alive.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct NodeHealth {
+    pub(crate) health: Health,
+    /// Since when the health has been the same, in seconds since 1970.
+    pub(crate) since: f64,
+}
+
+impl NodesStatus {
+    /// The names of `names`, each with the time since when its health has been the same.
+    pub(crate) fn since(&self, names: &[String]) -> String {
+        let with_time = |name: &String| match self.node_health.get(name) {
+            Some(of) => format!("{name} since {}", clock::wall_text(of.since)),
+            None => name.clone(),
+        };
+        some(&names.iter().map(with_time).collect::<Vec<_>>())
+    }
 }
 
 /// The status at one moment. Times of day are seconds since 1970 by the wall clock.
@@ -106,17 +164,8 @@ pub(crate) struct Status {
     pub(crate) guarded_by: String,
     /// Number of items of each kind in the mirror.
     pub(crate) state: Counts,
-    /// Nodes that do not answer but are not known to be dead.
-    pub(crate) unreachable: Vec<String>,
-    /// Registered nodes whose port refuses connections.
-    #[serde(default)]
-    pub(crate) dead_nodes: Vec<String>,
-    /// Registered nodes that have not been checked, or not in the last two minutes.
-    #[serde(default)]
-    pub(crate) unchecked_nodes: Vec<String>,
-    /// Number of registered nodes that are alive, by the kernel's socket table or an answer.
-    #[serde(default)]
-    pub(crate) alive_nodes: usize,
+    #[serde(flatten)]
+    pub(crate) nodes: NodesStatus,
     /// Number of masters examined since this process started, including the first.
     pub(crate) recoveries: u64,
     /// Report of the last recovery.
@@ -146,14 +195,15 @@ impl Status {
     }
 
     fn nodes_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let nodes = &self.nodes;
         let lists = [
-            (&self.dead_nodes, "dead but registered"),
-            (&self.unreachable, "not answering"),
-            (&self.unchecked_nodes, "not checked"),
+            (&nodes.dead_nodes, "dead but registered"),
+            (&nodes.unreachable, "not answering"),
+            (&nodes.unchecked_nodes, "not checked"),
         ];
-        write!(f, "nodes       {} alive", self.alive_nodes)?;
+        write!(f, "nodes       {} alive", nodes.alive_nodes)?;
         for (names, what) in lists.into_iter().filter(|(names, _)| !names.is_empty()) {
-            write!(f, "; {} {what}: {}", names.len(), some(names))?;
+            write!(f, "; {} {what}: {}", names.len(), nodes.since(names))?;
         }
         writeln!(f)
     }

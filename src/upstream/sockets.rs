@@ -10,8 +10,10 @@
 //! Linux drops rosrescue's end a minute after the master's side has acknowledged the close. So a call in a master on
 //! another computer is waited for no longer than a minute; see `docs/decisions/0003-no-call-in-flight.md`.
 
+mod diag;
+
 use std::{
-    collections::HashSet,
+    collections::HashMap,
     fs::{self, File},
     io::{BufRead, BufReader},
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
@@ -34,8 +36,19 @@ pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
     })
 }
 
-/// The addresses at which processes in this network namespace listen. IPv4 addresses are not in their IPv6 form.
-pub(crate) fn listening() -> HashSet<SocketAddr> {
+/// The addresses at which processes in this network namespace listen, with the inodes of their sockets. IPv4 addresses
+/// are not in their IPv6 form. Blocks for some hundred microseconds.
+pub(crate) fn listening() -> HashMap<SocketAddr, Vec<u64>> {
+    let mut all = HashMap::<_, Vec<u64>>::new();
+    // The table in /proc takes 25 ms, because the kernel looks through the connections as well.
+    for (address, inode) in diag::listening().unwrap_or_else(|_| listening_in_table()) {
+        all.entry(address).or_default().push(inode);
+    }
+    all
+}
+
+/// Like [`listening`], from the table in /proc.
+fn listening_in_table() -> Vec<(SocketAddr, u64)> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
         // The kernel lists listening sockets first. Tens of thousands of others may follow.
@@ -43,6 +56,24 @@ pub(crate) fn listening() -> HashSet<SocketAddr> {
         lines.map_while(|line| listens_at(&line.ok()?))
     });
     sockets.collect()
+}
+
+/// The inodes of the sockets of `listening` that accept connections to `address`. A socket with a specific address takes
+/// precedence over one for any address.
+pub(crate) fn accepting(
+    listening: &HashMap<SocketAddr, Vec<u64>>,
+    address: SocketAddr,
+) -> Vec<u64> {
+    if let Some(sockets) = listening.get(&address) {
+        return sockets.clone();
+    }
+    let port = address.port();
+    let any = [([0; 4], port).into(), ([0; 16], port).into()];
+    any.iter()
+        .filter_map(|any| listening.get(any))
+        .flatten()
+        .copied()
+        .collect()
 }
 
 /// One end of a connection in this network namespace.
@@ -80,12 +111,15 @@ fn end_in(line: &str) -> Option<Established> {
     })
 }
 
-/// The address in one line of the table, if the socket listens.
-fn listens_at(line: &str) -> Option<SocketAddr> {
+/// Address and inode in one line of the table, if the socket listens.
+fn listens_at(line: &str) -> Option<(SocketAddr, u64)> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, state) = (columns.next()?, columns.nth(1)?);
-    let listens = u8::from_str_radix(state, 16).ok()? == LISTEN;
-    address(local).filter(|_| listens)
+    if u8::from_str_radix(state, 16).ok()? != LISTEN {
+        return None;
+    }
+    let inode = columns.nth(5)?.parse().ok()?;
+    Some((address(local)?, inode))
 }
 
 fn is_in_table(table: &str, master: SocketAddr) -> bool {
@@ -159,6 +193,28 @@ mod tests {
             drop(server);
             eventually("it has been run", || !may_run_a_call(master));
         }
+    }
+
+    #[test]
+    fn both_ways_list_the_same_listening_sockets() {
+        let listeners = ["127.0.0.1:0", "0.0.0.0:0", "[::1]:0", "[::]:0"];
+        let listeners: Vec<_> = listeners
+            .map(TcpListener::bind)
+            .into_iter()
+            .flatten()
+            .collect();
+        let own: Vec<_> = listeners
+            .iter()
+            .map(|it| it.local_addr().unwrap())
+            .collect();
+        let only_own = |mut all: Vec<(SocketAddr, u64)>| {
+            all.retain(|(address, _)| own.contains(address));
+            all.sort_unstable();
+            all
+        };
+        let table = only_own(listening_in_table());
+        assert_eq!(table.len(), own.len());
+        assert_eq!(only_own(diag::listening().unwrap()), table);
     }
 
     #[test]

@@ -90,8 +90,6 @@ pub(crate) struct Drain {
     /// Successful calls that rosrescue does not understand. Their answers wait until the mirror has
     /// been read from the master again and includes their effects.
     opaque: Opaque,
-    /// Whether a node is unregistered when another node registers its port.
-    pub(super) evicts: bool,
 }
 
 #[derive(Default)]
@@ -135,7 +133,6 @@ impl Drain {
             resync: ResyncSchedule::default(),
             retry_at: None,
             opaque: Opaque::default(),
-            evicts: false,
         }
     }
 
@@ -434,6 +431,7 @@ impl Drain {
             .zip(&replies)
             .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply, &item.source)))
             .collect();
+        let registered = answered.iter().any(|(call, ..)| registers(call));
         let Ok(recorded) = self
             .link
             .ledger
@@ -443,6 +441,9 @@ impl Drain {
             self.lost = true;
             return self.take_back(items);
         };
+        if registered {
+            self.link.judge.registered();
+        }
         if opaque {
             self.link.ledger.doubt();
             // Answers may be waiting already: after a failed read of the state, calls are sent before the next read.
@@ -560,7 +561,7 @@ impl Drain {
                 continue;
             };
             let call = item.call.as_deref().filter(|call| call.is_answerable());
-            if let Some(call) = call.filter(|_| self.evicts && item.raw.is_some()) {
+            if let Some(call) = call.filter(|_| self.link.judge.reaps_all() && item.raw.is_some()) {
                 evict::while_standing_in(&ledger, call);
             }
             if let Some(item) = answers.add(&ledger, item) {
@@ -638,6 +639,12 @@ impl Answers {
     fn count(&self) -> u64 {
         self.made.len() as u64
     }
+}
+
+/// Whether `call`, or an entry of it, registers something for a node.
+fn registers(call: &Request) -> bool {
+    let mut calls = call.calls().into_iter();
+    calls.any(|call| call.registrant().is_some())
 }
 
 /// Whether `call`, or an entry of it, subscribes to a parameter. The reply contains the parameter's

@@ -58,11 +58,13 @@ mod master {
 
 /// A new master is given the state, and the health check examines the nodes.
 mod recovery {
+    mod addresses;
     mod health_check;
     mod host_names;
     mod injection;
     mod liveness;
     mod no_shutdown;
+    mod reap;
     mod reconciliation;
     mod taken_port;
     mod two_robots;

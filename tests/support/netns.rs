@@ -113,6 +113,18 @@ impl Netns {
         ip(&format!("addr add {net}.100/24 dev {near}"));
     }
 
+    /// Takes the address of this side away.
+    pub(crate) fn lose_near(&self) {
+        let Self { near, net, .. } = self;
+        ip(&format!("addr del {net}.1/24 dev {near}"));
+    }
+
+    /// Gives this side its address back.
+    pub(crate) fn return_near(&self) {
+        let Self { near, net, .. } = self;
+        ip(&format!("addr add {net}.1/24 dev {near}"));
+    }
+
     /// Wraps `command` so that it runs on the other side.
     pub(crate) fn inside(&self, command: &Command) -> Command {
         let mut inside = Command::new("ip");

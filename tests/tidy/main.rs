@@ -179,6 +179,8 @@ fn only_the_clock_reads_the_wall_clock() {
         "app/startup.rs",
         "clock.rs",
         "commands/check/facts.rs",
+        "nodes/addresses.rs",
+        "nodes/local.rs",
         "recovery/reporting.rs",
         "server/clients.rs",
         "server/pages/robot.rs",

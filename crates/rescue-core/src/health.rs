@@ -4,14 +4,25 @@
 //! The answering node counts as the one that has registered unless there is evidence against that, because losing a
 //! healthy node is worse than keeping a dead one.
 
+mod addresses;
 mod backoff;
+mod feuds;
+mod kernel;
 mod liveness;
+mod moves;
+mod mutant;
 mod rates;
 mod repeats;
+#[cfg(test)]
+mod simulation;
 mod taken_port;
 mod unreachable;
 
+pub use addresses::{AddressChanges, NodeAddresses};
+pub use feuds::{Feud, Feuds};
+pub use kernel::{Death, Evidence, LocalName, Owner, Process, Registrants};
 pub use liveness::{Health, Liveness};
+pub use moves::{Moving, Reap};
 pub use rates::Rates;
 pub use repeats::Repeats;
 pub use taken_port::{Eviction, first_taking};

@@ -76,7 +76,7 @@ impl Computer {
             gate.clone(),
             stats,
             None,
-            false,
+            Arc::new(()),
             crate::lifecycle::Patience::new(second),
         );
         let (standing, standing_rx) = watch::channel(standing);

@@ -46,7 +46,13 @@ const BEGIN: &[u8] = b"retry: 1000\n\n";
 /// Fields of the status that change all the time. They are sent as a separate event.
 const LIVELY: [&str; 4] = ["counters", "pending_writes", "journal", "cluster"];
 /// Fields of the status that are left out, because they may be long.
-const LEFT_OUT: [&str; 4] = ["clients", "slowest_callers", "calls_per_second", "uptime"];
+const LEFT_OUT: [&str; 5] = [
+    "clients",
+    "slowest_callers",
+    "calls_per_second",
+    "uptime",
+    "node_health",
+];
 
 /// The latest event of each kind.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

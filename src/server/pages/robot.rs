@@ -15,10 +15,14 @@ pub(super) struct NodeRow {
     pub(super) health: Health,
     /// When the node's `health` was last checked, in seconds since 1970.
     pub(super) checked_at: Option<u64>,
+    /// Since when the node's `health` has been the same, in seconds since 1970.
+    pub(super) since: Option<u64>,
     /// The node's XML-RPC address.
     pub(super) api: String,
     /// The node's process id, if the node has reported it.
     pub(super) pid: Option<i32>,
+    /// The process of this computer whose end would prove the node dead.
+    pub(super) process: Option<u32>,
     pub(super) publishes: Vec<String>,
     pub(super) subscribes: Vec<String>,
     pub(super) serves: Vec<String>,
@@ -67,6 +71,8 @@ impl Robot {
             node.pid = pids.get(&node.name).copied();
             if let Some(life) = lives.get(&node.name) {
                 node.health = life.health;
+                node.process = life.process;
+                node.since = Some(clock::wall_time_of(life.since).round() as u64);
                 let at = life.checked.map(clock::wall_time_of);
                 node.checked_at = at.map(|at| at.round() as u64);
             }
@@ -166,7 +172,9 @@ impl NodeRow {
             api,
             health: Health::Unchecked,
             checked_at: None,
+            since: None,
             pid: None,
+            process: None,
             publishes: Vec::new(),
             subscribes: Vec::new(),
             serves: Vec::new(),
@@ -198,9 +206,9 @@ mod tests {
         let shown = serde_json::to_value(&robot).unwrap();
         let expected = serde_json::json!({
             "nodes": [
-                {"name": "/camera", "health": "unchecked", "checked_at": null, "api": api, "pid": null, "publishes": ["/image"],
+                {"name": "/camera", "health": "unchecked", "checked_at": null, "since": null, "api": api, "pid": null, "process": null, "publishes": ["/image"],
                  "subscribes": ["/trigger"], "serves": ["/capture"], "removed_at": null},
-                {"name": "/viewer", "health": "unchecked", "checked_at": null, "api": "http://robot:3/", "pid": null, "publishes": [],
+                {"name": "/viewer", "health": "unchecked", "checked_at": null, "since": null, "api": "http://robot:3/", "pid": null, "process": null, "publishes": [],
                  "subscribes": ["/image"], "serves": [], "removed_at": null},
             ],
             "topics": [

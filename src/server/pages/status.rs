@@ -16,7 +16,7 @@ use crate::{
         DiskStatus,
         computers::Computers,
         condition::{Situation, condition},
-        summary::{JournalStatus, SCHEMA, Status},
+        summary::{JournalStatus, NodeHealth, NodesStatus, SCHEMA, Status},
     },
 };
 
@@ -76,16 +76,13 @@ impl Pages {
             gate_since,
             unprotected: unprotected.clone(),
             master: master.clone(),
+            feuds: self.nodes.local.feuds(),
+            lost_addresses: self.nodes.lost_addresses(),
         };
         let rescues = facts.reports.iter().filter(|report| report.is_rescue());
         let last = (facts.recoveries > 0)
             .then(|| facts.reports.back())
             .flatten();
-        let lives = self.nodes.lives();
-        let of = |health| {
-            let names = lives.iter().filter(|(_, life)| life.health == health);
-            names.map(|(name, _)| name.clone()).collect::<Vec<_>>()
-        };
         Status {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -114,13 +111,7 @@ impl Pages {
             guarded: facts.guarded.is_guarded(),
             guarded_by: facts.guarded.to_string(),
             state: self.ledger.with_mirror(Master::counts),
-            unreachable: of(Health::Unreachable),
-            dead_nodes: of(Health::Dead),
-            unchecked_nodes: of(Health::Unchecked),
-            alive_nodes: lives
-                .values()
-                .filter(|life| life.health == Health::Alive)
-                .count(),
+            nodes: self.nodes_status(situation),
             recoveries: facts.recoveries,
             last_recovery: last.cloned(),
             rescues: facts.rescues,
@@ -130,6 +121,33 @@ impl Pages {
             clients: self.clients.list(),
             counters: counters.collect(),
             cluster: facts.cluster.as_ref().map(Computers::from),
+        }
+    }
+
+    fn nodes_status(&self, situation: Situation) -> NodesStatus {
+        let lives = self.nodes.lives();
+        let of = |health| {
+            let names = lives.iter().filter(|(_, life)| life.health == health);
+            names.map(|(name, _)| name.clone()).collect::<Vec<_>>()
+        };
+        let ill = lives
+            .iter()
+            .filter(|(_, life)| life.health != Health::Alive);
+        let ill = ill.map(|(name, life)| {
+            let health = NodeHealth {
+                health: life.health,
+                since: clock::wall_time_of(life.since).round(),
+            };
+            (name.clone(), health)
+        });
+        NodesStatus {
+            unreachable: of(Health::Unreachable),
+            dead_nodes: of(Health::Dead),
+            unchecked_nodes: of(Health::Unchecked),
+            alive_nodes: of(Health::Alive).len(),
+            node_health: ill.collect(),
+            feuds: situation.feuds,
+            lost_addresses: situation.lost_addresses,
         }
     }
 

@@ -174,6 +174,8 @@ mod tests {
         let mut facts = Facts::new(Mode::Core);
         facts.cluster = Some(cluster.clone());
         let situation = Situation {
+            feuds: Vec::new(),
+            lost_addresses: Vec::new(),
             gate,
             gate_since: facts.started,
             unprotected: None,

@@ -54,7 +54,15 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     let (gate_tx, gate) = gate();
     gate_tx.set(State::Open { incarnation });
     let patience = Patience::new(Duration::from_secs(60));
-    let (queue, drain) = write_queue(ledger.clone(), upstream, gate, stats, None, false, patience);
+    let (queue, drain) = write_queue(
+        ledger.clone(),
+        upstream,
+        gate,
+        stats,
+        None,
+        Arc::new(()),
+        patience,
+    );
     tokio::spawn(drain.run());
 
     let call = Request::new(Method::UnregisterPublisher, ["/b", "/t", PUBLISHER]);

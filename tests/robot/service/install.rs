@@ -209,7 +209,7 @@ fn installed_completions_match_the_command_line() {
     for shell in ["bash", "zsh", "fish"] {
         let script = said(&rosrescue(&scratch, &["completions", shell]), 0);
         assert!(
-            script.contains("reap-dead-nodes") && script.contains("uninstall"),
+            script.contains("reap") && script.contains("uninstall"),
             "{shell}"
         );
     }

@@ -6,9 +6,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-use super::Reaction;
+use super::{Evidence, Reaction};
 
 /// Pause before a node is asked again. It is shorter if the socket table shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
@@ -16,7 +16,7 @@ const ASK_AGAIN: Duration = Duration::from_secs(30);
 const STALE: Duration = Duration::from_secs(120);
 
 /// Whether a node is alive, as far as known.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Health {
     /// A process listens at the node's port, or the node has answered.
@@ -127,6 +127,16 @@ impl Health {
             Some(Reaction::Dead) => Self::Dead,
             Some(Reaction::Silent) => Self::Unreachable,
             None => Self::Unchecked,
+        }
+    }
+
+    /// This health of a node's port, corrected by what the kernel shows about the node itself.
+    pub fn with(self, evidence: Evidence) -> Self {
+        match evidence {
+            Evidence::Ended(_) => Self::Dead,
+            // The process at the port may be another one.
+            Evidence::Replaced => Self::Unchecked,
+            Evidence::Listens | Evidence::Unknown => self,
         }
     }
 }

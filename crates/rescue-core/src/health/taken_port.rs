@@ -84,12 +84,18 @@ impl Eviction {
         let mut registrants = registrants(call);
         registrants.retain(|(node, port)| after.api_of(node).map(port_of) == Some(port));
         let nodes = Holders::new(mirror).displaced(&registrants);
+        Self::of(mirror, nodes.into_iter().map(str::to_owned))
+    }
+
+    /// The eviction of these nodes. `None` if none of them has registrations.
+    pub fn of(mirror: &Master, nodes: impl IntoIterator<Item = String>) -> Option<Self> {
+        let nodes: Vec<_> = nodes.into_iter().collect();
         let calls: Vec<_> = nodes
             .iter()
             .flat_map(|node| mirror.forget_calls(node))
             .collect();
         (!calls.is_empty()).then(|| Self {
-            nodes: nodes.into_iter().map(str::to_owned).collect(),
+            nodes,
             call: Request::multicall(calls),
         })
     }

@@ -47,6 +47,13 @@ impl Unreachable {
         self.of.remove(port).is_some()
     }
 
+    /// Lets all ports be asked at `now`, and again soon if they do not answer.
+    pub fn ask_all_at(&mut self, now: Instant) {
+        for wait in self.of.values_mut() {
+            wait.backoff = Backoff::new(now, FIRST_PAUSE);
+        }
+    }
+
     /// Removes ports at which no node is registered any more.
     pub fn retain(&mut self, registered: impl Fn(&str) -> bool) {
         self.of.retain(|port, _| registered(port));
@@ -112,6 +119,22 @@ mod tests {
         assert_eq!(unreachable.due(late), Vec::<String>::new());
         unreachable.add("a", late);
         assert_eq!(unreachable.next(), Some(late + FIRST_PAUSE * 2));
+    }
+
+    #[test]
+    fn all_nodes_are_asked_at_once_when_a_link_is_back() {
+        let start = Instant::now();
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", start);
+        unreachable.add("b", start);
+        let late = start + Duration::from_secs(100);
+        assert_eq!(unreachable.due(late), ["a", "b"]);
+        unreachable.add("a", late);
+        let back = late + Duration::from_millis(1);
+        unreachable.ask_all_at(back);
+        assert_eq!(unreachable.due(back), ["a"], "the other one is being asked");
+        unreachable.add("b", back);
+        assert_eq!(unreachable.next(), Some(back + FIRST_PAUSE));
     }
 
     #[test]

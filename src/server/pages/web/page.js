@@ -597,8 +597,8 @@ function health(node) {
   const texts = {
     alive: "alive",
     unchecked: node.checked_at ? `not checked since ${moment(node.checked_at)}` : "not checked yet",
-    unreachable: "unreachable: still registered, retrying",
-    dead: node.removed_at ? `dead, unregistered ${moment(node.removed_at)}` : "dead: its port is closed; still registered",
+    unreachable: `unreachable since ${moment(node.since)}: still registered, retrying`,
+    dead: node.removed_at ? `dead, unregistered ${moment(node.removed_at)}` : `dead since ${moment(node.since)}; still registered`,
   };
   return el("span", { class: "health", "data-is": node.health }, texts[node.health] ?? node.health);
 }

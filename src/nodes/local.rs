@@ -1,0 +1,415 @@
+//! The nodes of this computer, as the kernel shows them: who listens at their ports, and whose process has ended. Also
+//! recognises calls that would make the master shut down an innocent node.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    net::{IpAddr, SocketAddr},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Instant,
+};
+
+use tokio::sync::Notify;
+
+use super::{Nodes, health_check};
+use crate::{
+    clock,
+    health::{
+        AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
+        Reap, Registrants, first_taking, port_of,
+    },
+    ledger::{Ledger, activity::LastCalls},
+    limit::rarely,
+    master::{Master, Request},
+    process::listeners,
+    replay::Token,
+    status::stats::Stats,
+    upstream::sockets,
+    write_queue::MoveJudge,
+};
+
+/// The listening sockets of this computer, by address.
+pub(super) type Listening = HashMap<SocketAddr, Vec<u64>>;
+
+/// What the kernel shows about the nodes of this computer.
+#[derive(Debug)]
+pub(crate) struct LocalNodes {
+    reap: Reap,
+    stats: &'static Stats,
+    known: Mutex<Known>,
+    feuds: Mutex<Feuds>,
+    /// Wakes the task that reads the socket table, because a node has registered.
+    pub(super) registered: Notify,
+}
+
+#[derive(Debug, Default)]
+struct Known {
+    /// For each port of a node on this computer, the addresses at which the node may listen.
+    here: BTreeMap<String, Vec<SocketAddr>>,
+    registrants: Registrants,
+    evidence: BTreeMap<String, Evidence>,
+    /// Dead nodes that were reported or unregistered, each with the number of its last registration.
+    handled: BTreeMap<String, u64>,
+    addresses: NodeAddresses,
+}
+
+/// A registered name.
+pub(super) struct Named {
+    node: String,
+    api: String,
+    /// The address up to the port.
+    pub(super) port: String,
+    registered: u64,
+    /// The process id that the node has answered since its last registration.
+    said: Option<i32>,
+}
+
+/// All registered names, without rosrescue's own.
+pub(super) fn names(ledger: &Ledger) -> Vec<Named> {
+    ledger.with_activity(|mirror, activity| {
+        let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
+        let named = nodes.map(|(node, api)| Named {
+            node: node.to_owned(),
+            api: api.to_owned(),
+            port: port_of(api).to_owned(),
+            registered: activity.last_calls(node).registered,
+            said: match activity.pid_of(node, api) {
+                Some((pid, false)) => Some(pid),
+                // An answer from before the last registration may be another process's.
+                Some((_, true)) | None => None,
+            },
+        });
+        named.collect()
+    })
+}
+
+impl LocalNodes {
+    pub(crate) fn new(reap: Reap, stats: &'static Stats) -> Self {
+        Self {
+            reap,
+            stats,
+            known: Mutex::default(),
+            feuds: Mutex::default(),
+            registered: Notify::new(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Known> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes the addresses of this computer at which the node at `port` may listen. Empty for a node of another
+    /// computer.
+    pub(super) fn set_here(&self, port: &str, addresses: Vec<SocketAddr>) {
+        let mut known = self.lock();
+        known
+            .addresses
+            .set(port, addresses.iter().map(SocketAddr::ip));
+        match addresses.is_empty() {
+            true => known.here.remove(port),
+            false => known.here.insert(port.to_owned(), addresses),
+        };
+    }
+
+    /// Looks at all nodes, with `listening` as the socket table, which must be read after `names`. Returns whether a
+    /// process listens at each port of this computer. Without `proves`, as on a computer that does not see all
+    /// registrations, the table proves nothing about single names.
+    pub(super) fn look(
+        &self,
+        names: &[Named],
+        listening: &Listening,
+        proves: bool,
+    ) -> BTreeMap<String, bool> {
+        let now = Instant::now();
+        let known = &mut *self.lock();
+        if !proves {
+            known.registrants = Registrants::default();
+        }
+        let registered: BTreeSet<_> = names.iter().map(|name| name.port.as_str()).collect();
+        known
+            .here
+            .retain(|port, _| registered.contains(port.as_str()));
+        known.addresses.retain(|port| registered.contains(port));
+        let here = known.here.iter();
+        let sockets: BTreeMap<_, _> = here
+            .map(|(port, addresses)| (port.as_str(), accepting(listening, addresses)))
+            .collect();
+        let local: Vec<_> = names.iter().map(Named::local).collect();
+        let at = |port| sockets.get(port).map(Vec::as_slice);
+        if proves {
+            known.registrants.look(&local, at);
+        }
+        known.evidence.clear();
+        for name in names {
+            let evidence = match at(name.port.as_str()) {
+                Some(sockets) => known.registrants.evidence(
+                    &name.node,
+                    &name.port,
+                    sockets,
+                    listeners::has_ended,
+                    now,
+                ),
+                None => Evidence::Unknown,
+            };
+            if evidence != Evidence::Unknown {
+                known.evidence.insert(name.node.clone(), evidence);
+            }
+        }
+        let known_handled = &mut known.handled;
+        known_handled.retain(|node, _| known.evidence.contains_key(node));
+        let listens = sockets.into_iter();
+        listens
+            .map(|(port, sockets)| (port.to_owned(), !sockets.is_empty()))
+            .collect()
+    }
+
+    /// The ports of nodes that are registered at a lost address.
+    pub(super) fn lost_ports(&self) -> Vec<String> {
+        let known = self.lock();
+        let lost = known.addresses.lost();
+        lost.map(|(port, ..)| port.to_owned()).collect()
+    }
+
+    /// The addresses that this computer has lost and that nodes are registered at, each with their ports and the time.
+    pub(crate) fn lost(&self) -> BTreeMap<IpAddr, (Instant, BTreeSet<String>)> {
+        let mut lost = BTreeMap::new();
+        for (port, address, since) in self.lock().addresses.lost() {
+            let (at, ports) = lost
+                .entry(address)
+                .or_insert_with(|| (since, BTreeSet::new()));
+            *at = since.min(*at);
+            ports.insert(port.to_owned());
+        }
+        lost
+    }
+
+    /// Looks which nodes' addresses this computer has lost or got back.
+    pub(super) fn look_at_addresses(&self, is_own: impl Fn(IpAddr) -> bool) -> AddressChanges {
+        self.lock().addresses.look(is_own, Instant::now())
+    }
+
+    /// The sockets of nodes whose owners have not been looked for yet.
+    pub(super) fn unowned(&self) -> BTreeSet<u64> {
+        self.lock().registrants.unowned()
+    }
+
+    /// Finds the owners of these sockets. Blocks for some milliseconds.
+    pub(super) fn find_owners(&self, sockets: &BTreeSet<u64>) {
+        for (socket, owner) in listeners::owners(sockets) {
+            self.lock().registrants.set_owner(socket, owner);
+        }
+    }
+
+    /// What the last look has shown about `node`.
+    pub(super) fn evidence(&self, node: &str) -> Evidence {
+        let known = self.lock();
+        let evidence = known.evidence.get(node);
+        evidence.copied().unwrap_or(Evidence::Unknown)
+    }
+
+    /// The process whose end would prove that of `node` at `port`.
+    pub(super) fn process(&self, node: &str, port: &str) -> Option<u32> {
+        let process = self.lock().registrants.process(node, port);
+        process.map(|process| process.pid)
+    }
+
+    /// What the kernel shows about `node` at `port` now.
+    fn evidence_now(&self, node: &str, port: &str) -> Evidence {
+        let known = &mut *self.lock();
+        let Some(addresses) = known.here.get(port) else {
+            return Evidence::Unknown;
+        };
+        let sockets = accepting(&sockets::listening(), addresses);
+        let ended = listeners::has_ended;
+        known
+            .registrants
+            .evidence(node, port, &sockets, ended, Instant::now())
+    }
+
+    /// The feuds of this moment.
+    pub(crate) fn feuds(&self) -> Vec<Feud> {
+        let mut feuds = self.feuds.lock().unwrap_or_else(PoisonError::into_inner);
+        feuds.list(Instant::now())
+    }
+
+    fn note_feud(&self, moving: &Moving, evidence: Evidence) {
+        let lived = match evidence {
+            Evidence::Listens => Some(true),
+            Evidence::Ended(_) | Evidence::Replaced => Some(false),
+            Evidence::Unknown => None,
+        };
+        let addresses = (moving.from.as_str(), moving.to.as_str());
+        let mut feuds = self.feuds.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(feud) = feuds.displaced(&moving.node, addresses, lived, Instant::now()) {
+            let Feud {
+                node,
+                from,
+                to,
+                times,
+            } = feud;
+            tracing::warn!(
+                node,
+                from,
+                to,
+                times,
+                "two programs take a node name from each other, and the master shuts one down each time; stop one of them or give it another name (__name:=)"
+            );
+        }
+    }
+}
+
+impl MoveJudge for LocalNodes {
+    fn reaps_all(&self) -> bool {
+        self.reap == Reap::All
+    }
+
+    fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
+        let moving = calls.iter().position(|call| Moving::is_any(mirror, call));
+        let taking = match self.reaps_all() {
+            true => first_taking(mirror, calls.iter().copied()),
+            false => None,
+        };
+        moving.into_iter().chain(taking).min()
+    }
+
+    fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
+        let (moving, taking) = ledger.with_mirror(|mirror| {
+            let taking = self.reaps_all().then(|| Eviction::before(mirror, call));
+            (Moving::by(mirror, call), taking.flatten())
+        });
+        if moving.is_empty() && taking.is_none() {
+            return None;
+        }
+        let taken = taking.map(|taking| taking.nodes).unwrap_or_default();
+        let mut gone: BTreeSet<_> = taken.into_iter().collect();
+        for moving in moving {
+            let evidence = self.evidence_now(&moving.node, port_of(&moving.from));
+            self.note_feud(&moving, evidence);
+            let hits_another = moving.hits_another(evidence);
+            if moving.is_unregistered_first(self.reap, evidence) {
+                if hits_another {
+                    self.stats.shutdowns_prevented.count();
+                    say_prevented(&moving);
+                }
+                gone.insert(moving.node);
+            } else if hits_another {
+                self.stats.shutdowns_misdirected.count();
+                say_misdirected(&moving);
+            }
+        }
+        Some(ledger.with_mirror(|mirror| Eviction::of(mirror, gone)))
+    }
+
+    fn registered(&self) {
+        self.registered.notify_one();
+    }
+}
+
+fn say_prevented(moving: &Moving) {
+    let Moving {
+        node, from, others, ..
+    } = moving;
+    rarely!(
+        info,
+        node,
+        from,
+        ?others,
+        "a node has moved, and another node uses its old port: unregistered the old node first, so that the master does not shut down the other one"
+    );
+}
+
+fn say_misdirected(moving: &Moving) {
+    let Moving {
+        node, from, others, ..
+    } = moving;
+    rarely!(
+        warn,
+        node,
+        from,
+        ?others,
+        "the master shuts down the wrong node: a node has moved, and another one uses its old port. `--reap local` prevents this"
+    );
+}
+
+impl Named {
+    fn local(&self) -> LocalName<'_> {
+        LocalName {
+            node: &self.node,
+            port: &self.port,
+            registered: self.registered,
+            said: self.said,
+        }
+    }
+}
+
+/// The sockets that accept connections to one of `addresses`.
+fn accepting(listening: &Listening, addresses: &[SocketAddr]) -> Vec<u64> {
+    let sockets = addresses.iter();
+    let sockets: BTreeSet<_> = sockets
+        .flat_map(|address| sockets::accepting(listening, *address))
+        .collect();
+    sockets.into_iter().collect()
+}
+
+/// Reports or unregisters the nodes of `names` that are proved dead. Does nothing while the mirror answers in the
+/// master's place: the health check afterwards deals with dead nodes.
+pub(super) fn bury(nodes: &Arc<Nodes>, names: &[Named]) {
+    if !nodes.gate.is_open() {
+        return;
+    }
+    for name in names {
+        let Evidence::Ended(death) = nodes.local.evidence(&name.node) else {
+            continue;
+        };
+        let others: Vec<_> = names
+            .iter()
+            .filter(|other| other.port == name.port && other.node != name.node)
+            .map(|other| other.node.as_str())
+            .collect();
+        if !death.is_certain(!others.is_empty()) {
+            continue;
+        }
+        let mut known = nodes.local.lock();
+        if known.handled.get(&name.node) == Some(&death.registered) {
+            continue;
+        }
+        known.handled.insert(name.node.clone(), death.registered);
+        drop(known);
+        let node = &name.node;
+        let how = how(&death, &others);
+        if nodes.local.reap == Reap::Report {
+            rarely!(info, "would have unregistered {node}: {how} (--reap local)");
+            continue;
+        }
+        crate::task::spawn(unregister(
+            nodes.clone(),
+            name.node.clone(),
+            name.api.clone(),
+            death,
+            how,
+        ));
+    }
+}
+
+async fn unregister(nodes: Arc<Nodes>, node: String, api: String, death: Death, how: String) {
+    let same = |calls: LastCalls| calls.registered == death.registered && nodes.gate.is_open();
+    if health_check::remove(&nodes, &node, &api, same).await {
+        nodes.stats.dead_nodes_reaped.count();
+        rarely!(info, "unregistered {node}: {how}");
+    } else {
+        // The next look tries again, if the node is still registered.
+        nodes.local.lock().handled.remove(&node);
+    }
+}
+
+/// How a node has ended, as in `its process 7 ended at 14:03:01, nobody listens at its port`. `others` are the other names
+/// at its port.
+fn how(death: &Death, others: &[&str]) -> String {
+    let at = clock::wall_text(clock::wall_time_of(death.since));
+    let time = at.get(11..19).unwrap_or(&at);
+    let process = death.process.pid;
+    let port = match death.taken {
+        false => "nobody listens at its port".to_owned(),
+        true => format!("{} uses its port now", others.join(", ")),
+    };
+    format!("its process {process} ended at {time}, {port}")
+}

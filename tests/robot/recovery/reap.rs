@@ -1,0 +1,246 @@
+//! Dead nodes without an outage: what `--reap` reports or unregisters, and that no innocent node is shut down.
+
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use serde_json::Value as Json;
+
+use crate::support::{
+    FakeNode, Library, Mode, NODES, Node, Process, Robot, State, eventually, free_port, holds,
+    in_both_modes, names, page, params, ros_command, signal,
+};
+
+/// Longer than a master needs to tell a node to shut down.
+const A_WHILE: Duration = Duration::from_secs(2);
+
+/// What the page shows of a node. `None` if it is unknown.
+fn shown(robot: &Robot, node: &str) -> Option<Json> {
+    let state = page(&robot.client(), "/state.json");
+    let state: Json = serde_json::from_str(state.rsplit("\r\n").next()?).ok()?;
+    let mut nodes = state["nodes"].as_array()?.iter();
+    nodes.find(|of| of["name"] == node).cloned()
+}
+
+/// Waits until the kernel would prove the end of these nodes.
+fn await_watched(robot: &Robot, nodes: &[(&str, u32)]) {
+    for (node, pid) in nodes {
+        eventually("the kernel watches the node's process", || {
+            shown(robot, node).is_some_and(|of| of["process"] == *pid)
+        });
+    }
+}
+
+fn has_logged(robot: &Robot, words: &[&str]) -> bool {
+    let mut lines = robot.rescue.output().into_iter();
+    lines.any(|line| words.iter().all(|word| line.contains(word)))
+}
+
+/// A node of each library, whose processes the kernel watches.
+fn two_nodes(robot: &Robot) -> [Node; 2] {
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    let pids = [("/talker", talker.pid()), ("/listener", listener.pid())];
+    await_watched(robot, &pids);
+    [talker, listener]
+}
+
+in_both_modes!(by_default_dead_nodes_are_reported_and_stay_registered);
+
+fn by_default_dead_nodes_are_reported_and_stay_registered(mode: Mode) {
+    let robot = Robot::start_with(mode, &[]);
+    let [mut talker, _listener] = two_nodes(&robot);
+    let before = robot.settled_state();
+    let process = format!("its process {} ended at", talker.pid());
+    talker.kill();
+    eventually("the log reports the dead node", || {
+        let report = "would have unregistered /talker: ";
+        has_logged(&robot, &[report, &process, "nobody listens at its port"])
+    });
+    let status = robot.status().unwrap_or_default();
+    assert_eq!(names(&status["dead_nodes"]), ["/talker"]);
+    assert_eq!(status["node_health"]["/talker"]["health"], "dead");
+    let metrics = page(&robot.client(), "/metrics");
+    let line = "\nrosrescue_node_since_seconds{node=\"/talker\",health=\"dead\"} ";
+    assert!(metrics.contains(line), "{metrics}");
+    before.assert_same(&robot.settled_state(), "a dead node stays registered");
+}
+
+in_both_modes!(reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one);
+
+fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one(mode: Mode) {
+    let robot = Robot::start_with(mode, &["--reap", "local"]);
+    let [mut talker, listener] = two_nodes(&robot);
+    let after = robot.settled_state().without_node("/talker");
+    listener.signal(Signal::STOP);
+    let killed = Instant::now();
+    talker.kill();
+    eventually("the dead node is unregistered", || {
+        State::try_read(&robot.bare()).is_ok_and(|now| !now.knows("/talker"))
+    });
+    println!("unregistered after {:?}", killed.elapsed());
+    robot.await_state(&after, "after the node's death");
+    assert!(has_logged(
+        &robot,
+        &["unregistered /talker: its process", "nobody listens"]
+    ));
+    assert_eq!(robot.counter("dead_nodes_reaped"), 1);
+    // A node that is stopped does not answer, and lives.
+    assert!(holds(A_WHILE, || robot.state().knows("/listener")));
+    listener.signal(Signal::CONT);
+    let state = robot.settled_state();
+    after.assert_same(&state, "the stopped node stays registered");
+    assert!(shown(&robot, "/talker").is_some_and(|of| !of["removed_at"].is_null()));
+}
+
+/// A node that is gone, although the kernel does not prove that. Its port is then `innocent`'s.
+fn with_taken_port(robot: &Robot) -> FakeNode {
+    let client = robot.client();
+    let ghost = FakeNode::start_at("/killed", free_port());
+    ghost.publish(&client, "/topic", "std_msgs/String");
+    let port = ghost.port();
+    drop(ghost);
+    let innocent = FakeNode::start_at("/innocent", port);
+    innocent.publish(&client, "/topic", "std_msgs/String");
+    innocent
+}
+
+fn start_again(robot: &Robot) -> FakeNode {
+    let again = FakeNode::start("/killed");
+    again.publish(&robot.client(), "/topic", "std_msgs/String");
+    again
+}
+
+in_both_modes!(reap_local_never_lets_the_master_shut_down_an_innocent_node);
+
+fn reap_local_never_lets_the_master_shut_down_an_innocent_node(mode: Mode) {
+    let robot = Robot::start_with(mode, &["--reap", "local"]);
+    let innocent = with_taken_port(&robot);
+    let _again = start_again(&robot);
+    assert!(holds(A_WHILE, || innocent.heard("shutdown").is_empty()));
+    let state = robot.settled_state();
+    assert_eq!(state.publishers_of("/topic"), ["/innocent", "/killed"]);
+    assert_eq!(robot.counter("shutdowns_prevented"), 1);
+    assert_eq!(robot.counter("divergences"), 0);
+}
+
+/// The program at the dead node's port has not registered yet.
+#[test]
+fn a_program_that_has_not_registered_is_not_shut_down_either() {
+    let robot = Robot::start_with(Mode::Core, &["--reap", "local"]);
+    let mut talker = robot.node(Library::Rospy, "talker", &[]);
+    await_watched(&robot, &[("/talker", talker.pid())]);
+    let api = robot.client().ok("lookupNode", params!["/test", "/talker"]);
+    let port = api.as_str().unwrap().trim_end_matches('/');
+    let port = port.rsplit(':').next().unwrap().parse().unwrap();
+    talker.kill();
+    let innocent = FakeNode::start_at("/innocent", port);
+    let again = FakeNode::start("/talker");
+    again.publish(&robot.client(), "/topic", "std_msgs/String");
+    assert!(holds(A_WHILE, || innocent.heard("shutdown").is_empty()));
+    assert!(robot.settled_state().publishers_of("/topic") == ["/talker"]);
+}
+
+#[test]
+fn by_default_a_shutdown_of_the_wrong_node_is_reported() {
+    let robot = Robot::start_with(Mode::Core, &[]);
+    let innocent = with_taken_port(&robot);
+    let _again = start_again(&robot);
+    eventually("the master shuts down the wrong node", || {
+        innocent.heard("shutdown").len() == 1
+    });
+    eventually("the log reports it", || {
+        has_logged(
+            &robot,
+            &[
+                "shuts down the wrong node",
+                "/killed",
+                "/innocent",
+                "--reap local",
+            ],
+        )
+    });
+    assert_eq!(robot.counter("shutdowns_misdirected"), 1);
+}
+
+/// Two programs under one name that are started again whenever they are shut down (ros_comm issue 2018).
+#[test]
+fn two_programs_that_take_a_name_from_each_other_are_reported() {
+    let robot = Robot::start_with(Mode::Core, &["--reap", "local"]);
+    let client = robot.client();
+    let mut last: Option<FakeNode> = None;
+    for turn in 0..4 {
+        let program = FakeNode::start("/twin");
+        program.publish(&client, "/topic", "std_msgs/String");
+        eventually("the kernel watches the program", || {
+            let is_there =
+                |of: Json| of["process"] == std::process::id() && of["api"] == program.api.as_str();
+            shown(&robot, "/twin").is_some_and(is_there)
+        });
+        if let Some(last) = last.replace(program) {
+            // This is an ordinary displacement, as with a bare master.
+            eventually("the displaced program is told", || {
+                last.heard("shutdown").len() == 1
+            });
+        }
+        let feuds = robot.status().unwrap_or_default()["feuds"].clone();
+        assert_eq!(feuds.as_array().map(Vec::len), Some(usize::from(turn == 3)));
+    }
+    let status = robot.status().unwrap_or_default();
+    let feud = &status["feuds"][0];
+    let to = last.as_ref().unwrap().api.trim_end_matches('/');
+    assert_eq!(
+        (&feud["node"], &feud["times"]),
+        (&"/twin".into(), &3.into())
+    );
+    assert_eq!(feud["to"], to);
+    let action = status["condition"]["action"].as_str().unwrap();
+    assert!(action.contains("another name"), "{action}");
+    let from = feud["from"].as_str().unwrap();
+    assert!(has_logged(
+        &robot,
+        &["two programs take a node name", "/twin", from, to]
+    ));
+    let metrics = page(&client, "/metrics");
+    assert!(metrics.contains("\nrosrescue_feuds 1\n"), "{metrics}");
+}
+
+/// A node that dies and is started again displaces only its ghost.
+#[test]
+fn a_node_that_is_started_again_and_again_is_no_feud() {
+    let robot = Robot::start_with(Mode::Core, &[]);
+    for _ in 0..4 {
+        let node = robot.node(Library::Rospy, "talker", &[]);
+        await_watched(&robot, &[("/talker", node.pid())]);
+        signal(node.pid(), Signal::KILL);
+        drop(node);
+    }
+    let status = robot.status().unwrap_or_default();
+    assert_eq!(status["feuds"], serde_json::json!([]));
+    assert_eq!(robot.counter("shutdowns_misdirected"), 0);
+}
+
+/// Many small nodes are killed, stopped, replaced and started again, some at the ports of dead ones.
+#[test]
+fn of_a_crowd_no_living_node_is_unregistered_and_no_innocent_one_shut_down() {
+    let variable = |name: &str, other: u64| match std::env::var(name) {
+        Ok(value) => value.parse().unwrap(),
+        Err(_) => other,
+    };
+    let rounds = variable("ROSRESCUE_ROUNDS", 150);
+    let seed = variable("ROSRESCUE_SEED", u64::from(std::process::id()));
+    println!("ROSRESCUE_SEED={seed}");
+    let robot = Robot::start_with(Mode::Core, &["--reap", "local", "--no-rosout"]);
+    let program = format!("{NODES}/crowd.py");
+    let mut crowd = ros_command(&robot.scratch, "/usr/bin/python3", robot.port());
+    crowd.args([program, rounds.to_string(), seed.to_string()]);
+    let mut crowd = Process::start("crowd", &mut crowd);
+    let ended = crowd.wait_output();
+    println!("{}", crowd.output().join("\n"));
+    assert!(ended.success(), "{ended}");
+    println!(
+        "{} shutdowns prevented, {} nodes reaped",
+        robot.counter("shutdowns_prevented"),
+        robot.counter("dead_nodes_reaped")
+    );
+    assert_eq!(robot.counter("divergences"), 0);
+}
