@@ -14,6 +14,11 @@ pub fn wall_time() -> f64 {
         .map_or(0.0, |since| since.as_secs_f64())
 }
 
+/// The present wall time in milliseconds since 1970; 0 if the clock shows an earlier time.
+pub fn wall_millis() -> u64 {
+    (wall_time() * 1e3) as u64
+}
+
 /// Wall time at `moment`, computed from what the clock shows now.
 pub fn wall_time_of(moment: Instant) -> f64 {
     (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)

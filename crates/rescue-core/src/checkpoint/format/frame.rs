@@ -16,11 +16,12 @@ use std::ops::Range;
 
 use super::{
     Checkpoint, Damage, Decoded, EncodeError, Encoded, FormatError, Record, RecordContent,
-    SnapshotError, document,
+    SnapshotError,
+    document::{self, Form},
 };
 
 /// The version of the format that this program writes.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 const MAGIC: &str = "# rosrescue checkpoint v";
 /// Longest first line, in bytes.
@@ -39,14 +40,14 @@ const COUNT_MAX: u64 = u64::MAX / 2;
 pub struct Stamp(u32);
 
 /// Adds the first line to a snapshot.
-pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
+pub(super) fn frame_snapshot(snapshot: &[u8], version: u32, seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
     let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
     // This cannot fail, because it writes to a vector.
     let _ = write!(
         bytes,
-        "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
+        "{MAGIC}{version} generation={generation} seq={seq} snapshot={length} \
          crc32c={crc:08x} header="
     );
     let stamp = Stamp(crc32c::crc32c(&bytes));
@@ -57,8 +58,12 @@ pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Enco
 
 /// Appends the line of a record without its check sums.
 pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &RecordContent) -> Result<(), EncodeError> {
+    push(out, seq, entry, Form::Short)
+}
+
+fn push(out: &mut Vec<u8>, seq: u64, entry: &RecordContent, form: Form) -> Result<(), EncodeError> {
     let start = out.len();
-    let written = document::write_record(out, seq, entry);
+    let written = document::write_record(out, seq, entry, form);
     if written.is_err() {
         out.truncate(start);
     }
@@ -78,10 +83,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
 /// The stamp of records that are outside of any checkpoint file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends the line of a record that is outside of any checkpoint file.
+/// Appends the line of a record that is outside of any checkpoint file. All versions read it.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
-    push_body(out, record.seq, &record.entry)?;
+    push(out, record.seq, &record.entry, Form::Long)?;
     seal(out, start, NO_FILE);
     Ok(())
 }
@@ -232,7 +237,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
         return Ok(None);
     };
     match version.parse() {
-        Ok(FORMAT_VERSION) => {}
+        Ok(1..=FORMAT_VERSION) => {}
         Ok(version) => return Err(FormatError::NewerVersion { version }),
         Err(_) => return Ok(None),
     }
