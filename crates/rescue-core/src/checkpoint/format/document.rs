@@ -176,7 +176,7 @@ fn write_label(out: &mut Vec<u8>, label: Label) {
         return;
     }
     out.extend_from_slice(b", t: ");
-    decimal(out, &label.at);
+    decimal(out, label.at);
     let from = match label.origin {
         Origin::COMMON => return,
         Origin::Unknown => String::new(),

@@ -274,6 +274,25 @@ fn resembles(bytes: &[u8]) -> bool {
         || contains(b"\nsession:\n") && contains(b"\njournal:\n")
 }
 
+impl Header {
+    /// Connects the file's records to its snapshot.
+    pub fn stamp(&self) -> Stamp {
+        self.stamp
+    }
+}
+
+impl<'a> Line<'a> {
+    /// Wall clock time in the line, in milliseconds since 1970; see [`Label::at`](super::Label::at). 0 without a time.
+    pub fn time(&self) -> u64 {
+        time_at_end(self.body).unwrap_or(0)
+    }
+
+    /// The line without its check sums, as [`push_body`] writes it.
+    pub fn body(&self) -> &'a [u8] {
+        self.body
+    }
+}
+
 impl<'a> Framed<'a> {
     /// A file without any undamaged part.
     pub fn unreadable(bytes: &'a [u8]) -> Self {
@@ -290,6 +309,30 @@ impl<'a> Framed<'a> {
 
     /// The verified snapshot.
     pub fn checkpoint(&self) -> Result<Checkpoint, SnapshotError> {
+        std::str::from_utf8(self.snapshot()?)
+            .map_err(|error| error.to_string())
+            .and_then(document::read_snapshot)
+            .map_err(|why| SnapshotError::Content { why })
+    }
+
+    /// The file's text up to its first record. Its check sums are verified, its YAML is not.
+    pub fn head(&self) -> Result<&'a [u8], SnapshotError> {
+        let length = self.snapshot()?.len() + self.header.map_or(0, |header| header.length);
+        Ok(self.bytes.get(..length).unwrap_or_default())
+    }
+
+    /// Wall clock time of the snapshot, in milliseconds since 1970; see [`Session::at`](super::Session::at). 0 without a
+    /// time.
+    pub fn taken_at(&self) -> u64 {
+        let head = self.head().ok().and_then(|it| std::str::from_utf8(it).ok());
+        let session = head.and_then(|head| head.split("\nnodes:").next());
+        let at = session.and_then(|session| session.rsplit_once("\n  at: "));
+        at.and_then(|(_, at)| at.lines().next()?.parse().ok())
+            .unwrap_or(0)
+    }
+
+    /// The text of the verified snapshot.
+    fn snapshot(&self) -> Result<&'a [u8], SnapshotError> {
         let header = self.header.ok_or(SnapshotError::Header)?;
         let behind = self.bytes.get(header.length..).unwrap_or_default();
         let snapshot = usize::try_from(header.snapshot)
@@ -306,10 +349,7 @@ impl<'a> Framed<'a> {
                 found,
             });
         }
-        std::str::from_utf8(snapshot)
-            .map_err(|error| error.to_string())
-            .and_then(document::read_snapshot)
-            .map_err(|why| SnapshotError::Content { why })
+        Ok(snapshot)
     }
 
     /// The records with numbers above `after`. A line with valid check sums and invalid content is added to `damaged`.
@@ -402,6 +442,20 @@ impl<'a> Framed<'a> {
             None => {}
         }
     }
+}
+
+/// The time at the end of a record's line, before its origin. Such a text cannot be inside of a value, because a line
+/// without a label ends in `]` or `true`.
+fn time_at_end(body: &[u8]) -> Option<u64> {
+    let text = std::str::from_utf8(body).ok()?;
+    let text = text.trim_end_matches('}');
+    let text = match text.ends_with('"') {
+        true => text.rsplit_once(", from: ")?.0,
+        false => text,
+    };
+    let (before, digits) = text.rsplit_once(": ")?;
+    let is_time = before.ends_with(" t") || before.ends_with(" at");
+    is_time.then(|| digits.parse().ok()).flatten()
 }
 
 /// Number, stamp and body of a line with valid check sums.
