@@ -8,19 +8,21 @@ mod live;
 mod serve;
 mod service;
 mod tools;
+mod when;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
     cluster::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
     files::{
-        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, ReportArgs,
-        RestoreArgs, VerifyArgs,
+        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReadArgs,
+        ReportArgs, RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, RestoreChoice, SyncPolicy},
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
+    when::When,
 };
 
 /// Keeps a ROS 1 robot running when its master dies.

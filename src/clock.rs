@@ -54,6 +54,12 @@ pub fn wall_text(seconds: f64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
+/// Formats a wall time in milliseconds since 1970 in UTC, as in `2026-11-21T09:26:53.123Z`.
+pub fn wall_text_millis(millis: u64) -> String {
+    let text = wall_text((millis / 1_000) as f64);
+    format!("{}.{:03}Z", text.trim_end_matches('Z'), millis % 1_000)
+}
+
 /// Formats a time span for people, as in `2 h 5 min`.
 pub fn span(seconds: f64) -> String {
     let whole = seconds.max(0.0) as u64;

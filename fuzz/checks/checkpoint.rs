@@ -243,6 +243,10 @@ impl Storage for Memory {
         })
     }
 
+    fn length_at(&self, path: &Path) -> io::Result<u64> {
+        Ok(self.file(path)?.lock().unwrap().len() as u64)
+    }
+
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {
         Ok(self.file(path).ok().as_ref().map(id))
     }

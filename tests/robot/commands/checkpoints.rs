@@ -135,6 +135,7 @@ fn file(at: &Path) -> [usize; 3] {
         },
         pending: Vec::new(),
         displaced: Vec::new(),
+        follows: false,
     };
     let encoded = format::encode_checkpoint(&checkpoint, 1).unwrap();
     let mut bytes = encoded.bytes;

@@ -86,7 +86,7 @@ pub struct Entry {
 }
 
 /// Reads the files of a history, oldest first, and lists what changed. May read a file again that has grown.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct LogReader {
     hide: Hide,
     state: Option<(Master, Session)>,
