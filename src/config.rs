@@ -159,7 +159,7 @@ pub struct SupervisedConfig {
 impl Config {
     /// Maximum space for kept checkpoints, in bytes.
     pub fn kept_bytes(&self) -> u64 {
-        self.history / 2
+        self.history / 4
     }
 
     /// Maximum space for the log of changes, in bytes.

@@ -90,7 +90,7 @@ pub struct CommonArgs {
     /// Whether a start restores the checkpoint
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
     pub restore: RestoreChoice,
-    /// Maximum space for the past, in MiB. Half is for the last 5 sessions and 20 rescues, half for the log of changes
+    /// Maximum space for the past, in MiB. A quarter is for the last 5 sessions and 20 rescues, the rest for the log
     #[arg(
         long,
         env = "ROSRESCUE_HISTORY",

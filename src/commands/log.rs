@@ -1,6 +1,8 @@
 //! `rosrescue log`: shows what changed, when, and who did it.
 
-use std::{io, path::Path, time::Duration};
+use std::{
+    collections::VecDeque, io, num::NonZero, path::Path, thread::ScopedJoinHandle, time::Duration,
+};
 
 use serde::Serialize;
 
@@ -76,6 +78,8 @@ struct Wanted<'a> {
     until: u64,
     /// Whether entries about anything are wanted.
     all: bool,
+    /// One of these is in each record about a wanted name.
+    words: Vec<String>,
 }
 
 impl<'a> Wanted<'a> {
@@ -87,6 +91,7 @@ impl<'a> Wanted<'a> {
             since: args.since.map_or(0, |since| since.millis(now)),
             until: args.until.map_or(u64::MAX, |until| until.millis(now)),
             all: subjects.iter().all(|names| names.is_empty()),
+            words: words_of(args),
         }
     }
 
@@ -124,30 +129,51 @@ impl<'a> Wanted<'a> {
         (subjects == 0 || is_subject) && (args.node.is_empty() || is_by)
     }
 
-    /// Whether a file may have wanted entries, to spare the time to read its YAML.
-    fn may_have(&self, framed: &format::Framed<'_>) -> usize {
-        let args = self.args;
-        let lists = [&args.param, &args.topic, &args.service, &args.node];
-        let mut names: Vec<&[u8]> = Vec::new();
-        for name in lists.into_iter().flatten() {
-            // A call may use only the last part of a name, or a part of the name as a namespace.
-            let last = name.trim_end_matches('/').rsplit('/').next();
-            names.push(last.unwrap_or_default().as_bytes());
+    /// Leaves out the records that change only unwanted parameters, because to read the YAML of a record takes long.
+    /// Counts the records that may be wanted.
+    fn thin(&self, text: &[u8]) -> Thin {
+        let mut count = 0;
+        let framed = format::scan(text).ok();
+        let thinned = framed.and_then(|framed| {
+            framed.thinned(|line| {
+                let body = std::str::from_utf8(line.body()).unwrap_or_default();
+                let is_named = self.all || self.words.iter().any(|word| body.contains(word));
+                count += usize::from(is_named && self.has_time(line.time()));
+                is_named || !body.contains("Param: [")
+            })
+        });
+        Thin {
+            text: thinned.unwrap_or_default(),
+            count,
         }
-        let has_name = |body: &[u8]| {
-            let in_body = |name: &&[u8]| contains(body, name);
-            // Sessions have events. A namespace may be set or deleted as a whole.
-            self.all || names.iter().any(in_body) || contains(body, b"Param: ")
-        };
-        let lines = framed.lines.iter();
-        lines
-            .filter(|line| self.has_time(line.time()) && has_name(line.body()))
-            .count()
     }
 }
 
-fn contains(text: &[u8], name: &[u8]) -> bool {
-    name.is_empty() || text.windows(name.len()).any(|window| window == name)
+/// A file without unwanted records.
+struct Thin {
+    text: Vec<u8>,
+    /// Number of records that may be wanted.
+    count: usize,
+}
+
+/// Texts of which each record has one that concerns a wanted name: the last part of the name, or a namespace above it.
+fn words_of(args: &LogArgs) -> Vec<String> {
+    let mut words = Vec::new();
+    for name in [&args.topic, &args.service, &args.node, &args.param]
+        .into_iter()
+        .flatten()
+    {
+        let last = name.trim_end_matches('/').rsplit('/').next();
+        words.push(last.unwrap_or_default().to_owned());
+    }
+    for name in &args.param {
+        let above = name.trim_matches('/').rsplit('/').skip(1);
+        words.extend(above.flat_map(|part| [format!("{part}\""), format!("{part}/\"")]));
+    }
+    if !args.param.is_empty() {
+        words.extend(["\"/\"", "\"~\"", "\"\""].map(str::to_owned));
+    }
+    words
 }
 
 /// The name with a slash at its start.
@@ -164,52 +190,68 @@ fn newest(
     reader: &mut LogReader,
 ) -> Result<Vec<Entry>, CommandFailure> {
     let files = list(path)?;
-    let mut most = match lines {
-        0 => usize::MAX,
-        lines => lines,
-    };
+    let mut thin: VecDeque<Thin> = VecDeque::new();
+    let mut found = Vec::new();
+    let mut most = lines;
     loop {
-        let first = first_file(&files, wanted, most);
-        let mut found = Vec::new();
+        let first = files.len() - thin.len();
+        let counted: usize = thin.iter().map(|file| file.count).sum();
+        if first > 0 && (lines == 0 || counted < most || thin.len() < LIVE_FILES) {
+            // Each time as many files as before, so that a short answer is quick.
+            let from = first.saturating_sub(thin.len().max(LIVE_FILES));
+            let more = files.get(from..first).unwrap_or_default();
+            for file in thinned(more, wanted).into_iter().rev() {
+                thin.push_front(file);
+            }
+            continue;
+        }
         let mut this = reader.clone();
-        for file in files.iter().skip(first) {
-            let text = match file.read() {
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                text => text.map_err(|error| error.to_string()),
-            };
-            if let Err(why) = text.and_then(|text| this.read(&text)) {
-                eprintln!("rosrescue: cannot use `{}`: {why}", file.path.display());
+        found.clear();
+        let mut texts = thin.iter().peekable();
+        let mut left = thin.len();
+        while let Some(file) = texts.next() {
+            left -= 1;
+            let next = texts.peek().map_or(0, |next| next.count);
+            // The file before a wanted one shows what changed between the two.
+            if wanted.all && file.count == 0 && next == 0 && left >= LIVE_FILES {
+                this.forget();
+            } else if !file.text.is_empty() {
+                // A file that cannot be used is as good as none.
+                let _ = this.read(&file.text);
             }
             found.extend(this.take().into_iter().filter(|entry| wanted.has(entry)));
         }
-        if first == 0 || found.len() >= lines && lines > 0 {
+        if first == 0 || found.len() >= lines {
             *reader = this;
             return Ok(found);
         }
+        // Not every record changes something.
         most = most.saturating_mul(4);
     }
 }
 
-/// The first file from which on there may be as many as `most` wanted entries.
-fn first_file(files: &[LogFile], wanted: &Wanted<'_>, most: usize) -> usize {
-    let (mut count, mut first) = (0, files.len());
-    for (index, file) in files.iter().enumerate().rev() {
-        let text = file.read().unwrap_or_default();
-        let may_have = format::scan(&text).map_or(0, |framed| wanted.may_have(&framed));
-        count += may_have;
-        if may_have > 0 || index + LIVE_FILES >= files.len() {
-            // The file before it shows what changed in between.
-            first = index.saturating_sub(1);
+/// Reads `files`, several at a time.
+fn thinned(files: &[LogFile], wanted: &Wanted<'_>) -> Vec<Thin> {
+    let threads = std::thread::available_parallelism().map_or(1, NonZero::get);
+    let share = files.len().div_ceil(threads).max(1);
+    std::thread::scope(|scope| {
+        let parts = files.chunks(share).map(|files| {
+            scope.spawn(move || files.iter().map(|file| thin_of(file, wanted)).collect())
+        });
+        let parts: Vec<ScopedJoinHandle<'_, Vec<Thin>>> = parts.collect();
+        let parts = parts.into_iter().filter_map(|part| part.join().ok());
+        parts.flatten().collect()
+    })
+}
+
+fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
+    let text = file.read().unwrap_or_else(|error| {
+        if error.kind() != io::ErrorKind::NotFound {
+            eprintln!("rosrescue: cannot read `{}`: {error}", file.path.display());
         }
-        if count >= most {
-            break;
-        }
-    }
-    match count < most {
-        // There are no more.
-        true if wanted.since == 0 && wanted.all => 0,
-        _ => first,
-    }
+        Vec::new()
+    });
+    wanted.thin(&text)
 }
 
 /// Adds the rescues of which there is a report, after the last entry before them.

@@ -36,7 +36,7 @@ fn robot(nodes: usize) -> Master {
 fn record(path: &Path, seconds: u64, nodes: usize) -> u64 {
     let mut master = robot(nodes);
     let mut store = Store::open(path).unwrap().0;
-    store.keep_log(32 << 20);
+    store.keep_log(48 << 20);
     let begin = |store: &mut Store, master: &Master| {
         let mut checkpoint = Checkpoint {
             seq: store.seq(),

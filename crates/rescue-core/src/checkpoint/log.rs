@@ -105,6 +105,11 @@ impl LogReader {
         }
     }
 
+    /// Forgets the state, so that the next file is not compared with the last one.
+    pub fn forget(&mut self) {
+        self.state = None;
+    }
+
     /// Takes the entries that were read since the last call.
     pub fn take(&mut self) -> Vec<Entry> {
         std::mem::take(&mut self.entries)
