@@ -133,6 +133,7 @@ pub async fn run(
         context.board.clone(),
         config.checkpoint.clone(),
         config.sync_interval,
+        config.log_bytes(),
     );
     let port = last.map(|uri| uri.port);
     let (checkpointer, begun) = tokio::join!(

@@ -2,4 +2,4 @@
 
 pub use checkpoint_store as store;
 pub(crate) use checkpoint_store::folder;
-pub use rescue_core::checkpoint::{compare, format, putback, session};
+pub use rescue_core::checkpoint::{compare, format, log, putback, session};

@@ -1,6 +1,6 @@
 //! The command line. Each option of `core` and `proxy` has an environment variable. Options of the other commands that
 //! confirm a change, such as `--yes`, have none: a variable left over from an earlier command must not confirm
-//! anything.
+//! anything. Nor have those that choose a time or a name in the log: the command would show another state than asked.
 
 pub(crate) mod cluster;
 mod files;
@@ -8,14 +8,15 @@ mod live;
 mod serve;
 mod service;
 mod tools;
+mod when;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
     cluster::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
     files::{
-        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, ReportArgs,
-        RestoreArgs, VerifyArgs,
+        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReadArgs,
+        ReportArgs, RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{
@@ -24,6 +25,7 @@ pub use self::{
     },
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
+    when::When,
 };
 
 /// Keeps a ROS 1 robot running when its master dies.
@@ -99,6 +101,14 @@ mod tests {
                 let serves = ["rosrescue", "core", "proxy"].contains(&command.get_name());
                 if !serves && !option.get_action().takes_values() {
                     assert_eq!(option.get_env(), None, "{name}: consent by environment");
+                    continue;
+                }
+                // They choose a time or a name in the log.
+                let of_one_run = [
+                    "at", "from", "to", "since", "until", "param", "topic", "service", "node",
+                ];
+                if of_one_run.contains(&name.as_str()) && option.get_env().is_none() {
+                    assert!(!serves, "{name}");
                     continue;
                 }
                 let variable = option

@@ -14,6 +14,11 @@ pub fn wall_time() -> f64 {
         .map_or(0.0, |since| since.as_secs_f64())
 }
 
+/// The present wall time in milliseconds since 1970; 0 if the clock shows an earlier time.
+pub fn wall_millis() -> u64 {
+    (wall_time() * 1e3) as u64
+}
+
 /// Wall time at `moment`, computed from what the clock shows now.
 pub fn wall_time_of(moment: Instant) -> f64 {
     (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)
@@ -47,6 +52,12 @@ pub fn wall_text(seconds: f64) -> String {
     let year = year_of_era + era * 400 + i64::from(month <= 2);
     let (hour, minute, second) = (time / 3_600, time / 60 % 60, time % 60);
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
+}
+
+/// Formats a wall time in milliseconds since 1970 in UTC, as in `2026-11-21T09:26:53.123Z`.
+pub fn wall_text_millis(millis: u64) -> String {
+    let text = wall_text((millis / 1_000) as f64);
+    format!("{}.{:03}Z", text.trim_end_matches('Z'), millis % 1_000)
 }
 
 /// Formats a time span for people, as in `2 h 5 min`.

@@ -11,6 +11,7 @@ mod history;
 mod inspect;
 mod install;
 mod live;
+mod log;
 mod man;
 mod params;
 mod report;
@@ -96,6 +97,7 @@ pub fn run(tool: &Tool) -> ExitCode {
         Tool::History(args) => Box::pin(history::run(args)),
         Tool::Inspect(args) => Box::pin(inspect::run(args)),
         Tool::Install(args) => Box::pin(install::run(args)),
+        Tool::Log(args) => Box::pin(log::run(args)),
         Tool::Man(args) => Box::pin(man::run(args)),
         Tool::Params(args) => Box::pin(params::run(args)),
         Tool::Report(args) => Box::pin(report::run(args)),

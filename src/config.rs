@@ -87,7 +87,7 @@ pub struct Config {
     /// Whether the user chose the checkpoint. Otherwise the checkpoint's name depends on the served port.
     pub checkpoint_is_given: bool,
     pub restore: RestorePolicy,
-    /// Maximum space for kept checkpoints, in bytes.
+    /// Maximum space for kept checkpoints and the log of changes, in bytes.
     pub history: u64,
     /// When the journal is synced to the disk.
     pub sync: SyncPolicy,
@@ -160,6 +160,16 @@ pub struct SupervisedConfig {
 }
 
 impl Config {
+    /// Maximum space for kept checkpoints, in bytes.
+    pub fn kept_bytes(&self) -> u64 {
+        self.history / 4
+    }
+
+    /// Maximum space for the log of changes, in bytes.
+    pub fn log_bytes(&self) -> u64 {
+        self.history - self.kept_bytes()
+    }
+
     /// The configuration of `rosrescue core` with `args` in the environment `env` on the computer
     /// `hostname`.
     pub fn core(

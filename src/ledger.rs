@@ -34,10 +34,11 @@ use self::{
 };
 use crate::{
     checkpoint::{
-        format::{Record, RecordContent, Session},
+        format::{Label, Origin, Record, RecordContent, Session},
         store::Store,
     },
     cli::SyncPolicy,
+    clock,
     cluster::{
         merge::Verdict,
         sharing::{Change, Sharing, Source},
@@ -189,7 +190,7 @@ impl Ledger {
     ) -> Result<Recorded, Superseded> {
         let batch: Vec<_> = batch
             .iter()
-            .map(|(call, reply)| (*call, *reply, &Source::Here))
+            .map(|(call, reply)| (*call, *reply, &Source::Here, Origin::Rosrescue))
             .collect();
         self.record_from(now, incarnation, &batch)
     }
@@ -200,7 +201,7 @@ impl Ledger {
         &self,
         now: Instant,
         incarnation: u64,
-        batch: &[(&Request, &Reply, &Source)],
+        batch: &[(&Request, &Reply, &Source, Origin)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
         if inner.session.incarnation != incarnation || inner.injecting || inner.is_elsewhere() {
@@ -208,19 +209,20 @@ impl Ledger {
         }
         let mut recorded = Recorded::default();
         let mut answered = Vec::with_capacity(batch.len());
-        for (call, reply, source) in batch {
+        for (call, reply, source, origin) in batch {
             let accepted = replay::accepted(&inner.mirror, call, reply);
             recorded.doubtful |= !accepted.certain;
-            answered.extend(accepted.calls.into_iter().map(|of| (of, *source)));
+            answered.extend(accepted.calls.into_iter().map(|of| (of, *source, *origin)));
         }
-        let writes = |(of, _): &(Answered<'_>, _)| {
+        let writes = |(of, ..): &(Answered<'_>, &Source, Origin)| {
             matches!(of.call.method(), Method::SetParam | Method::DeleteParam)
         };
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
         let mut sources = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
-        for (index, (answered, source)) in answered.into_iter().enumerate() {
+        let at = clock::wall_millis();
+        for (index, (answered, source, origin)) in answered.into_iter().enumerate() {
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
@@ -236,7 +238,8 @@ impl Ledger {
                 }
             }
             if answered.executed {
-                entries.push(RecordContent::call(answered.call.clone().into()));
+                let call = answered.call.clone().into();
+                entries.push(RecordContent::labelled(call, Label { at, origin }));
                 sources.push(source);
             }
         }
@@ -261,7 +264,9 @@ impl Ledger {
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
-        inner.append(vec![RecordContent::call(call.clone().into())]);
+        let (at, origin) = (clock::wall_millis(), Origin::Rosrescue);
+        let label = Label { at, origin };
+        inner.append(vec![RecordContent::labelled(call.clone().into(), label)]);
         drop(inner);
         self.write_soon();
     }

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use rosrescue::checkpoint::format::{self, Checkpoint, Record, RecordContent};
+use rosrescue::checkpoint::format::{self, Checkpoint, Label, Origin, Record, RecordContent};
 use rosrescue::checkpoint::session::{Rebuilt, rebuild};
 use rosrescue::checkpoint::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::master::Master;
@@ -14,7 +14,7 @@ use rosrescue::xmlrpc::Call;
 /// Separates the present file from its previous generation, which may follow it.
 const PREVIOUS: &[u8] = b"=== previous generation ===\n";
 
-const MAGIC: &str = "# rosrescue checkpoint v1 ";
+const MAGIC: &str = "# rosrescue checkpoint v2 ";
 const RECORD_START: &[u8] = b"- {seq: ";
 
 /// Loads the bytes as they are, and again with all check sums corrected, which a fuzzer could never do by
@@ -115,6 +115,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         snapshot,
         pending: pending.into_iter().map(Call::from).collect(),
         displaced,
+        follows: false,
     };
     store
         .begin(&expected)
@@ -124,6 +125,10 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         RecordContent::Call {
             call,
             pending: true,
+            label: Label {
+                at: 1_764_115_200_123,
+                origin: Origin::Rosrescue,
+            },
         },
         RecordContent::Session(expected.session.clone()),
     ];
@@ -236,6 +241,10 @@ impl Storage for Memory {
             length: length as u64,
             modified: 0,
         })
+    }
+
+    fn length_at(&self, path: &Path) -> io::Result<u64> {
+        Ok(self.file(path)?.lock().unwrap().len() as u64)
     }
 
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {

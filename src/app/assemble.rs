@@ -143,7 +143,7 @@ pub(super) async fn assemble(
         supervision,
         probing: config.probing,
         probe_timeout: config.probe_timeout,
-        history: config.history,
+        history: config.kept_bytes(),
         uri,
         checkpoint: config.checkpoint.clone(),
         node_timeout: config.node_timeout,

@@ -46,7 +46,10 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         let path = &own.checkpoint;
         earlier::take_over(&own);
         let found = Folder::look(path);
-        let opened = Store::open(path);
+        let mut opened = Store::open(path);
+        if let Ok((store, _)) = &mut opened {
+            store.keep_log(own.log_bytes());
+        }
         found.report(opened.is_ok());
         opened.map_err(|error| (store::read(path).ok().flatten().map(Box::new), error))
     });
@@ -125,7 +128,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
     }
     if let Some(store) = &store {
-        let (path, most) = (store.path().to_owned(), config.history);
+        let (path, most) = (store.path().to_owned(), config.kept_bytes());
         crate::task::spawn_blocking(move || {
             if let Err(error) = history::trim(&path, most) {
                 tracing::debug!(%error, "cannot list the kept checkpoints");

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{HideArgs, OutputArgs, TargetArgs};
+use super::{HideArgs, OutputArgs, TargetArgs, When};
 use crate::hide::Hide;
 
 /// Where the checkpoints are.
@@ -33,6 +33,14 @@ pub struct InspectArgs {
     /// Checkpoint: a path, or a name or number from `rosrescue history` [default: the one in use]
     #[arg(value_name = "FILE")]
     pub file: Option<PathBuf>,
+    /// Show the state at this time instead, from the log of changes. `rosrescue log --help` explains times
+    #[arg(
+        long,
+        value_name = "TIME",
+        conflicts_with = "file",
+        allow_hyphen_values = true
+    )]
+    pub at: Option<When>,
     #[command(flatten)]
     pub read: ReadArgs,
     #[command(flatten)]
@@ -57,11 +65,19 @@ pub struct VerifyArgs {
 #[derive(Args, Clone, Debug)]
 pub struct DiffArgs {
     /// Checkpoint: a path, or a name or number from `rosrescue history`
-    #[arg(value_name = "A")]
-    pub a: PathBuf,
+    #[arg(value_name = "A", required_unless_present = "from")]
+    pub a: Option<PathBuf>,
     /// Checkpoint to compare with
-    #[arg(value_name = "B", required_unless_present = "live")]
+    #[arg(value_name = "B", required_unless_present_any = ["live", "from"])]
     pub b: Option<PathBuf>,
+    /// Compare the states at two times instead, from the log of changes. `rosrescue log --help` explains times
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    #[arg(conflicts_with_all = ["a", "b", "live"])]
+    pub from: Option<When>,
+    /// The second time
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    #[arg(requires = "from", default_value = "now")]
+    pub to: When,
     /// Compare with the running master, on any computer. Subscriptions to parameters are left out, because
     /// a master does not list them
     #[arg(long, conflicts_with = "b")]
@@ -85,6 +101,49 @@ pub struct HistoryArgs {
     pub output: OutputArgs,
 }
 
+/// Options of `rosrescue log`.
+#[derive(Args, Clone, Debug)]
+pub struct LogArgs {
+    /// Only changes of this parameter, or of parameters in this namespace. May be given several times
+    #[arg(long, value_name = "NAME")]
+    pub param: Vec<String>,
+    /// Only changes of this topic. May be given several times
+    #[arg(long, value_name = "NAME")]
+    pub topic: Vec<String>,
+    /// Only changes of this service. May be given several times
+    #[arg(long, value_name = "NAME")]
+    pub service: Vec<String>,
+    /// Only changes by or of this node. May be given several times
+    #[arg(long, value_name = "NAME")]
+    pub node: Vec<String>,
+    /// Only changes at this time or later, such as 14:03, 2026-11-26T14:03:05, -5min, -2h or -3d. Times are in UTC;
+    /// without a date, 14:03 is the last one [default: all]
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub since: Option<When>,
+    /// Only changes at this time or earlier
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub until: Option<When>,
+    /// Show this many of the newest changes; 0 for all
+    #[arg(
+        short = 'n',
+        long,
+        env = "ROSRESCUE_LOG_LINES",
+        value_name = "COUNT",
+        default_value_t = 1000
+    )]
+    pub lines: usize,
+    /// Continue with new changes until Ctrl-C
+    #[arg(short, long)]
+    pub follow: bool,
+    /// Print one JSON object per line
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub place: CheckpointArgs,
+    #[command(flatten)]
+    pub hide: HideArgs,
+}
+
 /// Options of `rosrescue report`.
 #[derive(Args, Clone, Debug)]
 pub struct ReportArgs {
@@ -101,8 +160,19 @@ pub struct ReportArgs {
 #[derive(Args, Clone, Debug)]
 pub struct RestoreArgs {
     /// Checkpoint: a path, or a name or number from `rosrescue history`
-    #[arg(value_name = "FILE")]
-    pub file: PathBuf,
+    #[arg(value_name = "FILE", required_unless_present = "at")]
+    pub file: Option<PathBuf>,
+    /// Use the state at this time instead, from the log of changes. `rosrescue log --help` explains times
+    #[arg(
+        long,
+        value_name = "TIME",
+        conflicts_with = "file",
+        allow_hyphen_values = true
+    )]
+    pub at: Option<When>,
+    /// Set only this parameter, or the parameters in this namespace. May be given several times
+    #[arg(long, value_name = "NAME")]
+    pub param: Vec<String>,
     /// Only show the changes
     #[arg(long)]
     pub plan: bool,
@@ -126,8 +196,16 @@ pub struct RestoreArgs {
 #[derive(Args, Clone, Debug)]
 pub struct ParamsArgs {
     /// Checkpoint: a path, or a name or number from `rosrescue history`
-    #[arg(value_name = "FILE")]
-    pub file: PathBuf,
+    #[arg(value_name = "FILE", required_unless_present = "at")]
+    pub file: Option<PathBuf>,
+    /// Use the state at this time instead, from the log of changes. `rosrescue log --help` explains times
+    #[arg(
+        long,
+        value_name = "TIME",
+        conflicts_with = "file",
+        allow_hyphen_values = true
+    )]
+    pub at: Option<When>,
     /// Leave out parameters whose full name matches this regular expression. Case does not matter [default: none]
     #[arg(long, env = "ROSRESCUE_PARAMS_HIDE_VALUES", value_name = "REGEX")]
     pub hide_values: Option<Hide>,

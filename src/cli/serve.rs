@@ -90,12 +90,12 @@ pub struct CommonArgs {
     /// Whether a start restores the checkpoint
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
     pub restore: RestoreChoice,
-    /// Maximum space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
+    /// Maximum space for the past, in MiB. A quarter is for the last 5 sessions and 20 rescues, the rest for the log
     #[arg(
         long,
         env = "ROSRESCUE_HISTORY",
         value_name = "MIB",
-        default_value_t = 16,
+        default_value_t = 64,
         hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(..=1 << 20))]

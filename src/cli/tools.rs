@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 
 use super::{
-    ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, ReportArgs,
+    ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReportArgs,
     RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
@@ -18,7 +18,7 @@ pub enum Tool {
     Check(CheckArgs),
     /// Print a completion script for a shell
     Completions(CompletionsArgs),
-    /// Show how two checkpoints differ, or a checkpoint and the running master. Exit status 1 if they differ
+    /// Show how two checkpoints differ, two times, or a checkpoint and the running master. Exit status 1 if they differ
     Diff(DiffArgs),
     /// Test the robot: kill the master on purpose, and report what calls, topics and nodes noticed
     Drill(DrillArgs),
@@ -30,13 +30,15 @@ pub enum Tool {
     Inspect(InspectArgs),
     /// Install rosrescue as a systemd service that starts at boot
     Install(InstallArgs),
+    /// Show what changed, when, and who did it
+    Log(LogArgs),
     /// Print the manual page, or write all manual pages into a folder
     Man(ManArgs),
     /// Print the parameters of a checkpoint, for `rosparam load`
     Params(ParamsArgs),
     /// Show the report of a rescue: its cause, duration and result
     Report(ReportArgs),
-    /// Set the parameters of the running robot to those of a checkpoint
+    /// Set the parameters of the running robot to those of a checkpoint or of an earlier time
     Restore(RestoreArgs),
     /// Show the status of the running rosrescue
     Status(StatusArgs),

@@ -11,13 +11,17 @@ use crate::{
 };
 
 pub(super) async fn run(args: &DiffArgs) -> Result<Exit, CommandFailure> {
-    let a = files::read(&args.a, &args.read).await?;
-    let (b, state, names) = match &args.b {
-        Some(b) => {
+    let a = files::read_either(args.a.as_deref(), args.from, &args.read).await?;
+    let (b, state, names) = match (&args.b, args.from) {
+        (Some(b), _) => {
             let b = files::read(b, &args.read).await?;
             (b.path.display().to_string(), b.state, ["A", "B"])
         }
-        None => {
+        (None, Some(_)) => {
+            let b = files::read_at(args.to, &args.read).await?;
+            (b.moment(), b.state, ["A", "B"])
+        }
+        (None, None) => {
             let mut live = Live::connect(&Running::find(&args.target)?).await?;
             let state = live.state(&a.state).await?;
             (live.uri, state, ["the file", "the running master"])
@@ -30,7 +34,10 @@ pub(super) async fn run(args: &DiffArgs) -> Result<Exit, CommandFailure> {
     });
     let diff = Diff {
         names,
-        a: a.path.display().to_string(),
+        a: match args.from {
+            Some(_) => a.moment(),
+            None => a.path.display().to_string(),
+        },
         b,
         differences: differences.collect(),
     };

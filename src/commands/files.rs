@@ -14,11 +14,11 @@ use super::{
 use crate::{
     checkpoint::{
         format::{RecordContent, Session},
-        session,
-        store::{self, OpenError, history},
+        log, session,
+        store::{self, OpenError, history, log::files},
     },
-    cli::{CheckpointArgs, ReadArgs, TargetArgs},
-    config,
+    cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
+    clock, config,
     master::{Master, Request},
     ros_env::DEFAULT_MASTER_PORT,
 };
@@ -30,8 +30,8 @@ const LARGE: u64 = 16 << 20;
 pub(super) struct Opened {
     pub(super) path: PathBuf,
     pub(super) bytes: u64,
-    /// Wall time of the last change.
-    pub(super) written: i64,
+    /// Wall time of the last change, in seconds since 1970.
+    pub(super) written: f64,
     /// Number of the last record that the snapshot includes. `None` if there is no complete snapshot.
     pub(super) snapshot_seq: Option<u64>,
     /// Methods of the calls in the journal; `session` for a change of the session.
@@ -43,6 +43,14 @@ pub(super) struct Opened {
     pub(super) exact: bool,
     pub(super) torn: Option<String>,
     pub(super) damage: Vec<String>,
+}
+
+impl Opened {
+    /// Describes a state of the log by its time and place.
+    pub(super) fn moment(&self) -> String {
+        let (time, path) = (clock::wall_text(self.written), self.path.display());
+        format!("the state of {time}, from {path}")
+    }
 }
 
 /// The path of the checkpoint in use, with links resolved.
@@ -166,15 +174,11 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
     let mut damage = loaded.damage;
     let rebuilt = session::rebuild(loaded.checkpoint, loaded.records);
     let exact = loaded.exact && rebuilt.trouble.is_none();
-    damage.extend(
-        rebuilt
-            .trouble
-            .map(|why| format!("the snapshot is not a valid master state: {why}")),
-    );
+    damage.extend(rebuilt.trouble.map(not_valid));
     Ok(Opened {
         path: path.to_owned(),
         bytes: metadata.len(),
-        written: metadata.mtime(),
+        written: metadata.mtime() as f64,
         snapshot_seq,
         journal,
         session: rebuilt.session.unwrap_or_default(),
@@ -184,6 +188,99 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
         torn: loaded.torn,
         damage,
     })
+}
+
+/// The state of the checkpoint in use at an earlier time, rebuilt from the log of changes. `now` stands for its end,
+/// whatever the clock shows.
+pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, CommandFailure> {
+    let path = present(&args.place).await;
+    let time = match at {
+        When::Now => u64::MAX,
+        at => at.millis(clock::wall_millis()),
+    };
+    let shown = path.display();
+    let failed = |error: io::Error| {
+        CommandFailure::Usage(format!("cannot read the log beside `{shown}`: {error}"))
+    };
+    let mut unread = Vec::new();
+    for file in files(&path).map_err(failed)?.into_iter().rev() {
+        let text = match file.read() {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            Err(error) => {
+                unread.push(format!("cannot read `{}`: {error}", file.path.display()));
+                continue;
+            }
+        };
+        match log::moment(&text, time) {
+            Ok(Some(moment)) => return opened_at(file.path, &text, moment, unread, args),
+            Ok(None) => {}
+            Err(why) => unread.push(format!("cannot use `{}`: {why}", file.path.display())),
+        }
+    }
+    for sentence in unread {
+        eprintln!("rosrescue: {sentence}");
+    }
+    let time = clock::wall_text_millis(time.min(clock::wall_millis()));
+    Err(CommandFailure::Usage(format!(
+        "`{shown}` and the log beside it have no state of {time} or earlier. `rosrescue log -n 0` shows the oldest one"
+    )))
+}
+
+fn opened_at(
+    path: PathBuf,
+    text: &[u8],
+    moment: log::Moment,
+    unread: Vec<String>,
+    args: &ReadArgs,
+) -> Result<Opened, CommandFailure> {
+    let rebuilt = moment.rebuilt;
+    let mut damage = unread;
+    if !moment.exact {
+        damage.push(format!(
+            "`{}` lacks records before that time",
+            path.display()
+        ));
+    }
+    damage.extend(rebuilt.trouble.map(not_valid));
+    if let Some(first) = damage.first().filter(|_| !args.damaged) {
+        return Err(CommandFailure::Usage(format!(
+            "the log is damaged: {first}. --damaged uses the readable part"
+        )));
+    }
+    for sentence in &damage {
+        eprintln!("rosrescue: {sentence}");
+    }
+    Ok(Opened {
+        path,
+        bytes: text.len() as u64,
+        written: moment.at as f64 / 1e3,
+        snapshot_seq: Some(moment.snapshot_seq),
+        journal: moment.journal,
+        session: rebuilt.session.unwrap_or_default(),
+        state: rebuilt.mirror,
+        pending: rebuilt.pending,
+        exact: damage.is_empty(),
+        torn: None,
+        damage,
+    })
+}
+
+fn not_valid(why: String) -> String {
+    format!("the snapshot is not a valid master state: {why}")
+}
+
+/// Reads the state at a time, if there is one, or else the checkpoint that `file` stands for.
+pub(super) async fn read_either(
+    file: Option<&Path>,
+    at: Option<When>,
+    args: &ReadArgs,
+) -> Result<Opened, CommandFailure> {
+    match (file, at) {
+        (_, Some(at)) => read_at(at, args).await,
+        (Some(file), None) => read(file, args).await,
+        (None, None) => read(&present(&args.place).await, args).await,
+    }
 }
 
 /// Reads the checkpoint that `file` stands for. Refuses a damaged one without `--damaged`.

@@ -19,15 +19,7 @@ use crate::{
 };
 
 pub(super) async fn run(args: &InspectArgs) -> Result<Exit, CommandFailure> {
-    let present;
-    let file = match &args.file {
-        Some(file) => file,
-        None => {
-            present = files::present(&args.read.place).await;
-            &present
-        }
-    };
-    let opened = files::read(file, &args.read).await?;
+    let opened = files::read_either(args.file.as_deref(), args.at, &args.read).await?;
     print(
         &Inspected::new(&opened, &args.hide.hide_values),
         &args.output,
@@ -124,7 +116,7 @@ impl Inspected {
             exact: opened.exact,
             damage: opened.damage.clone(),
             torn: opened.torn.clone(),
-            written: clock::wall_text(opened.written as f64),
+            written: clock::wall_text(opened.written),
             session: Session {
                 id: session.id.clone(),
                 started: session.started.clone(),

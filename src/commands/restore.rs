@@ -17,7 +17,7 @@ use crate::{
     },
     cli::RestoreArgs,
     hide::Hide,
-    master::{CALLER_ID, Method, Request},
+    master::{CALLER_ID, Master, Method, Request},
     xmlrpc::Value,
 };
 
@@ -27,12 +27,20 @@ const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 
 pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
-    let file = files::read(&args.file, &args.read).await?;
+    let file = files::read_either(args.file.as_deref(), args.at, &args.read).await?;
     let mut live = Live::connect(&Running::find(&args.target)?).await?;
     let now = live.state(&file.state).await?;
-    let params = ParamChanges::between(file.state.params(), now.params(), args.exact);
+    let between = |now: &Master| {
+        let mut found = ParamChanges::between(file.state.params(), now.params(), args.exact);
+        found.retain(&args.param);
+        found
+    };
+    let params = between(&now);
     let mut restored = Restored {
-        file: file.path.display().to_string(),
+        file: match args.at {
+            Some(_) => file.moment(),
+            None => file.path.display().to_string(),
+        },
         master: live.uri.clone(),
         plan: Plan::of(&params, &args.hide.hide_values),
         done: false,
@@ -51,7 +59,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
         // If the master refused calls, its messages explain what differs.
         if restored.failed.is_empty() {
             let now = live.state(&file.state).await?;
-            let left = ParamChanges::between(file.state.params(), now.params(), args.exact);
+            let left = between(&now);
             let changed = left
                 .set
                 .iter()

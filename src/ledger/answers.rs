@@ -4,7 +4,8 @@ use std::{sync::Arc, time::Instant};
 
 use super::{Ledger, Mark, delivery::Delivery};
 use crate::{
-    checkpoint::format::RecordContent,
+    checkpoint::format::{Label, Origin, RecordContent},
+    clock,
     cluster::sharing::Source,
     master::{Kind, Method, Request, is_success},
     order::Concern,
@@ -113,7 +114,8 @@ impl Ledger {
     /// or if the answers to the reads in a multicall are too large. Then the call has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
-        let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
+        let (reply, mark, _) =
+            self.answer_standing_in(now, call, &concern, &Source::Here, Origin::Rosrescue)?;
         Some((reply, mark))
     }
 
@@ -126,8 +128,9 @@ impl Ledger {
         call: &Request,
         concern: &Concern,
         source: &Source,
+        origin: Origin,
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
-        let (reply, mark, number) = self.answer_standing_in(now, call, concern, source)?;
+        let (reply, mark, number) = self.answer_standing_in(now, call, concern, source, origin)?;
         let delivery = number.map(|number| Delivery::new(self, number));
         Some((reply, mark, delivery))
     }
@@ -138,6 +141,7 @@ impl Ledger {
         call: &Request,
         concern: &Concern,
         source: &Source,
+        origin: Origin,
     ) -> Option<(Reply, Mark, Option<u64>)> {
         let mut inner = self.lock();
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
@@ -184,9 +188,11 @@ impl Ledger {
         // The new version outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
+        let at = clock::wall_millis();
         let entries = writes.iter().map(|&call| RecordContent::Call {
             call: call.clone().into(),
             pending: true,
+            label: Label { at, origin },
         });
         let entries: Vec<_> = entries.collect();
         let sources = vec![source; entries.len()];

@@ -40,6 +40,8 @@ pub(crate) struct Checkpointer {
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
+    /// Maximum size of the log of changes, in bytes.
+    log_bytes: u64,
     /// The number of the journal's last record when the file was last checked.
     seq: u64,
     recorded_at: Instant,
@@ -50,12 +52,14 @@ pub(crate) struct Checkpointer {
 impl Checkpointer {
     /// Writes the first complete checkpoint of `ledger` at `path`. Before that, no write may be answered, because no
     /// journal would have it. Later the file is synced every `sync_interval`, unless the ledger's sync policy says
-    /// otherwise. Waits for the disk for [`DISK_PATIENCE`] at most.
+    /// otherwise. A log of changes with up to `log_bytes` is kept beside it. Waits for the disk for [`DISK_PATIENCE`] at
+    /// most.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,
         path: PathBuf,
         sync_interval: Duration,
+        log_bytes: u64,
     ) -> Self {
         let opened = ledger.seen_store().is_some();
         // A checkpoint that could not be opened was already logged at the start.
@@ -75,6 +79,7 @@ impl Checkpointer {
             ledger,
             path,
             sync_interval,
+            log_bytes,
         };
         if timeout(DISK_PATIENCE, checkpointer.compact())
             .await
@@ -220,8 +225,19 @@ impl Checkpointer {
             Some((seq, Err(error))) => (seq, Some(Err(error))),
             Some((seq, Ok(job))) => match crate::task::spawn_blocking(move || job.run()).await {
                 Ok(done) => {
-                    let finished = self.on_store(|store| store.finish_compaction(done));
-                    (seq, finished.await)
+                    let finished = self.on_store(|store| {
+                        let finished = store.finish_compaction(done);
+                        (finished, store.take_log_trouble())
+                    });
+                    let (finished, trouble) = finished.await.unzip();
+                    if let Some(reason) = trouble.flatten() {
+                        rarely!(
+                            warn,
+                            reason,
+                            "the log of changes has a gap; the state itself is recorded as usual"
+                        );
+                    }
+                    (seq, finished)
                 }
                 Err(_) => return,
             },
@@ -251,7 +267,8 @@ impl Checkpointer {
     async fn open_again(&self) {
         let path = self.path.clone();
         let opened = crate::task::spawn_blocking(move || Store::open_over(&path)).await;
-        if let Ok(Ok(store)) = opened {
+        if let Ok(Ok(mut store)) = opened {
+            store.keep_log(self.log_bytes);
             self.ledger.set_store(store);
         }
     }

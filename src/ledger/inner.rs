@@ -15,6 +15,7 @@ use super::{
 };
 use crate::{
     checkpoint::format::{Checkpoint, RecordContent, Session},
+    clock,
     cluster::sharing::Source,
     health::port_of,
     master::{Master, Request},
@@ -174,6 +175,7 @@ impl Inner {
                 true => 0,
                 false => self.cluster_seq(),
             };
+            self.session.at = clock::wall_millis();
             let entry = RecordContent::Session(self.session.clone());
             self.append(vec![entry]);
         }
@@ -233,9 +235,9 @@ impl Inner {
             return;
         };
         for (index, entry) in entries.iter().enumerate() {
-            if let RecordContent::Call { call, .. } = entry {
+            if let RecordContent::Call { call, label, .. } = entry {
                 let source = sources.get(index).copied().unwrap_or(&Source::Here);
-                sharing.record(&Request::from(call.clone()), source);
+                sharing.record_labelled(&Request::from(call.clone()), source, *label);
             }
         }
     }
@@ -261,6 +263,7 @@ impl Inner {
             seq: self.seq(),
             session: Session {
                 cluster_seq: self.cluster_seq(),
+                at: clock::wall_millis(),
                 ..self.session.clone()
             },
             pending: self
@@ -272,6 +275,7 @@ impl Inner {
                 .collect(),
             snapshot: self.mirror.snapshot(),
             displaced: self.activity.displaced_lately(Instant::now()),
+            follows: !self.whole.is_due(),
         }
     }
 }

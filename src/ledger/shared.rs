@@ -130,7 +130,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        checkpoint::format::{Record, RecordContent, Session},
+        checkpoint::format::{Origin, Record, RecordContent, Session},
         cli::SyncPolicy,
         cluster::{
             merge::Verdict,
@@ -321,7 +321,9 @@ mod tests {
         let keys = ["/a", "/b", "/c", "/d", "/e"];
         let calls: Vec<_> = keys.iter().map(|key| set_of(key, 1)).collect();
         let batch = calls.iter().zip(&sources);
-        let batch: Vec<_> = batch.map(|(call, source)| (call, &reply, source)).collect();
+        let batch: Vec<_> = batch
+            .map(|(call, source)| (call, &reply, source, Origin::Unknown))
+            .collect();
         ledger
             .record_from(Instant::now(), ledger.incarnation(), &batch)
             .unwrap();

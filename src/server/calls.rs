@@ -24,6 +24,7 @@ use super::{
     },
 };
 use crate::{
+    checkpoint::format::Origin,
     cli::Reads,
     cluster::sharing::Source,
     gate::{self, State},
@@ -107,6 +108,21 @@ pub struct Calls {
     pub(crate) others: Option<Others>,
 }
 
+/// Where a call comes from.
+#[derive(Clone)]
+pub(super) struct Incoming {
+    source: Source,
+    origin: Origin,
+}
+
+impl Incoming {
+    /// A call from `source`, which this computer has got from `peer`.
+    pub(super) fn of(source: Source, peer: SocketAddr) -> Self {
+        let origin = Origin::At(peer.ip().to_canonical());
+        Self { source, origin }
+    }
+}
+
 /// An answer of the mirror, and its encoding.
 pub struct LargeAnswer {
     value: Value,
@@ -142,8 +158,11 @@ impl Calls {
             return Ok(refusal);
         }
         match &self.others {
-            None => Ok(self.answer_here(head, body, call, Source::Here).await?),
-            Some(others) => others.answer(self, head, body, call).await,
+            None => {
+                let incoming = Incoming::of(Source::Here, peer);
+                Ok(self.answer_here(head, body, call, incoming).await?)
+            }
+            Some(others) => others.answer(self, peer, head, body, call).await,
         }
     }
 
@@ -154,7 +173,7 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Request>,
-        source: Source,
+        incoming: Incoming,
     ) -> Result<HttpReply, Unanswered> {
         let call = match self.understood(&head, &body, call) {
             Ok(call) => call,
@@ -174,7 +193,7 @@ impl Calls {
                 self.read(head, body, call.as_ref()).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-                self.write(head, body, call, source).await
+                self.write(head, body, call, incoming).await
             }
         }
     }
@@ -396,14 +415,14 @@ impl Calls {
         head: Head,
         body: Bytes,
         mut call: Option<Request>,
-        source: Source,
+        incoming: Incoming,
     ) -> Result<HttpReply, Unanswered> {
         if let Some(parts) = Parts::of(&mut call, body.len()) {
             drop(body);
-            return self.write_parts(&head, parts, source).await;
+            return self.write_parts(&head, parts, incoming).await;
         }
         let call = call.map(Arc::new);
-        let (answer, delivery) = self.queue(head, body, call.clone(), source).await?;
+        let (answer, delivery) = self.queue(head, body, call.clone(), incoming).await?;
         self.http(call.as_deref(), answer, delivery)
     }
 
@@ -413,7 +432,7 @@ impl Calls {
         &self,
         head: &Head,
         parts: Parts,
-        source: Source,
+        incoming: Incoming,
     ) -> Result<HttpReply, Unanswered> {
         let mut whole = ListWriter::answer();
         for part in parts {
@@ -426,7 +445,7 @@ impl Calls {
                     head.clone(),
                     body.into(),
                     Some(part.clone()),
-                    source.clone(),
+                    incoming.clone(),
                 )
                 .await?;
             let reply = match &answer {
@@ -468,7 +487,7 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Arc<Request>>,
-        source: Source,
+        incoming: Incoming,
     ) -> Result<AnswerAndDelivery, Unanswered> {
         if self.gate.state() == State::Injecting
             && let Some((reply, delivery)) = self.answer_if_unchanged(call.as_deref()).await
@@ -476,7 +495,7 @@ impl Calls {
             return Ok((CallAnswer::Made(reply), delivery));
         }
         let (mut item, mut answered) = Item::new(Some((head, body)), call.clone());
-        item.source = source;
+        (item.source, item.origin) = (incoming.source, incoming.origin);
         self.write_queue.submit(item).await;
         let call = call.as_deref();
         let mut gate = self.gate.clone();

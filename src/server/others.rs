@@ -2,6 +2,7 @@
 
 use std::{
     collections::VecDeque,
+    net::SocketAddr,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -18,7 +19,7 @@ mod forwarded;
 
 pub(crate) use self::forwarded::Forwarded;
 use super::{
-    calls::{Calls, Closed, NOT_IN_TIME, PATIENCE, Unanswered},
+    calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
     replies::{HttpReply, UntilWritten, forwarded, text, xml},
 };
 use crate::{
@@ -174,12 +175,15 @@ struct Call<'a> {
     body: Bytes,
     call: Option<Request>,
     kind: Kind,
+    /// Who made the call, or the computer that forwards it.
+    from: SocketAddr,
 }
 
 impl Others {
     pub(super) async fn answer(
         &self,
         calls: &Calls,
+        peer: SocketAddr,
         mut head: Head,
         body: Bytes,
         call: Option<Request>,
@@ -210,6 +214,7 @@ impl Others {
             body,
             call,
             kind,
+            from: peer,
         };
         let mut standing = self.standing.clone();
         self.conduct(&on_its_way, &mut standing, asked_term).await
@@ -263,12 +268,13 @@ impl Others {
                         Some(_) => Source::Forwarded,
                         None => Source::Here,
                     };
+                    let incoming = Incoming::of(source, call.from);
                     let answered = tokio::select! {
                         biased;
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
                         // be cut off, and may become the next leader.
                         _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
-                        answered = calls.answer_here(head, body, request, source) => answered,
+                        answered = calls.answer_here(head, body, request, incoming) => answered,
                     };
                     match answered {
                         Err(Unanswered::Elsewhere) => None,

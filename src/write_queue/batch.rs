@@ -7,6 +7,7 @@ use tokio::sync::oneshot;
 
 use super::merge::Merge;
 use crate::{
+    checkpoint::format::Origin,
     cluster::sharing::Source,
     ledger::{activity::LastCalls, delivery::Delivery},
     master::{Entry, Kind, Method, Request, entry_reply},
@@ -50,6 +51,8 @@ pub(crate) struct Item {
     /// Whether nodes whose port the call takes have been unregistered.
     pub way_made: bool,
     pub source: Source,
+    /// Who made the call.
+    pub origin: Origin,
     /// Set for the writes of a computer that was cut off.
     pub(super) merge: Option<Merge>,
 }
@@ -92,6 +95,7 @@ impl Item {
             condition: None,
             way_made: false,
             source: Source::Here,
+            origin: Origin::Rosrescue,
             merge: None,
         };
         (item, answered)

@@ -429,7 +429,9 @@ impl Drain {
         let answered: Vec<_> = items
             .iter()
             .zip(&replies)
-            .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply, &item.source)))
+            .filter_map(|(item, reply)| {
+                Some((item.call.as_deref()?, reply, &item.source, item.origin))
+            })
             .collect();
         let registered = answered.iter().any(|(call, ..)| registers(call));
         let Ok(recorded) = self
@@ -626,7 +628,10 @@ impl Answers {
     /// Answers `item`, or returns it if only a master can answer it.
     fn add(&mut self, ledger: &Arc<Ledger>, mut item: Item) -> Option<Item> {
         let call = item.call.as_deref().filter(|call| call.is_answerable());
-        let answer = |call| ledger.stand_in_for(Instant::now(), call, item.concern(), &item.source);
+        let answer = |call| {
+            let (concern, source, origin) = (item.concern(), &item.source, item.origin);
+            ledger.stand_in_for(Instant::now(), call, concern, source, origin)
+        };
         let Some((reply, mark, delivery)) = call.and_then(answer) else {
             return Some(item);
         };

@@ -7,6 +7,7 @@ use tokio::sync::oneshot;
 
 use super::batch::{self, AnswerAndDelivery, Item};
 use crate::{
+    checkpoint::format::Origin,
     cluster::{
         merge::{
             Verdict,
@@ -51,6 +52,7 @@ pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Jud
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
     item.source = Source::Merge(ask.id.clone());
+    item.origin = Origin::Unknown;
     set_call(&mut item, multicall(&ask.calls));
     item.merge = Some(Merge {
         ask,

@@ -436,9 +436,9 @@ impl World {
     fn answer_item(&mut self, mut item: Item) {
         let call = item.call.clone().unwrap();
         let now = self.instant();
-        let answer = self
-            .ledger
-            .stand_in_for(now, &call, item.concern(), &item.source);
+        let answer =
+            self.ledger
+                .stand_in_for(now, &call, item.concern(), &item.source, item.origin);
         let (reply, _, delivery) = answer.unwrap();
         item.delivery = delivery;
         item.reply(CallAnswer::Made(reply));

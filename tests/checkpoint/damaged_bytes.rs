@@ -1,11 +1,11 @@
 //! Reading a damaged checkpoint returns what was written, or less, but never anything else.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use indexmap::IndexMap;
 use rosrescue::checkpoint::format::{
-    Checkpoint, Decoded, FormatError, Record, RecordContent, Session, SnapshotError, Stamp, decode,
-    encode_checkpoint, encode_record,
+    Checkpoint, Decoded, FormatError, Label, Origin, Record, RecordContent, Session, SnapshotError,
+    Stamp, decode, encode_checkpoint, encode_record,
 };
 use rosrescue::master::{Snapshot, SnapshotNode};
 use rosrescue::xmlrpc::{Call, Struct, Value};
@@ -32,6 +32,7 @@ fn checkpoint(seq: u64) -> Checkpoint {
         },
         pending: Vec::new(),
         displaced: Vec::new(),
+        follows: false,
     }
 }
 
@@ -203,12 +204,12 @@ fn files_of_other_programs_are_recognised() {
 
 #[test]
 fn a_newer_format_is_recognised() {
-    let line = b"# rosrescue checkpoint v2 whatever=this says header=";
+    let line = b"# rosrescue checkpoint v3 whatever=this says header=";
     let mut bytes = line.to_vec();
     bytes.extend(format!("{:08x}\n- newer: true\n", crc32c::crc32c(line)).bytes());
     assert_eq!(
         decode(&bytes).unwrap_err(),
-        FormatError::NewerVersion { version: 2 }
+        FormatError::NewerVersion { version: 3 }
     );
     // With a wrong check sum it counts as a damaged checkpoint.
     bytes[line.len()] ^= 1;
@@ -216,6 +217,11 @@ fn a_newer_format_is_recognised() {
         decode(&bytes).unwrap().checkpoint.unwrap_err(),
         SnapshotError::Header
     );
+}
+
+fn label(origin: Origin) -> Label {
+    let at = 1_764_115_200_123;
+    Label { at, origin }
 }
 
 /// A file whose session and records also tell which writes have not reached the master yet.
@@ -231,13 +237,18 @@ fn file_with_pending_writes() -> Vec<u8> {
     let encoded = encode_checkpoint(&checkpoint, 1).unwrap();
     let mut session = checkpoint.session;
     session.delivered = 8;
+    session.at = label(Origin::Unknown).at;
     let entries = [
         RecordContent::Call {
             call: pending(8),
             pending: true,
+            label: label(Origin::At([10, 0, 0, 5].into())),
         },
         RecordContent::Session(session),
-        record(10).entry,
+        RecordContent::labelled(pending(10), label(Origin::Rosrescue)),
+        RecordContent::labelled(pending(11), label(Origin::At([127, 0, 0, 1].into()))),
+        RecordContent::labelled(pending(12), label(Origin::Unknown)),
+        record(13).entry,
     ];
     let mut bytes = encoded.bytes;
     for (seq, entry) in (8..).zip(entries) {
@@ -246,16 +257,32 @@ fn file_with_pending_writes() -> Vec<u8> {
     bytes
 }
 
-/// Files of earlier versions stay readable, and files are still written exactly like those.
+fn golden(name: &str) -> PathBuf {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    folder.join(name)
+}
+
+#[test]
+fn files_of_format_1_are_read() {
+    let names = ["checkpoint-v1.yaml", "checkpoint-v1-pending.yaml"];
+    for (name, last) in names.into_iter().zip([9, 10]) {
+        let decoded = decode(&std::fs::read(golden(name)).unwrap()).unwrap();
+        assert!(decoded.damaged.is_empty() && decoded.torn.is_none());
+        let expected = checkpoint(7).snapshot;
+        assert_eq!(decoded.checkpoint.unwrap().snapshot, expected, "{name}");
+        assert_eq!(decoded.records.last(), Some(&record(last)), "{name}");
+    }
+}
+
+/// Files of this format stay readable, and files are still written exactly like those.
 #[test]
 fn golden_files_are_read_and_written_unchanged() {
-    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let files = [
-        ("checkpoint-v1.yaml", file(2, 1).0, 2),
-        ("checkpoint-v1-pending.yaml", file_with_pending_writes(), 3),
+        ("checkpoint-v2.yaml", file(2, 1).0, 2),
+        ("checkpoint-v2-pending.yaml", file_with_pending_writes(), 6),
     ];
     for (name, bytes, records) in files {
-        let path = golden.join(name);
+        let path = golden(name);
         if std::env::var_os("BLESS").is_some() {
             std::fs::write(&path, &bytes).unwrap();
         }

@@ -11,6 +11,7 @@
 mod damaged_bytes;
 /// SIGKILL to a process that records.
 mod kill;
+mod log;
 /// The store on a disk: locks, generations, compaction.
 mod store;
 /// How Python reads a checkpoint.

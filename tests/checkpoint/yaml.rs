@@ -8,11 +8,16 @@ use self::catalogue::{catalogue, values};
 use indexmap::IndexMap;
 use proptest::prelude::*;
 use rosrescue::checkpoint::format::{
-    Checkpoint, DEPTH_MAX, EncodeError, Record, RecordContent, Session, decode, encode_checkpoint,
-    encode_record,
+    Checkpoint, DEPTH_MAX, EncodeError, Label, Origin, Record, RecordContent, Session, decode,
+    encode_checkpoint, encode_record,
 };
 use rosrescue::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use rosrescue::xmlrpc::{Call, Struct, Value};
+
+const LABEL: Label = Label {
+    at: 1_764_115_200_123,
+    origin: Origin::Rosrescue,
+};
 
 fn nested(levels: usize, wrap: impl Fn(Value) -> Value) -> Value {
     (0..levels).fold(Value::Int(1), |value, _| wrap(value))
@@ -54,6 +59,7 @@ fn with_params(params: Struct) -> Checkpoint {
             term: 1_800_000,
             cluster_seq: 1_700_000,
             port: 11_312,
+            at: 1_764_115_200_000,
         },
         snapshot: Snapshot {
             nodes: IndexMap::from([
@@ -101,6 +107,7 @@ fn with_params(params: Struct) -> Checkpoint {
                 topics: Vec::new(),
             },
         ],
+        follows: false,
     }
 }
 
@@ -111,6 +118,7 @@ fn file_with(value: &Value) -> Result<Vec<u8>, EncodeError> {
     let entry = RecordContent::Call {
         call: set_param(value),
         pending: true,
+        label: LABEL,
     };
     let mut file = encoded.bytes;
     file.extend(encode_record(
@@ -138,6 +146,7 @@ fn assert_round_trip(value: &Value) {
                 RecordContent::Call {
                     call,
                     pending: true,
+                    label: LABEL,
                 },
         },
     ] = decoded.records.as_slice()

@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use rosrescue::checkpoint::{compare::compare, log::moment, store::log};
+use rosrescue::clock;
 use rosrescue::master::{Kind, Master, Request};
 use rosrescue::replay::{Inspection, Plan, Skipped, Token};
 use rosrescue::xmlrpc::{Call, encode_call};
@@ -62,7 +64,7 @@ struct Rig {
     /// Process id of the master that was killed.
     killed: i32,
     rescue: Rescue,
-    _scratch: Scratch,
+    scratch: Scratch,
 }
 
 impl Rig {
@@ -87,7 +89,7 @@ impl Rig {
             master_port,
             killed: 0,
             rescue,
-            _scratch: scratch,
+            scratch,
         }
     }
 
@@ -167,6 +169,28 @@ impl Rig {
         status["open"] == true && status["last_recovery"]["master_pid"] != self.killed
     }
 
+    /// Whether the log has the state of each instant.
+    fn had_states(&self, instants: &[(u64, Master)]) -> Result<(), Failure> {
+        let name = format!("latest-chkpt-{}.yaml", self.rescue.port());
+        let path = self.scratch.log_dir().join(name);
+        let files = log::files(&path).map_err(|error| error.to_string())?;
+        let texts: Vec<_> = files.iter().filter_map(|file| file.read().ok()).collect();
+        let nothing_hidden = "".parse()?;
+        for (time, expected) in instants {
+            let found = texts
+                .iter()
+                .rev()
+                .find_map(|text| moment(text, *time).ok()?);
+            let found = found.ok_or_else(|| format!("there is no state of {time}"))?;
+            let differences = compare(expected, &found.rebuilt.mirror, &nothing_hidden);
+            if !differences.is_empty() {
+                let seq = found.seq;
+                return Err(format!("at {time}, after record {seq}: {differences:?}"));
+            }
+        }
+        Ok(())
+    }
+
     /// Waits until calls pass to a master, or until they no longer do.
     fn await_gate(&self, open: bool) -> Result<(), Failure> {
         let deadline = Instant::now() + patience();
@@ -178,6 +202,18 @@ impl Rig {
         }
         Ok(())
     }
+}
+
+/// One instant is checked for about this many steps.
+const INSTANT_EACH: usize = 4;
+
+/// The present time and state. Waits for the next millisecond, so that no later call has the same time.
+fn instant(model: &Master) -> (u64, Master) {
+    let now = clock::wall_millis();
+    while clock::wall_millis() == now {
+        std::thread::yield_now();
+    }
+    (now, model.clone())
 }
 
 /// The state at the other end once it is `complete`.
@@ -250,6 +286,7 @@ pub(crate) fn run(
     stage.allow_repeats();
     stage.callbacks = !script.unreturnable;
     let mut in_flight = false;
+    let mut instants = Vec::new();
     for (nth, step) in script.steps.iter().enumerate() {
         let done = match step {
             Step::Call { by, call } => {
@@ -323,6 +360,9 @@ pub(crate) fn run(
             Step::Away | Step::Handover { .. } | Step::Successor(_) => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
+        if !in_flight && Dice(nth as u64).once_in(INSTANT_EACH) {
+            instants.push(instant(&stage.model));
+        }
     }
     rig.revive();
     let end = rig.await_gate(true).and_then(|()| stage.settle());
@@ -336,7 +376,8 @@ pub(crate) fn run(
         let mut behind = Wire::connect(rig.master_port).map_err(|error| error.to_string())?;
         stage
             .same_reads(&mut behind)
-            .map_err(|why| format!("the master behind: {why}"))
+            .map_err(|why| format!("the master behind: {why}"))?;
+        rig.had_states(&instants)
     });
     end.map_err(|why| format!("at the end: {why}"))
 }

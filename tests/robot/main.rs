@@ -122,6 +122,7 @@ mod commands {
     mod handover;
     mod history;
     mod live_links;
+    mod log;
     mod params;
     mod restore;
     mod status;

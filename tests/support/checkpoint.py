@@ -33,16 +33,17 @@ def canonical(value):
 def replay(parameters, journal):
     """Applies the calls in the journal to `parameters`."""
     for record in journal or []:
-        if record.get("call") not in ("setParam", "deleteParam"):
+        params = record.get("setParam") or record.get("deleteParam")
+        if params is None:
             continue
-        names = record["params"][1].strip("/").split("/")
+        names = params[1].strip("/").split("/")
         tree = parameters
         for name in names[:-1]:
             if not isinstance(tree.get(name), dict):
                 tree[name] = {}
             tree = tree[name]
-        if record["call"] == "setParam":
-            tree[names[-1]] = record["params"][2]
+        if "setParam" in record:
+            tree[names[-1]] = params[2]
         else:
             del tree[names[-1]]
     return parameters

@@ -9,7 +9,7 @@ use super::{blocks::documents, commands::quoted, read, root, rust_files, source_
 const BYTES_MOST: [(&str, usize); 3] = [
     ("README.md", 8 << 10),
     ("docs/architecture.md", 20 << 10),
-    ("docs", 150 << 10),
+    ("docs", 155 << 10),
 ];
 
 /// The output of `rosrescue ARGUMENTS` at a width of 100, without settings of this computer.

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use super::journal::Active;
 use super::storage::FileId;
-use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
+use super::{LogKeeper, Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
 /// Minimum size of a journal for which a new checkpoint file is written.
@@ -55,6 +55,8 @@ struct Plan<S: Storage> {
     /// A sync of the present file, which runs first. It is needed if some of that file's records may be durable only in
     /// the previous generation, because that is about to be replaced.
     settle: Option<SyncJob<S>>,
+    /// Gets the records of the previous generation before that is replaced.
+    log: Arc<Mutex<LogKeeper<S>>>,
     ticket: Arc<Ticket>,
 }
 
@@ -115,6 +117,7 @@ impl<S: Storage> Plan<S> {
             }
             other => other,
         }?;
+        super::log::locked(&self.log).keep(storage, names, &names.previous());
         let wanted = self.ticket.lock();
         if !*wanted {
             return Err(names.superseded());
@@ -160,9 +163,12 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the previous generation, which would be replaced anyway. Never removes the present file, because it is
+    /// Removes the log, or if there is none, the previous generation, which would be replaced anyway. Never removes the present file, because it is
     /// the only copy until the new generation is complete.
     fn make_room(&self) -> bool {
+        if super::log::locked(&self.log).remove(&self.storage, &self.names) {
+            return true;
+        }
         let wanted = self.ticket.lock();
         *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
     }
@@ -181,7 +187,7 @@ impl<S: Storage> Store<S> {
         if checkpoint.seq >= self.seq {
             self.overtake();
         }
-        let done = self.plan(checkpoint.seq)?.run(checkpoint);
+        let done = self.plan(checkpoint)?.run(checkpoint);
         self.finish_compaction(done)?;
         match self.sync_job().map(SyncJob::run) {
             Some(done) => self.synced(done),
@@ -209,11 +215,12 @@ impl<S: Storage> Store<S> {
         &mut self,
         checkpoint: Checkpoint,
     ) -> Result<CompactionJob<S>, StoreError> {
-        let plan = self.plan(checkpoint.seq)?;
+        let plan = self.plan(&checkpoint)?;
         Ok(CompactionJob { plan, checkpoint })
     }
 
-    fn plan(&mut self, seq: u64) -> Result<Plan<S>, StoreError> {
+    fn plan(&mut self, checkpoint: &Checkpoint) -> Result<Plan<S>, StoreError> {
+        let seq = checkpoint.seq;
         if seq < self.seq {
             return Err(StoreError::Stale {
                 snapshot: seq,
@@ -227,6 +234,9 @@ impl<S: Storage> Store<S> {
         self.seq = seq;
         self.generation += 1;
         let generation = self.generation;
+        if !checkpoint.follows || self.active.is_none() {
+            super::log::locked(&self.log).breaks_at(generation);
+        }
         let ticket = Arc::new(Ticket(Mutex::new(true)));
         self.pending = Some(PendingGeneration {
             generation,
@@ -245,6 +255,7 @@ impl<S: Storage> Store<S> {
                 .filter(|present| present.usable)
                 .map(|present| present.id),
             settle: if unsettled { self.sync_job() } else { None },
+            log: Arc::clone(&self.log),
             ticket,
         })
     }

@@ -21,6 +21,7 @@ pub mod history;
 mod journal;
 mod load;
 mod lock;
+pub mod log;
 mod names;
 pub mod regular_file;
 #[cfg(test)]
@@ -31,6 +32,7 @@ mod tests;
 mod watch;
 
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 
 use aside::{LockedPath, Present, keep_aside, set_aside_previous};
 pub use error::{OpenError, StoreError};
@@ -41,6 +43,7 @@ pub use journal::{SyncJob, Synced};
 pub use load::Loaded;
 pub use lock::DiskLock;
 pub use lock::{LockHolder, holder_of};
+use log::LogKeeper;
 use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{CheckJob, Checked, ForeignChange};
@@ -65,6 +68,7 @@ pub struct Store<S: Storage = Disk> {
     generation: u64,
     compact_above: u64,
     file_bytes_max: u64,
+    log: Arc<Mutex<LogKeeper<S>>>,
     buffer: Vec<u8>,
 }
 
@@ -192,8 +196,21 @@ impl<S: Storage> Store<S> {
             generation: 0,
             compact_above: COMPACTION_BYTES_MIN,
             file_bytes_max: load::FILE_BYTES_MAX,
+            log: Arc::default(),
             buffer: Vec::new(),
         })
+    }
+
+    /// Keeps the records of replaced generations in the [log](log), in up to `bytes_max` bytes. 0 keeps none, and leaves
+    /// the files of an earlier log alone.
+    pub fn keep_log(&mut self, bytes_max: u64) {
+        log::locked(&self.log).bytes_max = bytes_max;
+    }
+
+    /// Takes the reason why the log lacks records, if there was a new one.
+    pub fn take_log_trouble(&mut self) -> Option<String> {
+        // A job may be waiting for the disk with the lock held.
+        self.log.try_lock().ok()?.trouble.take()
     }
 
     fn set_counts(&mut self, seq: u64, generation: u64) {
@@ -254,6 +271,10 @@ impl<S: Storage> Store<S> {
     pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
         self.active = None;
         self.overtake();
+        let (storage, names) = (&self.place.storage, &self.place.names);
+        for path in [names.previous(), names.path.clone()] {
+            log::locked(&self.log).keep(storage, names, &path);
+        }
         self.unprotected = Some("its file has been set aside".to_owned());
         self.place.set_aside(reason)
     }

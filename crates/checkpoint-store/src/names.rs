@@ -31,6 +31,28 @@ impl Names {
         self.numbered("new", generation)
     }
 
+    /// The file of part `number` of the log while it grows.
+    pub(super) fn log_part(&self, number: u64) -> PathBuf {
+        self.numbered("log", number)
+    }
+
+    /// The compressed file of part `number` of the log.
+    pub(super) fn closed_log_part(&self, number: u64) -> PathBuf {
+        self.with(&format!(".log-{number}.gz"))
+    }
+
+    /// The parts of the log, oldest first: the number of each, and whether it is compressed.
+    pub(super) fn log_parts(&self, storage: &impl Storage) -> io::Result<Vec<(u64, bool)>> {
+        let part = |ending: &String| {
+            let number = ending.strip_prefix("log-")?;
+            let closed = number.strip_suffix(".gz");
+            Some((closed.unwrap_or(number).parse().ok()?, closed.is_some()))
+        };
+        let mut parts: Vec<_> = self.endings(storage)?.iter().filter_map(part).collect();
+        parts.sort_unstable();
+        Ok(parts)
+    }
+
     pub(super) fn superseded(&self) -> StoreError {
         let path = self.path.clone();
         StoreError::Overtaken { path }

@@ -85,6 +85,8 @@ pub trait Storage: Clone + Send + Sync + 'static {
     /// Renames `from` to `path`, and the file that was at `path` to `aside`, an unused name.
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()>;
     fn status(&self, file: &Self::File) -> io::Result<FileStatus>;
+    /// The length of the file at `path`, in bytes.
+    fn length_at(&self, path: &Path) -> io::Result<u64>;
     /// The id of the file at `path`, if there is one.
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>>;
     /// The CRC-32C of the first `length` bytes of the file at `path`.
@@ -236,6 +238,10 @@ impl Storage for Disk {
             modified: i128::from(metadata.mtime()) * 1_000_000_000
                 + i128::from(metadata.mtime_nsec()),
         })
+    }
+
+    fn length_at(&self, path: &Path) -> io::Result<u64> {
+        Ok(fs::symlink_metadata(path)?.len())
     }
 
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {

@@ -1,6 +1,7 @@
 //! Crashes at every operation, losses of power, and failing disks.
 
 mod faults;
+mod log;
 mod moved;
 
 use std::path::Path;
@@ -30,6 +31,7 @@ impl Model {
     fn checkpoint(&self, seq: u64) -> Checkpoint {
         let mut checkpoint = Checkpoint {
             seq,
+            follows: true,
             ..Checkpoint::default()
         };
         checkpoint.session.id = self.session.to_owned();
@@ -95,7 +97,11 @@ fn state(loaded: &Loaded) -> Vec<u64> {
 }
 
 fn open(fs: &SimFs) -> Result<(Store<SimFs>, Option<Loaded>), OpenError> {
-    Store::open_on(fs.clone(), Path::new(PATH))
+    let opened = Store::open_on(fs.clone(), Path::new(PATH));
+    opened.map(|(mut store, loaded)| {
+        store.keep_log(1 << 20);
+        (store, loaded)
+    })
 }
 
 /// Does everything that a store does in its life. Each step runs whatever the result of the step before.

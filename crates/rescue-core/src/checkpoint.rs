@@ -2,5 +2,6 @@
 
 pub mod compare;
 pub mod format;
+pub mod log;
 pub mod putback;
 pub mod session;

@@ -37,7 +37,8 @@ for name in sys.stdin.read().split():
     assert list(yaml.safe_load_all(content)) == [document] or b'.nan' in content
     journal = document['journal']
     assert journal[0]['pending'] is True
-    print(show(document['parameters']), show(document['pending'][0]['params'][2]), show(journal[0]['params'][2]))
+    assert (journal[0]['t'], journal[0]['from']) == (1764115200123, 'rosrescue')
+    print(show(document['parameters']), show(document['pending'][0]['params'][2]), show(journal[0]['setParam'][2]))
 "#;
 
 fn hex(bytes: &[u8]) -> String {

@@ -64,6 +64,7 @@ fn forget_port(path: &Path) {
         snapshot: rebuilt.mirror.snapshot(),
         pending: Vec::new(),
         displaced: Vec::new(),
+        follows: false,
     };
     fs::write(
         path,

@@ -135,6 +135,7 @@ fn file(at: &Path) -> [usize; 3] {
         },
         pending: Vec::new(),
         displaced: Vec::new(),
+        follows: false,
     };
     let encoded = format::encode_checkpoint(&checkpoint, 1).unwrap();
     let mut bytes = encoded.bytes;
@@ -168,7 +169,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
     let damaged = make("damaged.yaml", &damaged);
     let newer = String::from_utf8(bytes.clone()).unwrap();
     let (first, rest) = newer.split_once('\n').unwrap();
-    let first = first.replace("checkpoint v1", "checkpoint v2");
+    let first = first.replace("checkpoint v2", "checkpoint v3");
     let (first, _) = first.rsplit_once("header=").unwrap();
     let first = format!("{first}header=");
     let newer = format!("{first}{:08x}\n{rest}", crc32c::crc32c(first.as_bytes()));
@@ -183,7 +184,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
         (folder.to_str().unwrap(), "is a folder"),
         (&other, "is not a rosrescue checkpoint"),
         (&empty, "is damaged"),
-        (&newer, "has checkpoint format 2 of a newer rosrescue"),
+        (&newer, "has checkpoint format 3 of a newer rosrescue"),
         (&damaged, "is damaged"),
     ] {
         for command in [

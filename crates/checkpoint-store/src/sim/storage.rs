@@ -116,6 +116,11 @@ impl Storage for SimFs {
         })
     }
 
+    fn length_at(&self, path: &Path) -> io::Result<u64> {
+        let world = self.0.lock().unwrap();
+        Ok(world.inodes[world.find(path)?].content().len() as u64)
+    }
+
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {
         let inode = self.0.lock().unwrap().find(path);
         Ok(inode.ok().map(|inode| SimFile(inode).id()))

@@ -110,6 +110,7 @@ fn an_obsolete_or_lost_job_does_not_disturb_the_next_one() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
+    store.keep_log(0);
     model.begin(&mut store);
     let lost = store.begin_compaction(model.checkpoint(0)).unwrap();
     let busy = store.begin_compaction(model.checkpoint(0)).map(|_| ());

@@ -109,6 +109,24 @@ pub fn compare(a: &Master, b: &Master, hide: &Hide) -> Vec<Difference> {
     found.found
 }
 
+/// Lists where two values of the parameter `name` differ, one difference for each parameter below it. `None` stands for
+/// no parameter. Values of hidden parameters are masked.
+pub fn compare_param(
+    name: &str,
+    a: Option<&Value>,
+    b: Option<&Value>,
+    hide: &Hide,
+) -> Vec<Difference> {
+    let mut found = Comparison {
+        a: Snapshot::default(),
+        b: Snapshot::default(),
+        hide,
+        found: Vec::new(),
+    };
+    found.param(name.trim_end_matches('/'), a, b);
+    found.found
+}
+
 /// Describes all registrations of a node, one per element.
 pub fn registrations(master: &Master, node: &str) -> Vec<String> {
     let services = master

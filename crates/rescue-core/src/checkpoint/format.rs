@@ -17,6 +17,7 @@ mod rosparam;
 mod tests;
 mod yaml;
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::ops::Range;
 
 use thiserror::Error;
@@ -60,6 +61,36 @@ pub struct Session {
     /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
     /// that follows in this file has the next number. Too low if the true number is unknown.
     pub cluster_seq: u64,
+    /// Wall clock time at which this was written, in milliseconds since 1970. 0 if an earlier version wrote it. It is a
+    /// label, like [`Label::at`].
+    pub at: u64,
+}
+
+/// When a record was made, and who made the call. For people only: the order of records is that of their numbers, and
+/// the clock may jump.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Label {
+    /// Wall clock time in milliseconds since 1970. 0 if it is unknown, as in records of earlier versions. Without a
+    /// time, no origin is recorded.
+    pub at: u64,
+    pub origin: Origin,
+}
+
+/// Who made a recorded call.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Origin {
+    /// An earlier version made the record.
+    #[default]
+    Unknown,
+    /// rosrescue itself, for example its health check.
+    Rosrescue,
+    /// A program at this address. A call through another computer's rosrescue has that computer's address.
+    At(IpAddr),
+}
+
+impl Origin {
+    /// The origin whose records name none, because most calls come from this computer.
+    const COMMON: Self = Self::At(IpAddr::V4(Ipv4Addr::LOCALHOST));
 }
 
 /// The content of a record.
@@ -70,16 +101,25 @@ pub enum RecordContent {
         call: Call,
         /// Whether the mirror answered the write before a master had run it.
         pending: bool,
+        label: Label,
     },
     /// New facts about the session, which replace the previous ones.
     Session(Session),
 }
 
 impl RecordContent {
-    /// A write that a master has run.
+    /// A write that a master has run, without a label.
     pub fn call(call: Call) -> Self {
-        let pending = false;
-        Self::Call { call, pending }
+        Self::labelled(call, Label::default())
+    }
+
+    /// A write that a master has run.
+    pub fn labelled(call: Call, label: Label) -> Self {
+        Self::Call {
+            call,
+            pending: false,
+            label,
+        }
     }
 }
 
@@ -102,6 +142,9 @@ pub struct Checkpoint {
     pub pending: Vec<Call>,
     /// Nodes that must shut down because another node has taken their name. Some of them may not have been told yet.
     pub displaced: Vec<Displaced>,
+    /// Whether the state is exactly what the records before it give. False after a change without a record. Not written
+    /// to the file.
+    pub follows: bool,
 }
 
 /// The text of a checkpoint, and the stamp for its records.
@@ -203,7 +246,19 @@ pub struct Decoded {
 /// [`EncodeError::TooDeep`] for a parameter that is nested deeper than [`DEPTH_MAX`].
 pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Encoded, EncodeError> {
     let body = document::write_snapshot(checkpoint)?;
-    Ok(frame::frame_snapshot(&body, checkpoint.seq, generation))
+    let (version, seq) = (FORMAT_VERSION, checkpoint.seq);
+    Ok(frame::frame_snapshot(&body, version, seq, generation))
+}
+
+/// Like [`encode_checkpoint`], for the other computers of a robot. Uses format 1, which all versions read: the
+/// computers may have different versions during an upgrade.
+///
+/// # Errors
+///
+/// The error of [`encode_checkpoint`].
+pub fn encode_shared(checkpoint: &Checkpoint) -> Result<Encoded, EncodeError> {
+    let body = document::write_snapshot(checkpoint)?;
+    Ok(frame::frame_snapshot(&body, 1, checkpoint.seq, 1))
 }
 
 /// Encodes `record` as a line for a file with this `stamp`, including the line feed.

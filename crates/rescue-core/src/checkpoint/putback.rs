@@ -30,6 +30,15 @@ impl ParamChanges {
         found
     }
 
+    /// Leaves out all parameters but those with one of these `names` and those below one. No names leave out none.
+    pub fn retain(&mut self, names: &[String]) {
+        let wanted = |of: &str| names.is_empty() || names.iter().any(|name| is_in(of, name));
+        self.set.retain(|(name, ..)| wanted(name));
+        self.delete.retain(|name| wanted(name));
+        self.left_out
+            .retain(|(what, _)| wanted(what.trim_start_matches("parameter ")));
+    }
+
     /// Whether there is nothing to change.
     pub fn is_empty(&self) -> bool {
         self.set.is_empty() && self.delete.is_empty()
@@ -76,6 +85,13 @@ impl ParamChanges {
         self.left_out
             .push((format!("parameter {name}"), why.to_owned()));
     }
+}
+
+/// Whether the parameter `name` has the name `space`, or is in that namespace. `space` needs no slash at its start.
+pub fn is_in(name: &str, space: &str) -> bool {
+    let space = space.trim_matches('/');
+    let rest = name.trim_start_matches('/').strip_prefix(space);
+    space.is_empty() || rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
 }
 
 /// Whether `key` can be one part of a parameter's name.

@@ -114,6 +114,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
             RecordContent::Call {
                 call,
                 pending: waits,
+                ..
             } => {
                 let request = Request::from(call);
                 let calls = request.calls().into_iter();
@@ -143,12 +144,17 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::checkpoint::format::Label;
     use crate::xmlrpc::Call;
 
     fn write(seq: u64, pending: bool) -> Record {
         let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
         let call = Call::new("setParam", params);
-        let entry = RecordContent::Call { call, pending };
+        let entry = RecordContent::Call {
+            call,
+            pending,
+            label: Label::default(),
+        };
         Record { seq, entry }
     }
 

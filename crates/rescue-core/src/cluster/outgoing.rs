@@ -200,7 +200,7 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
         snapshot,
         ..Checkpoint::default()
     };
-    let encoded = format::encode_checkpoint(&checkpoint, 1)?;
+    let encoded = format::encode_shared(&checkpoint)?;
     Ok(journal::state(keys, change.seq(), &encoded.bytes))
 }
 

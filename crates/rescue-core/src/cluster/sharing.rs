@@ -3,7 +3,7 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use crate::{
-    checkpoint::format::{self, Record, RecordContent},
+    checkpoint::format::{self, Label, Record, RecordContent},
     cluster::{
         merge::{self, ChangeSubject, Changes, Verdict},
         mutant::Mutant,
@@ -130,9 +130,14 @@ impl Sharing {
 
     /// Records a call from `source`. A call that cannot be encoded is left out, as in the checkpoint.
     pub fn record(&mut self, call: &Request, source: &Source) {
+        self.record_labelled(call, source, Label::default());
+    }
+
+    /// Like [`Self::record`], with the label of the call's record.
+    pub fn record_labelled(&mut self, call: &Request, source: &Source, label: Label) {
         let record = Record {
             seq: self.last + 1,
-            entry: RecordContent::call(call.clone().into()),
+            entry: RecordContent::labelled(call.clone().into(), label),
         };
         if format::push_record(&mut Vec::new(), &record).is_ok() {
             self.last += 1;

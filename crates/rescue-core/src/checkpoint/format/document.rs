@@ -3,7 +3,7 @@
 use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
-use super::{Checkpoint, EncodeError, RecordContent, Session, frame, yaml};
+use super::{Checkpoint, EncodeError, Label, Origin, RecordContent, Session, frame, yaml};
 use crate::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
@@ -15,6 +15,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         snapshot,
         pending,
         displaced,
+        follows: _,
     } = checkpoint;
     let mut out = Vec::with_capacity(64 * 1024);
     let out = &mut out;
@@ -67,7 +68,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         out.extend_from_slice(b"pending:\n");
         for call in pending {
             out.extend_from_slice(b"- {");
-            write_call(out, call)?;
+            write_call(out, call, Form::Long)?;
             out.extend_from_slice(b"}\n");
         }
     }
@@ -139,12 +140,70 @@ fn names(out: &mut Vec<u8>, ids: &[String]) {
     out.push(b'\n');
 }
 
-fn write_call(out: &mut Vec<u8>, call: &Call) -> Result<(), EncodeError> {
-    out.extend_from_slice(b"call: ");
-    quoted(out, &call.method);
-    out.extend_from_slice(b", params: ");
+/// How a call is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Form {
+    /// `call: "setParam", params: […]`, which all versions read.
+    Long,
+    /// `setParam: […]`, since format 2.
+    Short,
+}
+
+fn write_call(out: &mut Vec<u8>, call: &Call, form: Form) -> Result<(), EncodeError> {
+    if form == Form::Short && is_key(&call.method) {
+        out.extend_from_slice(call.method.as_bytes());
+        out.extend_from_slice(b": ");
+    } else {
+        out.extend_from_slice(b"call: ");
+        quoted(out, &call.method);
+        out.extend_from_slice(b", params: ");
+    }
     flow_list(out, &call.params, |out, value| flow(out, value, 0))
 }
+
+/// Whether a method's name can be the key of its record. All writes have such names. Shorter words could be `true` or
+/// `yes`, or another key of the record.
+fn is_key(method: &str) -> bool {
+    let letters = method.as_bytes();
+    letters.len() >= 8
+        && letters.iter().all(u8::is_ascii_alphabetic)
+        && letters.first().is_some_and(u8::is_ascii_lowercase)
+}
+
+/// Writes the end of a record: when it was made and by whom.
+fn write_label(out: &mut Vec<u8>, label: Label) {
+    if label.at == 0 {
+        return;
+    }
+    out.extend_from_slice(b", t: ");
+    decimal(out, label.at);
+    let from = match label.origin {
+        Origin::COMMON => return,
+        Origin::Unknown => String::new(),
+        Origin::Rosrescue => ROSRESCUE.to_owned(),
+        Origin::At(address) => address.to_string(),
+    };
+    out.extend_from_slice(b", from: ");
+    quoted(out, &from);
+}
+
+/// Reverses [`write_label`]. An unreadable label is no damage: it is for people only.
+fn read_label(entry: &Struct) -> Label {
+    let at = count(entry, "t").ok().flatten().unwrap_or(0);
+    let origin = match entry.get("from") {
+        _ if at == 0 => Origin::Unknown,
+        None => Origin::COMMON,
+        Some(Value::String(from)) if from == ROSRESCUE => Origin::Rosrescue,
+        Some(from) => from
+            .as_str()
+            .and_then(|from| from.parse().ok())
+            .map_or(Origin::Unknown, Origin::At),
+    };
+    Label { at, origin }
+}
+
+/// How a record names rosrescue as its caller.
+const ROSRESCUE: &str = "rosrescue";
 
 fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
     let mut members = vec![
@@ -167,6 +226,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("term", session.term),
         ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
+        ("at", session.at),
     ];
     // A missing count is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
@@ -183,16 +243,22 @@ pub(super) fn write_record(
     out: &mut Vec<u8>,
     seq: u64,
     entry: &RecordContent,
+    form: Form,
 ) -> Result<(), EncodeError> {
     out.extend_from_slice(b"- {seq: ");
     decimal(out, seq);
     match entry {
-        RecordContent::Call { call, pending } => {
+        RecordContent::Call {
+            call,
+            pending,
+            label,
+        } => {
             out.extend_from_slice(b", ");
-            write_call(out, call)?;
+            write_call(out, call, form)?;
             if *pending {
                 out.extend_from_slice(b", pending: true");
             }
+            write_label(out, *label);
         }
         RecordContent::Session(session) => {
             out.extend_from_slice(b", session: {");
@@ -266,6 +332,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         snapshot,
         pending,
         displaced,
+        follows: false,
     })
 }
 
@@ -306,8 +373,25 @@ pub(super) fn read_record(line: &str) -> Result<RecordContent, String> {
         return read_session(members(&mut entry, "session")?).map(RecordContent::Session);
     }
     let pending = entry.get("pending") == Some(&Value::Bool(true));
-    let call = read_call(&mut entry)?;
-    Ok(RecordContent::Call { call, pending })
+    let label = read_label(&entry);
+    let call = match entry.contains_key("call") {
+        true => read_call(&mut entry)?,
+        false => read_short(entry)?,
+    };
+    Ok(RecordContent::Call {
+        call,
+        pending,
+        label,
+    })
+}
+
+/// Reads a call whose method is the key of its parameters.
+fn read_short(entry: Struct) -> Result<Call, String> {
+    let call = entry.into_iter().find_map(|(method, params)| match params {
+        Value::Array(params) if is_key(&method) => Some(Call { method, params }),
+        _ => None,
+    });
+    call.ok_or_else(|| "it has no call".to_owned())
 }
 
 fn read_call(members: &mut Struct) -> Result<Call, String> {
@@ -334,6 +418,7 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         port: count(session, "port")?
             .and_then(|port| u16::try_from(port).ok())
             .unwrap_or(0),
+        at: count(session, "at")?.unwrap_or(0),
     })
 }
 

@@ -16,11 +16,12 @@ use std::ops::Range;
 
 use super::{
     Checkpoint, Damage, Decoded, EncodeError, Encoded, FormatError, Record, RecordContent,
-    SnapshotError, document,
+    SnapshotError,
+    document::{self, Form},
 };
 
 /// The version of the format that this program writes.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 const MAGIC: &str = "# rosrescue checkpoint v";
 /// Longest first line, in bytes.
@@ -39,14 +40,14 @@ const COUNT_MAX: u64 = u64::MAX / 2;
 pub struct Stamp(u32);
 
 /// Adds the first line to a snapshot.
-pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
+pub(super) fn frame_snapshot(snapshot: &[u8], version: u32, seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
     let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
     // This cannot fail, because it writes to a vector.
     let _ = write!(
         bytes,
-        "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
+        "{MAGIC}{version} generation={generation} seq={seq} snapshot={length} \
          crc32c={crc:08x} header="
     );
     let stamp = Stamp(crc32c::crc32c(&bytes));
@@ -57,8 +58,12 @@ pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Enco
 
 /// Appends the line of a record without its check sums.
 pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &RecordContent) -> Result<(), EncodeError> {
+    push(out, seq, entry, Form::Short)
+}
+
+fn push(out: &mut Vec<u8>, seq: u64, entry: &RecordContent, form: Form) -> Result<(), EncodeError> {
     let start = out.len();
-    let written = document::write_record(out, seq, entry);
+    let written = document::write_record(out, seq, entry, form);
     if written.is_err() {
         out.truncate(start);
     }
@@ -78,10 +83,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
 /// The stamp of records that are outside of any checkpoint file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends the line of a record that is outside of any checkpoint file.
+/// Appends the line of a record that is outside of any checkpoint file. All versions read it.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
-    push_body(out, record.seq, &record.entry)?;
+    push(out, record.seq, &record.entry, Form::Long)?;
     seal(out, start, NO_FILE);
     Ok(())
 }
@@ -232,7 +237,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
         return Ok(None);
     };
     match version.parse() {
-        Ok(FORMAT_VERSION) => {}
+        Ok(1..=FORMAT_VERSION) => {}
         Ok(version) => return Err(FormatError::NewerVersion { version }),
         Err(_) => return Ok(None),
     }
@@ -269,6 +274,25 @@ fn resembles(bytes: &[u8]) -> bool {
         || contains(b"\nsession:\n") && contains(b"\njournal:\n")
 }
 
+impl Header {
+    /// Connects the file's records to its snapshot.
+    pub fn stamp(&self) -> Stamp {
+        self.stamp
+    }
+}
+
+impl<'a> Line<'a> {
+    /// Wall clock time in the line, in milliseconds since 1970; see [`Label::at`](super::Label::at). 0 without a time.
+    pub fn time(&self) -> u64 {
+        time_at_end(self.body).unwrap_or(0)
+    }
+
+    /// The line without its check sums, as [`push_body`] writes it.
+    pub fn body(&self) -> &'a [u8] {
+        self.body
+    }
+}
+
 impl<'a> Framed<'a> {
     /// A file without any undamaged part.
     pub fn unreadable(bytes: &'a [u8]) -> Self {
@@ -285,6 +309,40 @@ impl<'a> Framed<'a> {
 
     /// The verified snapshot.
     pub fn checkpoint(&self) -> Result<Checkpoint, SnapshotError> {
+        std::str::from_utf8(self.snapshot()?)
+            .map_err(|error| error.to_string())
+            .and_then(document::read_snapshot)
+            .map_err(|why| SnapshotError::Content { why })
+    }
+
+    /// The file's text up to its first record. Its check sums are verified, its YAML is not.
+    pub fn head(&self) -> Result<&'a [u8], SnapshotError> {
+        let length = self.snapshot()?.len() + self.header.map_or(0, |header| header.length);
+        Ok(self.bytes.get(..length).unwrap_or_default())
+    }
+
+    /// The file's text with only those records that `keeps` is true for. `None` without a usable snapshot.
+    pub fn thinned(&self, mut keeps: impl FnMut(&Line<'_>) -> bool) -> Option<Vec<u8>> {
+        let mut text = self.head().ok()?.to_vec();
+        for line in self.lines.iter().filter(|line| keeps(line)) {
+            let end = line.offset + line.body.len() + CHECK_BYTES + 1;
+            text.extend_from_slice(self.bytes.get(line.offset..end)?);
+        }
+        Some(text)
+    }
+
+    /// Wall clock time of the snapshot, in milliseconds since 1970; see [`Session::at`](super::Session::at). 0 without a
+    /// time.
+    pub fn taken_at(&self) -> u64 {
+        let head = self.head().ok().and_then(|it| std::str::from_utf8(it).ok());
+        let session = head.and_then(|head| head.split("\nnodes:").next());
+        let at = session.and_then(|session| session.rsplit_once("\n  at: "));
+        at.and_then(|(_, at)| at.lines().next()?.parse().ok())
+            .unwrap_or(0)
+    }
+
+    /// The text of the verified snapshot.
+    fn snapshot(&self) -> Result<&'a [u8], SnapshotError> {
         let header = self.header.ok_or(SnapshotError::Header)?;
         let behind = self.bytes.get(header.length..).unwrap_or_default();
         let snapshot = usize::try_from(header.snapshot)
@@ -301,10 +359,7 @@ impl<'a> Framed<'a> {
                 found,
             });
         }
-        std::str::from_utf8(snapshot)
-            .map_err(|error| error.to_string())
-            .and_then(document::read_snapshot)
-            .map_err(|why| SnapshotError::Content { why })
+        Ok(snapshot)
     }
 
     /// The records with numbers above `after`. A line with valid check sums and invalid content is added to `damaged`.
@@ -397,6 +452,20 @@ impl<'a> Framed<'a> {
             None => {}
         }
     }
+}
+
+/// The time at the end of a record's line, before its origin. Such a text cannot be inside of a value, because a line
+/// without a label ends in `]` or `true`.
+fn time_at_end(body: &[u8]) -> Option<u64> {
+    let text = std::str::from_utf8(body).ok()?;
+    let text = text.trim_end_matches('}');
+    let text = match text.ends_with('"') {
+        true => text.rsplit_once(", from: ")?.0,
+        false => text,
+    };
+    let (before, digits) = text.rsplit_once(": ")?;
+    let is_time = before.ends_with(" t") || before.ends_with(" at");
+    is_time.then(|| digits.parse().ok()).flatten()
 }
 
 /// Number, stamp and body of a line with valid check sums.

@@ -1,0 +1,277 @@
+//! The log: the records of replaced generations, for people who ask what changed and when.
+//!
+//! The log consists of numbered *parts* beside the checkpoint. Each is a checkpoint file: a snapshot, and after it the
+//! records of as many generations as follow without a gap. The last part grows as `PATH.log-N`. When it is large, or
+//! when a generation does not follow, it is compressed to `PATH.log-N.gz`, and a new part begins.
+//!
+//! Nothing depends on the log. It is written by the job that writes a new generation, in the background, and a failure
+//! only leaves records out of the log. It is not synced, except for a compressed part before it replaces the other one.
+
+use std::collections::BTreeSet;
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use flate2::{Compression, read::MultiGzDecoder, write::GzEncoder};
+
+use super::generation::append_all;
+use super::load::FILE_BYTES_MAX;
+use super::names::previous;
+use super::{Disk, Names, Storage};
+use rescue_core::checkpoint::format::{self, Framed, Stamp};
+
+/// Size of the records for which a new part begins, in bytes.
+const PART_BYTES_MAX: u64 = 1 << 20;
+/// A part has at most this fraction of the log's space, so that the oldest can be removed.
+const PARTS_MIN: u64 = 8;
+
+/// Writes the log.
+pub(super) struct LogKeeper<S: Storage> {
+    /// Maximum size of the log in bytes. 0 keeps none.
+    pub(super) bytes_max: u64,
+    part: Option<OpenPart<S>>,
+    /// Generations whose snapshot does not follow from the records before it.
+    breaks: BTreeSet<u64>,
+    /// Why records are missing. Reported once.
+    pub(super) trouble: Option<String>,
+}
+
+/// The part that grows.
+struct OpenPart<S: Storage> {
+    file: S::File,
+    stamp: Stamp,
+    /// Number of the last record in the part.
+    last: u64,
+    /// Size of the records in the part, in bytes.
+    bytes: u64,
+}
+
+impl<S: Storage> Default for LogKeeper<S> {
+    fn default() -> Self {
+        Self {
+            bytes_max: 0,
+            part: None,
+            breaks: BTreeSet::new(),
+            trouble: None,
+        }
+    }
+}
+
+pub(super) fn locked<S: Storage>(log: &Mutex<LogKeeper<S>>) -> MutexGuard<'_, LogKeeper<S>> {
+    // After a panic the part may lack records. A gap begins a new part.
+    log.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl<S: Storage> LogKeeper<S> {
+    /// Notes that the snapshot of this generation does not follow from the records before it.
+    pub(super) fn breaks_at(&mut self, generation: u64) {
+        self.breaks.insert(generation);
+    }
+
+    /// Adds the records of the generation at `path` that the log lacks. A failure leaves them out.
+    pub(super) fn keep(&mut self, storage: &S, names: &Names, path: &Path) {
+        if self.bytes_max == 0 {
+            return;
+        }
+        if let Err(error) = self.try_keep(storage, names, path)
+            && error.kind() != io::ErrorKind::NotFound
+        {
+            self.part = None;
+            let path = path.display();
+            self.trouble = Some(format!("cannot add the records of `{path}`: {error}"));
+        }
+    }
+
+    fn try_keep(&mut self, storage: &S, names: &Names, path: &Path) -> io::Result<()> {
+        let bytes = storage.read(path, FILE_BYTES_MAX)?;
+        let framed = format::scan(&bytes).map_err(io::Error::other)?;
+        let Some(header) = framed.header else {
+            return Ok(());
+        };
+        let breaks = self.breaks.contains(&header.generation);
+        self.breaks = self.breaks.split_off(&header.generation);
+        let full = self.bytes_max.min(PARTS_MIN * PART_BYTES_MAX) / PARTS_MIN;
+        let follows = |part: &OpenPart<S>| header.seq <= part.last && part.bytes < full;
+        let part = match self.part.take().filter(|part| !breaks && follows(part)) {
+            Some(part) => Some(part),
+            None => self.begin(storage, names, &framed)?,
+        };
+        // The same generation may come again with more records.
+        self.breaks.remove(&header.generation);
+        self.part = part.map(|part| part.add(storage, &framed)).transpose()?;
+        self.trim(storage, names)
+    }
+
+    /// Begins a new part with the snapshot of `framed`. `None` if there is no usable snapshot, or not enough space.
+    fn begin(
+        &self,
+        storage: &S,
+        names: &Names,
+        framed: &Framed<'_>,
+    ) -> io::Result<Option<OpenPart<S>>> {
+        let (Some(header), Ok(head)) = (framed.header, framed.head()) else {
+            return Ok(None);
+        };
+        let parts = names.log_parts(storage)?;
+        for &(number, closed) in &parts {
+            if !closed {
+                close(storage, names, number)?;
+            }
+        }
+        if head.len() as u64 > self.bytes_max / 2 {
+            return Ok(None);
+        }
+        let number = parts.last().map_or(0, |(number, _)| *number) + 1;
+        let file = storage.create(&names.log_part(number))?;
+        append_all(storage, &file, head)?;
+        Ok(Some(OpenPart {
+            file,
+            stamp: header.stamp(),
+            last: header.seq,
+            bytes: 0,
+        }))
+    }
+
+    /// Removes the oldest parts until the others fit.
+    fn trim(&mut self, storage: &S, names: &Names) -> io::Result<()> {
+        let mut total: u64 = 0;
+        for (number, closed) in names.log_parts(storage)?.into_iter().rev() {
+            let path = part_path(names, number, closed);
+            total = total.saturating_add(storage.length_at(&path)?);
+            if total > self.bytes_max {
+                storage.remove(&path)?;
+                if !closed {
+                    self.part = None;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes the whole log. Returns whether that made room.
+    pub(super) fn remove(&mut self, storage: &S, names: &Names) -> bool {
+        if self.bytes_max == 0 {
+            return false;
+        }
+        self.part = None;
+        let parts = names.log_parts(storage).unwrap_or_default().into_iter();
+        let mut removed = parts
+            .filter(|(number, closed)| storage.remove(&part_path(names, *number, *closed)).is_ok());
+        let any = removed.next().is_some();
+        removed.for_each(drop);
+        if any {
+            self.trouble = Some("removed the log, because the disk is full".to_owned());
+        }
+        any
+    }
+}
+
+impl<S: Storage> OpenPart<S> {
+    /// Adds the records after the last one, up to the first gap.
+    fn add(mut self, storage: &S, framed: &Framed<'_>) -> io::Result<Self> {
+        let mut lines = Vec::new();
+        let mut last = self.last;
+        for line in &framed.lines {
+            if line.seq == last + 1 {
+                let start = lines.len();
+                lines.extend_from_slice(line.body());
+                format::seal(&mut lines, start, self.stamp);
+                last = line.seq;
+            }
+        }
+        append_all(storage, &self.file, &lines)?;
+        self.last = last;
+        self.bytes += lines.len() as u64;
+        Ok(self)
+    }
+}
+
+fn part_path(names: &Names, number: u64, closed: bool) -> PathBuf {
+    match closed {
+        true => names.closed_log_part(number),
+        false => names.log_part(number),
+    }
+}
+
+/// Compresses a part that no longer grows.
+fn close(storage: &impl Storage, names: &Names, number: u64) -> io::Result<()> {
+    let (open, closed) = (names.log_part(number), names.closed_log_part(number));
+    if storage.id_at(&closed)?.is_none() {
+        let bytes = storage.read(&open, FILE_BYTES_MAX)?;
+        let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
+        encoder.write_all(&bytes)?;
+        let packed = encoder.finish()?;
+        // If a crash leaves this file, the next start removes it.
+        let fresh = super::names::with(&closed, ".new");
+        let file = storage.create(&fresh)?;
+        append_all(storage, &file, &packed)
+            .and_then(|()| storage.sync(&file))
+            .and_then(|()| storage.rename(&fresh, &closed))
+            .inspect_err(|_| drop(storage.remove(&fresh)))?;
+    }
+    storage.remove(&open)
+}
+
+/// A file that has a part of the history of a checkpoint.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogFile {
+    pub path: PathBuf,
+    closed: bool,
+}
+
+impl LogFile {
+    /// Reads and decompresses the file: a checkpoint with a snapshot and records.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read or decompressed.
+    pub fn read(&self) -> io::Result<Vec<u8>> {
+        self.read_on(&Disk)
+    }
+
+    pub(super) fn read_on(&self, storage: &impl Storage) -> io::Result<Vec<u8>> {
+        let bytes = storage.read(&self.path, FILE_BYTES_MAX)?;
+        if !self.closed {
+            return Ok(bytes);
+        }
+        let mut text = Vec::new();
+        MultiGzDecoder::new(bytes.as_slice())
+            .take(FILE_BYTES_MAX)
+            .read_to_end(&mut text)?;
+        Ok(text)
+    }
+}
+
+/// Lists the files that together have the history of the checkpoint at `path`, oldest first: the parts of the log, the
+/// previous generation, and the checkpoint itself. Their records may overlap. Links in `path` must be resolved.
+///
+/// # Errors
+///
+/// If the folder cannot be read.
+pub fn files(path: &Path) -> io::Result<Vec<LogFile>> {
+    let names = Names {
+        path: path.to_owned(),
+    };
+    files_on(&Disk, &names)
+}
+
+pub(super) fn files_on(storage: &impl Storage, names: &Names) -> io::Result<Vec<LogFile>> {
+    let parts = names.log_parts(storage)?;
+    // After a crash, a part may be there in both forms.
+    let is_twice = |number: u64, closed: bool| !closed && parts.contains(&(number, true));
+    let parts = parts
+        .iter()
+        .filter(|(number, closed)| !is_twice(*number, *closed));
+    let mut files: Vec<_> = parts
+        .map(|&(number, closed)| LogFile {
+            path: part_path(names, number, closed),
+            closed,
+        })
+        .collect();
+    let live = [previous(&names.path), names.path.clone()];
+    files.extend(live.map(|path| LogFile {
+        path,
+        closed: false,
+    }));
+    Ok(files)
+}

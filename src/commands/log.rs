@@ -1,0 +1,361 @@
+//! `rosrescue log`: shows what changed, when, and who did it.
+
+use std::{
+    collections::VecDeque, io, num::NonZero, path::Path, thread::ScopedJoinHandle, time::Duration,
+};
+
+use serde::Serialize;
+
+use super::{CommandFailure, Exit, files, print_line};
+use crate::{
+    checkpoint::{
+        compare::{Difference, What},
+        format,
+        log::{Entry, LogReader},
+        putback::is_in,
+        store::log::{LogFile, files as log_files},
+    },
+    cli::LogArgs,
+    clock,
+    log::{plain, plain_json},
+    recovery::report_file,
+    status::report::Report,
+};
+
+/// Pause between two looks at the checkpoint with `--follow`.
+const LOOK: Duration = Duration::from_millis(500);
+/// Number of files that `--follow` reads again: the last part of the log, the previous generation and the checkpoint.
+const LIVE_FILES: usize = 3;
+
+pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
+    let path = files::present(&args.place).await;
+    let wanted = Wanted::of(args);
+    let mut reader = LogReader::new(args.hide.hide_values.clone());
+    let mut entries = newest(&path, &wanted, args.lines, &mut reader)?;
+    add_rescues(&mut entries, &path, &wanted);
+    if args.lines > 0 {
+        entries.drain(..entries.len().saturating_sub(args.lines));
+    }
+    for entry in &entries {
+        if !show(entry, args.json)? {
+            return Ok(Exit::Good);
+        }
+    }
+    if !args.follow {
+        return Ok(match entries.is_empty() {
+            true => Exit::Bad,
+            false => Exit::Good,
+        });
+    }
+    loop {
+        tokio::time::sleep(LOOK).await;
+        let files = list(&path)?;
+        let live = files.iter().skip(files.len().saturating_sub(LIVE_FILES));
+        // A file may be replaced while it is read. The next look finds what is missing.
+        live.filter_map(|file| file.read().ok())
+            .for_each(|text| drop(reader.read(&text)));
+        let new = reader.take().into_iter();
+        for entry in new.filter(|entry| wanted.has(entry)) {
+            if !show(&entry, args.json)? {
+                return Ok(Exit::Good);
+            }
+        }
+    }
+}
+
+fn list(path: &Path) -> Result<Vec<LogFile>, CommandFailure> {
+    log_files(path).map_err(|error| {
+        let path = path.display();
+        CommandFailure::Usage(format!("cannot read the folder of `{path}`: {error}"))
+    })
+}
+
+/// Which entries to show.
+struct Wanted<'a> {
+    args: &'a LogArgs,
+    /// In milliseconds since 1970.
+    since: u64,
+    until: u64,
+    /// Whether entries about anything are wanted.
+    all: bool,
+    /// One of these is in each record about a wanted name.
+    words: Vec<String>,
+}
+
+impl<'a> Wanted<'a> {
+    fn of(args: &'a LogArgs) -> Self {
+        let now = clock::wall_millis();
+        let subjects = [&args.param, &args.topic, &args.service, &args.node];
+        Self {
+            args,
+            since: args.since.map_or(0, |since| since.millis(now)),
+            until: args.until.map_or(u64::MAX, |until| until.millis(now)),
+            all: subjects.iter().all(|names| names.is_empty()),
+            words: words_of(args),
+        }
+    }
+
+    fn has_time(&self, at: u64) -> bool {
+        (self.since..=self.until).contains(&at)
+    }
+
+    fn has(&self, entry: &Entry) -> bool {
+        if !self.has_time(entry.at) {
+            return false;
+        }
+        let Some(change) = &entry.change else {
+            return self.all;
+        };
+        let Difference {
+            what, name, node, ..
+        } = change;
+        let args = self.args;
+        let has = |names: &[String], name: &str| names.iter().any(|it| full(it) == name);
+        let subjects = args.param.len() + args.topic.len() + args.service.len();
+        let is_subject = match what {
+            What::Parameter => args
+                .param
+                .iter()
+                .any(|it| is_in(name, it) || is_in(it, name)),
+            What::ParamSubscriber => args.param.iter().any(|it| is_in(name, it)),
+            What::Publisher | What::Subscriber | What::TopicType => has(&args.topic, name),
+            What::Service => has(&args.service, name),
+            What::Node => false,
+        };
+        let is_node = |node: &Option<String>| node.as_ref().is_some_and(|it| has(&args.node, it));
+        let is_by = is_node(&entry.caller)
+            || is_node(node)
+            || (*what == What::Node && has(&args.node, name));
+        (subjects == 0 || is_subject) && (args.node.is_empty() || is_by)
+    }
+
+    /// Leaves out the records that change only unwanted parameters, because to read the YAML of a record takes long.
+    /// Counts the records that may be wanted.
+    fn thin(&self, text: &[u8]) -> Thin {
+        let mut count = 0;
+        let framed = format::scan(text).ok();
+        let thinned = framed.and_then(|framed| {
+            framed.thinned(|line| {
+                let body = std::str::from_utf8(line.body()).unwrap_or_default();
+                let is_named = self.all || self.words.iter().any(|word| body.contains(word));
+                count += usize::from(is_named && self.has_time(line.time()));
+                is_named || !body.contains("Param: [")
+            })
+        });
+        Thin {
+            text: thinned.unwrap_or_default(),
+            count,
+        }
+    }
+}
+
+/// A file without unwanted records.
+struct Thin {
+    text: Vec<u8>,
+    /// Number of records that may be wanted.
+    count: usize,
+}
+
+/// Texts of which each record has one that concerns a wanted name: the last part of the name, or a namespace above it.
+fn words_of(args: &LogArgs) -> Vec<String> {
+    let mut words = Vec::new();
+    for name in [&args.topic, &args.service, &args.node, &args.param]
+        .into_iter()
+        .flatten()
+    {
+        let last = name.trim_end_matches('/').rsplit('/').next();
+        words.push(last.unwrap_or_default().to_owned());
+    }
+    for name in &args.param {
+        let above = name.trim_matches('/').rsplit('/').skip(1);
+        words.extend(above.flat_map(|part| [format!("{part}\""), format!("{part}/\"")]));
+    }
+    if !args.param.is_empty() {
+        words.extend(["\"/\"", "\"~\"", "\"\""].map(str::to_owned));
+    }
+    words
+}
+
+/// The name with a slash at its start.
+fn full(name: &str) -> String {
+    format!("/{}", name.trim_start_matches('/'))
+}
+
+/// Reads at least the newest `lines` wanted entries, or all of them if `lines` is 0. Afterwards `reader` is at the end
+/// of the history.
+fn newest(
+    path: &Path,
+    wanted: &Wanted<'_>,
+    lines: usize,
+    reader: &mut LogReader,
+) -> Result<Vec<Entry>, CommandFailure> {
+    let files = list(path)?;
+    let mut thin: VecDeque<Thin> = VecDeque::new();
+    let mut found = Vec::new();
+    let mut most = lines;
+    loop {
+        let first = files.len() - thin.len();
+        let counted: usize = thin.iter().map(|file| file.count).sum();
+        if first > 0 && (lines == 0 || counted < most || thin.len() < LIVE_FILES) {
+            // Each time as many files as before, so that a short answer is quick.
+            let from = first.saturating_sub(thin.len().max(LIVE_FILES));
+            let more = files.get(from..first).unwrap_or_default();
+            for file in thinned(more, wanted).into_iter().rev() {
+                thin.push_front(file);
+            }
+            continue;
+        }
+        let mut this = reader.clone();
+        found.clear();
+        let mut texts = thin.iter().peekable();
+        let mut left = thin.len();
+        while let Some(file) = texts.next() {
+            left -= 1;
+            let next = texts.peek().map_or(0, |next| next.count);
+            // The file before a wanted one shows what changed between the two.
+            if wanted.all && file.count == 0 && next == 0 && left >= LIVE_FILES {
+                this.forget();
+            } else if !file.text.is_empty() {
+                // A file that cannot be used is as good as none.
+                let _ = this.read(&file.text);
+            }
+            found.extend(this.take().into_iter().filter(|entry| wanted.has(entry)));
+        }
+        if first == 0 || found.len() >= lines {
+            *reader = this;
+            return Ok(found);
+        }
+        // Not every record changes something.
+        most = most.saturating_mul(4);
+    }
+}
+
+/// Reads `files`, several at a time.
+fn thinned(files: &[LogFile], wanted: &Wanted<'_>) -> Vec<Thin> {
+    let threads = std::thread::available_parallelism().map_or(1, NonZero::get);
+    let share = files.len().div_ceil(threads).max(1);
+    std::thread::scope(|scope| {
+        let parts = files.chunks(share).map(|files| {
+            scope.spawn(move || files.iter().map(|file| thin_of(file, wanted)).collect())
+        });
+        let parts: Vec<ScopedJoinHandle<'_, Vec<Thin>>> = parts.collect();
+        let parts = parts.into_iter().filter_map(|part| part.join().ok());
+        parts.flatten().collect()
+    })
+}
+
+fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
+    let text = file.read().unwrap_or_else(|error| {
+        if error.kind() != io::ErrorKind::NotFound {
+            eprintln!("rosrescue: cannot read `{}`: {error}", file.path.display());
+        }
+        Vec::new()
+    });
+    wanted.thin(&text)
+}
+
+/// Adds the rescues of which there is a report, after the last entry before them.
+fn add_rescues(entries: &mut Vec<Entry>, path: &Path, wanted: &Wanted<'_>) {
+    for kept in report_file::read(path) {
+        let at = (kept.report.detected_at * 1e3) as u64;
+        let place = entries.iter().rposition(|entry| entry.at <= at);
+        let seq = place
+            .and_then(|last| entries.get(last))
+            .map_or(0, |it| it.seq);
+        let entry = Entry {
+            seq,
+            at,
+            caller: None,
+            from: None,
+            change: None,
+            event: Some(rescue(&kept.report)),
+        };
+        if wanted.has(&entry) {
+            entries.insert(place.map_or(0, |last| last + 1), entry);
+        }
+    }
+}
+
+fn rescue(report: &Report) -> String {
+    let ended = report.ended.as_ref();
+    let ended = ended.map_or_else(String::new, |how| format!(" ({how})"));
+    let removed = match report.removed.as_slice() {
+        [] => String::new(),
+        nodes => format!("; unregistered {}", nodes.join(", ")),
+    };
+    let (number, cause, total) = (report.number, &report.cause, report.phases.total_ms);
+    format!("rescue {number} after {total:.0} ms: {cause}{ended}{removed}")
+}
+
+/// An entry for programs.
+#[derive(Serialize)]
+struct Line<'a> {
+    time: String,
+    text: String,
+    #[serde(flatten)]
+    entry: &'a Entry,
+}
+
+/// Prints an entry. Returns false if the reader of the output has closed it.
+fn show(entry: &Entry, json: bool) -> Result<bool, CommandFailure> {
+    let time = match entry.at {
+        0 => "at an unknown time       ".to_owned(),
+        at => clock::wall_text_millis(at),
+    };
+    let text = text_of(entry);
+    if json {
+        let line = serde_json::to_string(&Line { time, text, entry });
+        let line = line.map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?;
+        return print_line(&plain_json(&line));
+    }
+    let who = match (&entry.caller, &entry.from) {
+        (Some(caller), Some(from)) => format!("{caller} ({from})  "),
+        (Some(caller), None) => format!("{caller}  "),
+        _ => String::new(),
+    };
+    print_line(&plain(&format!("{time}  {who}{text}")))
+}
+
+fn text_of(entry: &Entry) -> String {
+    let Some(change) = &entry.change else {
+        return entry.event.clone().unwrap_or_default();
+    };
+    let Difference {
+        what,
+        name,
+        node,
+        a,
+        b,
+        ..
+    } = change;
+    let by = match node {
+        Some(node) if entry.caller.as_ref() != Some(node) => format!("{node} "),
+        _ => String::new(),
+    };
+    let kind = b.as_ref().filter(|kind| !kind.is_empty());
+    let kind = kind.map_or_else(String::new, |kind| format!(" ({kind})"));
+    match (what, a, b) {
+        (What::Parameter, Some(a), Some(b)) => format!("set {name}: {a} -> {b}"),
+        (What::Parameter, None, Some(b)) => format!("set {name}: {b}"),
+        (What::Parameter, Some(a), None) => format!("deleted {name}: {a}"),
+        (What::Node, Some(a), Some(b)) => {
+            format!("node {name} at {b} displaced the one at {a}")
+        }
+        (What::Node, None, Some(b)) => format!("node {name} registered, at {b}"),
+        (What::Node, Some(a), None) => format!("node {name} unregistered, was at {a}"),
+        (What::Publisher, _, Some(_)) => format!("{by}publishes {name}{kind}"),
+        (What::Publisher, ..) => format!("{by}no longer publishes {name}"),
+        (What::Subscriber, _, Some(_)) => format!("{by}subscribes {name}{kind}"),
+        (What::Subscriber, ..) => format!("{by}no longer subscribes {name}"),
+        (What::ParamSubscriber, _, Some(_)) => format!("{by}watches the parameter {name}"),
+        (What::ParamSubscriber, ..) => format!("{by}no longer watches the parameter {name}"),
+        (What::Service, Some(a), Some(b)) => format!("service {name} of {b}, was of {a}"),
+        (What::Service, None, Some(b)) => format!("service {name} of {b}"),
+        (What::Service, ..) => format!("no longer provides the service {name}"),
+        (What::TopicType, a, b) => {
+            let of = |kind: &Option<String>| kind.clone().unwrap_or_else(|| "none".to_owned());
+            format!("type of {name}: {} -> {}", of(a), of(b))
+        }
+        (What::Parameter, None, None) | (What::Node, None, None) => name.clone(),
+    }
+}

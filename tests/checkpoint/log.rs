@@ -1,0 +1,120 @@
+//! The log of changes over a long time.
+
+use std::path::Path;
+use std::time::Instant;
+
+use rosrescue::checkpoint::format::{Checkpoint, Label, Origin, RecordContent};
+use rosrescue::checkpoint::log::LogReader;
+use rosrescue::checkpoint::store::{Store, log::files};
+use rosrescue::master::{Master, Request};
+use rosrescue::xmlrpc::{Call, Value};
+
+/// Time of the first record, in milliseconds since 1970.
+const START: u64 = 1_764_115_200_000;
+
+/// A robot with this many nodes, with seven registrations each.
+fn robot(nodes: usize) -> Master {
+    let mut master = Master::default();
+    for number in 0..nodes {
+        let (node, api) = (format!("/node_{number:03}"), format!("http://r:{number}/"));
+        for topic in 0..5 {
+            let topic = format!("/topic_{}", number * 5 + topic);
+            let params = [&*node, &*topic, "std_msgs/String", &*api].map(Value::from);
+            master.apply(&Call::new("registerPublisher", params.to_vec()).into());
+        }
+        for service in ["get_loggers", "set_logger_level"] {
+            let service = format!("{node}/{service}");
+            let params = [&*node, &*service, "rosrpc://r:5", &*api].map(Value::from);
+            master.apply(&Call::new("registerService", params.to_vec()).into());
+        }
+    }
+    master
+}
+
+/// Records a write per second for this long, as `benches/computers/day.rs` does. Every hour one of them sets `/rare`.
+/// Returns the bytes of all records.
+fn record(path: &Path, seconds: u64, nodes: usize) -> u64 {
+    let mut master = robot(nodes);
+    let mut store = Store::open(path).unwrap().0;
+    store.keep_log(48 << 20);
+    let begin = |store: &mut Store, master: &Master| {
+        let mut checkpoint = Checkpoint {
+            seq: store.seq(),
+            snapshot: master.snapshot(),
+            follows: true,
+            ..Checkpoint::default()
+        };
+        checkpoint.session.at = START + store.seq() * 1_000;
+        store.begin(&checkpoint).unwrap();
+    };
+    begin(&mut store, &master);
+    let mut bytes = 0;
+    for second in 1..=seconds {
+        let key = match second % 3_600 {
+            0 => "/rare".to_owned(),
+            _ => format!("/robot/part_{}/state", second % 50),
+        };
+        let value = second as f64 * 0.1;
+        let params = vec!["/robot_state".into(), key.into(), value.into()];
+        let call = Call::new("setParam", params);
+        let label = Label {
+            at: START + second * 1_000,
+            origin: Origin::At([127, 0, 0, 1].into()),
+        };
+        master.apply(&Request::from(call.clone()));
+        let before = store.journal_bytes();
+        store
+            .append(&[RecordContent::labelled(call, label)])
+            .unwrap();
+        bytes += store.journal_bytes() - before;
+        if store.wants_compaction() {
+            begin(&mut store, &master);
+        }
+    }
+    assert_eq!(store.take_log_trouble(), None);
+    bytes
+}
+
+fn read_all(path: &Path) -> LogReader {
+    let mut reader = LogReader::new("".parse().unwrap());
+    for file in files(path).unwrap() {
+        reader.read(&file.read().unwrap()).unwrap();
+    }
+    reader
+}
+
+#[test]
+fn a_long_log_has_every_record_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let seconds = 20_000;
+    record(&path, seconds, 20);
+    let parts = files(&path).unwrap().len();
+    assert!(parts > 3, "{parts}");
+    let entries = read_all(&path).take();
+    let seqs: Vec<u64> = entries.iter().map(|entry| entry.seq).collect();
+    assert_eq!(seqs, (1..=seconds).collect::<Vec<_>>());
+}
+
+/// Run it with `ROSRESCUE_LOG_FOLDER=FOLDER cargo test --release --test checkpoint thirty_days -- --ignored --nocapture`.
+/// The folder then has a checkpoint for `rosrescue log`.
+#[test]
+#[ignore = "a measurement, which takes minutes"]
+fn thirty_days_of_a_robot() {
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = std::env::var("ROSRESCUE_LOG_FOLDER").map(Into::into);
+    let folder = folder.unwrap_or_else(|_| temporary.path().to_owned());
+    let path = folder.join("c.yaml");
+    let seconds = 30 * 86_400;
+    let bytes = record(&path, seconds, 80);
+    let size: u64 = files(&path)
+        .unwrap()
+        .iter()
+        .filter_map(|file| Some(file.path.metadata().ok()?.len()))
+        .sum();
+    println!("{} bytes per record", bytes as f64 / seconds as f64);
+    println!("the log has {:.1} MiB", size as f64 / 1_048_576.0);
+    let begun = Instant::now();
+    let count = read_all(&path).take().len();
+    println!("{count} entries read in {:?}", begun.elapsed());
+}
