@@ -217,7 +217,10 @@ impl<'a> Judge<'a> {
                 }
                 let write = write.flatten();
                 reads.push((op, write));
-                if let Some(write) = write.filter(|it| !it.excused)
+                // A leader may have shown a write that etcd never got, and the writer's own computer has acknowledged it
+                // while it was cut off. The others get it with the merge.
+                let elsewhere = |it: &&Write<'_>| it.alone && it.op.computer != op.computer;
+                if let Some(write) = write.filter(|it| !it.excused && !elsewhere(it))
                     && let Some(acknowledged) = write.op.end
                 {
                     let floor = (end.max(acknowledged), write.op);
@@ -495,6 +498,12 @@ mod tests {
             Some(3),
             "goes back",
         );
+        // A leader had shown it before, and the others do not have it before the merge.
+        let shown = [
+            read(0, 3, 14 * S, 14 * S + 1),
+            read(0, 2, 15 * S, 15 * S + 1),
+        ];
+        good(&with(&shown), &[], Some(3));
         // What it had shown before binds it afterwards.
         let before = [
             write(0, 1, 1, 2),
