@@ -82,6 +82,8 @@ struct Probing {
 struct Before {
     leader: Option<(String, Instant)>,
     released: bool,
+    /// The term that the checkpoint was given last.
+    term: u64,
 }
 
 /// Evidence of another computer with this one's name.

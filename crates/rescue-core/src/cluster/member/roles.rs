@@ -60,8 +60,15 @@ impl Member {
                 }
             }
         }
-        self.act(Action::Term(term));
+        self.keep_term(term);
         self.stand_leading(term);
+    }
+
+    /// Has the checkpoint name the present term.
+    fn keep_term(&mut self, term: u64) {
+        if std::mem::replace(&mut self.before.term, term) != term {
+            self.act(Action::Term(term));
+        }
     }
 
     fn begin_to_lead(&mut self, now: Instant) {
@@ -227,11 +234,8 @@ impl Member {
             return;
         }
         // After a restart, a term that etcd has not reached would mean that etcd has lost its data.
-        if let Some((_, term)) = self.leader()
-            && term != self.own.term
-        {
-            self.own.term = term;
-            self.act(Action::Term(term));
+        if let Some((_, term)) = self.leader() {
+            self.keep_term(term);
         }
         let standing = match self.leader() {
             // Writes answered while cut off must be merged before new calls.
