@@ -83,38 +83,31 @@ fn read_all(path: &Path) -> LogReader {
     reader
 }
 
+/// `ROSRESCUE_DAYS=30 ROSRESCUE_LOG_FOLDER=FOLDER cargo test --release --test checkpoint a_long_log -- --nocapture`
+/// measures a month. The folder then has a checkpoint for `rosrescue log`.
 #[test]
 fn a_long_log_has_every_record_once() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
-    let seconds = 20_000;
-    record(&path, seconds, 20);
-    let parts = files(&path).unwrap().len();
-    assert!(parts > 3, "{parts}");
-    let entries = read_all(&path).take();
-    let seqs: Vec<u64> = entries.iter().map(|entry| entry.seq).collect();
-    assert_eq!(seqs, (1..=seconds).collect::<Vec<_>>());
-}
-
-/// Run it with `ROSRESCUE_LOG_FOLDER=FOLDER cargo test --release --test checkpoint thirty_days -- --ignored --nocapture`.
-/// The folder then has a checkpoint for `rosrescue log`.
-#[test]
-#[ignore = "a measurement, which takes minutes"]
-fn thirty_days_of_a_robot() {
     let temporary = tempfile::tempdir().unwrap();
     let folder = std::env::var("ROSRESCUE_LOG_FOLDER").map(Into::into);
     let folder = folder.unwrap_or_else(|_| temporary.path().to_owned());
     let path = folder.join("c.yaml");
-    let seconds = 30 * 86_400;
+    let days = std::env::var("ROSRESCUE_DAYS").map(|days| days.parse::<u64>().unwrap());
+    let seconds = days.map_or(20_000, |days| days * 86_400);
     let bytes = record(&path, seconds, 80);
-    let size: u64 = files(&path)
-        .unwrap()
+    let parts = files(&path).unwrap();
+    assert!(parts.len() > 3, "{}", parts.len());
+    let size: u64 = parts
         .iter()
         .filter_map(|file| Some(file.path.metadata().ok()?.len()))
         .sum();
-    println!("{} bytes per record", bytes as f64 / seconds as f64);
-    println!("the log has {:.1} MiB", size as f64 / 1_048_576.0);
     let begun = Instant::now();
-    let count = read_all(&path).take().len();
-    println!("{count} entries read in {:?}", begun.elapsed());
+    let entries = read_all(&path).take();
+    println!(
+        "{seconds} records of {} bytes; the log has {:.1} MiB, and is read in {:.1?}",
+        bytes / seconds,
+        size as f64 / 1_048_576.0,
+        begun.elapsed()
+    );
+    let seqs: Vec<u64> = entries.iter().map(|entry| entry.seq).collect();
+    assert_eq!(seqs, (1..=seconds).collect::<Vec<_>>());
 }
