@@ -281,7 +281,8 @@ fn wipe(fleet: &mut Fleet, clients: &Clients) {
     let always = ["--restore", "always"].map(str::to_owned);
     fleet.computers[leader].options.extend(always);
     fleet.computers[leader].start_rescue();
-    fleet.computers[leader].await_answers();
+    let computer = &fleet.computers[leader];
+    eventually("it leads", || computer.role_is("leading"));
     fleet.computers[leader].options = options;
     for other in fleet.others(leader) {
         fleet.computers[other].start_rescue();
