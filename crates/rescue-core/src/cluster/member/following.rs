@@ -255,7 +255,8 @@ impl Member {
             }
         }
         if first {
-            if !self.is_starting_over() {
+            // An empty journal after a loss says nothing of what others have changed.
+            if !self.is_starting_over() || self.journal.progress.seq > 0 {
                 self.cut_off.note_difference(None, &self.journal.state);
             }
             if self
