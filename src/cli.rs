@@ -103,9 +103,10 @@ mod tests {
                     assert_eq!(option.get_env(), None, "{name}: consent by environment");
                     continue;
                 }
-                // They choose a time or a name in the log.
+                // They choose what one run shows of the log.
                 let of_one_run = [
-                    "at", "from", "to", "since", "until", "param", "topic", "service", "node",
+                    "at", "from", "to", "since", "until", "lines", "param", "topic", "service",
+                    "node",
                 ];
                 if of_one_run.contains(&name.as_str()) && option.get_env().is_none() {
                     assert!(!serves, "{name}");

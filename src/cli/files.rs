@@ -124,13 +124,7 @@ pub struct LogArgs {
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     pub until: Option<When>,
     /// Show this many of the newest changes; 0 for all
-    #[arg(
-        short = 'n',
-        long,
-        env = "ROSRESCUE_LOG_LINES",
-        value_name = "COUNT",
-        default_value_t = 1000
-    )]
+    #[arg(short = 'n', long, value_name = "COUNT", default_value_t = 1000)]
     pub lines: usize,
     /// Continue with new changes until Ctrl-C
     #[arg(short, long)]
@@ -156,9 +150,9 @@ pub struct ReportArgs {
     pub output: OutputArgs,
 }
 
-/// Options of `rosrescue restore`.
+/// Where a state comes from.
 #[derive(Args, Clone, Debug)]
-pub struct RestoreArgs {
+pub struct StateArgs {
     /// Checkpoint: a path, or a name or number from `rosrescue history`
     #[arg(value_name = "FILE", required_unless_present = "at")]
     pub file: Option<PathBuf>,
@@ -170,6 +164,13 @@ pub struct RestoreArgs {
         allow_hyphen_values = true
     )]
     pub at: Option<When>,
+}
+
+/// Options of `rosrescue restore`.
+#[derive(Args, Clone, Debug)]
+pub struct RestoreArgs {
+    #[command(flatten)]
+    pub state: StateArgs,
     /// Set only this parameter, or the parameters in this namespace. May be given several times
     #[arg(long, value_name = "NAME")]
     pub param: Vec<String>,
@@ -195,17 +196,8 @@ pub struct RestoreArgs {
 /// Options of `rosrescue params`.
 #[derive(Args, Clone, Debug)]
 pub struct ParamsArgs {
-    /// Checkpoint: a path, or a name or number from `rosrescue history`
-    #[arg(value_name = "FILE", required_unless_present = "at")]
-    pub file: Option<PathBuf>,
-    /// Use the state at this time instead, from the log of changes. `rosrescue log --help` explains times
-    #[arg(
-        long,
-        value_name = "TIME",
-        conflicts_with = "file",
-        allow_hyphen_values = true
-    )]
-    pub at: Option<When>,
+    #[command(flatten)]
+    pub state: StateArgs,
     /// Leave out parameters whose full name matches this regular expression. Case does not matter [default: none]
     #[arg(long, env = "ROSRESCUE_PARAMS_HIDE_VALUES", value_name = "REGEX")]
     pub hide_values: Option<Hide>,

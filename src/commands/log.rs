@@ -26,6 +26,8 @@ use crate::{
 const LOOK: Duration = Duration::from_millis(500);
 /// Number of files that `--follow` reads again: the last part of the log, the previous generation and the checkpoint.
 const LIVE_FILES: usize = 3;
+/// Maximum number of files that are read before those without a wanted entry are dropped.
+const FILES_AT_ONCE: usize = 32;
 
 pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
     let path = files::present(&args.place).await;
@@ -129,27 +131,30 @@ impl<'a> Wanted<'a> {
         (subjects == 0 || is_subject) && (args.node.is_empty() || is_by)
     }
 
+    /// Whether `file`, followed by one with `next` records that may be wanted, has nothing wanted. The file before a
+    /// wanted one shows what changed between the two.
+    fn skips(&self, file: &Thin, next: usize) -> bool {
+        self.all && file.count == 0 && next == 0
+    }
+
     /// Leaves out the records that change only unwanted parameters, because to read the YAML of a record takes long.
     /// Counts the records that may be wanted.
-    fn thin(&self, text: &[u8]) -> Thin {
+    fn thin(&self, text: &[u8]) -> Result<Thin, String> {
         let mut count = 0;
-        let framed = format::scan(text).ok();
-        let thinned = framed.and_then(|framed| {
-            framed.thinned(|line| {
-                let body = std::str::from_utf8(line.body()).unwrap_or_default();
-                let is_named = self.all || self.words.iter().any(|word| body.contains(word));
-                count += usize::from(is_named && self.has_time(line.time()));
-                is_named || !body.contains("Param: [")
-            })
+        let framed = format::scan(text).map_err(|error| error.to_string())?;
+        let thinned = framed.thinned(|line| {
+            let body = std::str::from_utf8(line.body()).unwrap_or_default();
+            let is_named = self.all || self.words.iter().any(|word| body.contains(word));
+            count += usize::from(is_named && self.has_time(line.time()));
+            is_named || !body.contains("Param: [")
         });
-        Thin {
-            text: thinned.unwrap_or_default(),
-            count,
-        }
+        let text = thinned.map_err(|error| error.to_string())?;
+        Ok(Thin { text, count })
     }
 }
 
 /// A file without unwanted records.
+#[derive(Default)]
 struct Thin {
     text: Vec<u8>,
     /// Number of records that may be wanted.
@@ -198,9 +203,13 @@ fn newest(
         let counted: usize = thin.iter().map(|file| file.count).sum();
         if first > 0 && (lines == 0 || counted < most || thin.len() < LIVE_FILES) {
             // Each time as many files as before, so that a short answer is quick.
-            let from = first.saturating_sub(thin.len().max(LIVE_FILES));
+            let from = first.saturating_sub(thin.len().clamp(LIVE_FILES, FILES_AT_ONCE));
             let more = files.get(from..first).unwrap_or_default();
-            for file in thinned(more, wanted).into_iter().rev() {
+            for mut file in thinned(more, wanted).into_iter().rev() {
+                let next = thin.front().map_or(0, |next| next.count);
+                if thin.len() >= LIVE_FILES && wanted.skips(&file, next) {
+                    file.text = Vec::new();
+                }
                 thin.push_front(file);
             }
             continue;
@@ -212,11 +221,10 @@ fn newest(
         while let Some(file) = texts.next() {
             left -= 1;
             let next = texts.peek().map_or(0, |next| next.count);
-            // The file before a wanted one shows what changed between the two.
-            if wanted.all && file.count == 0 && next == 0 && left >= LIVE_FILES {
+            if left >= LIVE_FILES && wanted.skips(file, next) {
                 this.forget();
             } else if !file.text.is_empty() {
-                // A file that cannot be used is as good as none.
+                // It was reported when it was read.
                 let _ = this.read(&file.text);
             }
             found.extend(this.take().into_iter().filter(|entry| wanted.has(entry)));
@@ -245,13 +253,20 @@ fn thinned(files: &[LogFile], wanted: &Wanted<'_>) -> Vec<Thin> {
 }
 
 fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
-    let text = file.read().unwrap_or_else(|error| {
-        if error.kind() != io::ErrorKind::NotFound {
-            eprintln!("rosrescue: cannot read `{}`: {error}", file.path.display());
+    let path = file.path.display();
+    let text = match file.read() {
+        Ok(text) => text,
+        Err(error) => {
+            if error.kind() != io::ErrorKind::NotFound {
+                eprintln!("rosrescue: cannot read `{path}`: {error}");
+            }
+            return Thin::default();
         }
-        Vec::new()
-    });
-    wanted.thin(&text)
+    };
+    wanted.thin(&text).unwrap_or_else(|why| {
+        eprintln!("rosrescue: left out `{path}`: {why}");
+        Thin::default()
+    })
 }
 
 /// Adds the rescues of which there is a report, after the last entry before them.

@@ -16,7 +16,7 @@ use crate::{
 };
 
 pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {
-    let opened = files::read_either(args.file.as_deref(), args.at, &args.read).await?;
+    let opened = files::read_either(args.state.file.as_deref(), args.state.at, &args.read).await?;
     let mut tree = opened.state.params().clone();
     let mut left_out = Vec::new();
     if let Some(hide) = &args.hide_values {

@@ -27,7 +27,7 @@ const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 
 pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
-    let file = files::read_either(args.file.as_deref(), args.at, &args.read).await?;
+    let file = files::read_either(args.state.file.as_deref(), args.state.at, &args.read).await?;
     let mut live = Live::connect(&Running::find(&args.target)?).await?;
     let now = live.state(&file.state).await?;
     let between = |now: &Master| {
@@ -37,7 +37,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
     };
     let params = between(&now);
     let mut restored = Restored {
-        file: match args.at {
+        file: match args.state.at {
             Some(_) => file.moment(),
             None => file.path.display().to_string(),
         },

@@ -86,11 +86,14 @@ fn is_change(mut messages: &[u8], links: &mut BTreeMap<[u8; 4], u32>) -> bool {
         let kind = messages.get(4..6).and_then(|kind| kind.try_into().ok());
         match kind.map(u16::from_ne_bytes) {
             Some(NEW_ADDRESS | DELETED_ADDRESS) => changed = true,
-            Some(NEW_LINK | DELETED_LINK) => {
+            Some(NEW_LINK) => {
                 if let (Some(number), Some(flags)) = (word(20), word(24)) {
                     let flags = u32::from_ne_bytes(flags) & PASSES;
                     changed |= links.insert(number, flags) != Some(flags);
                 }
+            }
+            Some(DELETED_LINK) => {
+                changed |= word(20).is_some_and(|number| links.remove(&number).is_some());
             }
             _ => {}
         }
@@ -129,7 +132,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
 }
 
 fn say_blind(error: &io::Error) {
-    tracing::debug!(%error, "cannot watch this computer's addresses");
+    tracing::info!(%error, "cannot watch this computer's addresses; a lost one is not reported");
 }
 
 impl Nodes {

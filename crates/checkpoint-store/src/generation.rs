@@ -163,8 +163,8 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the log, or if there is none, the previous generation, which would be replaced anyway. Never removes the present file, because it is
-    /// the only copy until the new generation is complete.
+    /// Removes the log, or if there is none, the previous generation, which would be replaced anyway. Never removes the
+    /// present file, because it is the only copy until the new generation is complete.
     fn make_room(&self) -> bool {
         if super::log::locked(&self.log).remove(&self.storage, &self.names) {
             return true;

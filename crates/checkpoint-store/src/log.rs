@@ -65,7 +65,9 @@ pub(super) fn locked<S: Storage>(log: &Mutex<LogKeeper<S>>) -> MutexGuard<'_, Lo
 impl<S: Storage> LogKeeper<S> {
     /// Notes that the snapshot of this generation does not follow from the records before it.
     pub(super) fn breaks_at(&mut self, generation: u64) {
-        self.breaks.insert(generation);
+        if self.bytes_max > 0 {
+            self.breaks.insert(generation);
+        }
     }
 
     /// Adds the records of the generation at `path` that the log lacks. A failure leaves them out.

@@ -217,7 +217,11 @@ impl LogReader {
             ));
         }
         if before.term != after.term {
-            events.push(format!("this computer took over: term {}", after.term));
+            // A follower's checkpoint names the term, too.
+            events.push(format!(
+                "a computer took over as the leader: term {}",
+                after.term
+            ));
         }
         if !before.closed && after.closed {
             events.push("rosrescue was stopped".to_owned());

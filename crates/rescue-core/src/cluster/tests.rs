@@ -215,6 +215,39 @@ fn a_computer_that_starts_after_etcd_has_lost_its_data_follows_at_once() {
     }
 }
 
+/// A computer is cut off, and etcd loses its data meanwhile. The computer starts again with the writes that it kept, and
+/// has seen nothing of what the others have changed since.
+#[test]
+fn writes_kept_through_a_loss_of_etcd_replace_no_newer_ones() {
+    let (mut lost_by_three, mut kept) = (0, 0);
+    for seed in first()..first() + schedules().min(100) {
+        let mut world = calm(seed);
+        // A late term, so that the checkpoint names one that the new etcd has not reached.
+        world.run(Duration::from_secs(8));
+        let before = world.leaders()[0];
+        world.hand_over(before);
+        world.until_another_leads(before);
+        world.run(Duration::from_secs(1));
+        let leader = world.leaders()[0];
+        let lonely = (leader + 1) % 3;
+        world.cut_off(lonely);
+        world.run(Duration::from_secs(6));
+        world.lose_etcd();
+        while world.counts.etcds_lost < 2 || world.leaders().len() != 1 {
+            world.run(Duration::from_millis(200));
+        }
+        world.run(Duration::from_secs(1));
+        world.kill(lonely);
+        world.heal();
+        world.run(Duration::from_secs(10));
+        lost_by_three += u64::from(world.counts.etcds_lost == 3);
+        kept += world.counts.merged + world.counts.reported;
+        world.check();
+    }
+    println!("{lost_by_three} times the third computer noticed the loss, {kept} writes were kept");
+    assert!(lost_by_three > 0 && kept > 0 || schedules() < 20);
+}
+
 /// A schedule in which etcd loses its data while nothing else fails.
 fn lost(seed: u64) -> World {
     let mut world = calm(seed);

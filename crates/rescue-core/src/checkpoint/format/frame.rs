@@ -321,14 +321,21 @@ impl<'a> Framed<'a> {
         Ok(self.bytes.get(..length).unwrap_or_default())
     }
 
-    /// The file's text with only those records that `keeps` is true for. `None` without a usable snapshot.
-    pub fn thinned(&self, mut keeps: impl FnMut(&Line<'_>) -> bool) -> Option<Vec<u8>> {
-        let mut text = self.head().ok()?.to_vec();
+    /// The file's text with only those records that `keeps` is true for.
+    ///
+    /// # Errors
+    ///
+    /// If there is no usable snapshot.
+    pub fn thinned(
+        &self,
+        mut keeps: impl FnMut(&Line<'_>) -> bool,
+    ) -> Result<Vec<u8>, SnapshotError> {
+        let mut text = self.head()?.to_vec();
         for line in self.lines.iter().filter(|line| keeps(line)) {
             let end = line.offset + line.body.len() + CHECK_BYTES + 1;
-            text.extend_from_slice(self.bytes.get(line.offset..end)?);
+            text.extend_from_slice(self.bytes.get(line.offset..end).unwrap_or_default());
         }
-        Some(text)
+        Ok(text)
     }
 
     /// Wall clock time of the snapshot, in milliseconds since 1970; see [`Session::at`](super::Session::at). 0 without a

@@ -128,6 +128,12 @@ fn a_change_without_a_record_and_the_events_of_a_session_are_listed() {
     );
     let closed = |session: &mut Session| (session.incarnation, session.closed) = (2, true);
     assert_eq!(events(&closed, &mut reader), ["rosrescue was stopped"]);
+    let term =
+        |session: &mut Session| (session.incarnation, session.closed, session.term) = (2, true, 9);
+    assert_eq!(
+        events(&term, &mut reader),
+        ["a computer took over as the leader: term 9"]
+    );
 }
 
 /// The clock jumps back and forth by hours. The state at a time is that after the last record with that time or an

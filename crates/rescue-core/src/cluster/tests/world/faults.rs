@@ -236,6 +236,11 @@ impl World {
     }
 
     /// Stops etcd, which comes back without its data.
+    /// Cuts a computer off until the world heals.
+    pub(in super::super) fn cut_off(&mut self, at: usize) {
+        self.strike(Fault::CutOff(at), u64::from(u32::MAX));
+    }
+
     pub(in super::super) fn lose_etcd(&mut self) {
         let time = (20 + self.dice.below(6000)) * MS;
         self.strike(Fault::EtcdAway, time);
