@@ -21,6 +21,9 @@ use crate::{
     xmlrpc::Value,
 };
 
+/// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
+pub(super) const TELLER: &str = "/rosrescue";
+
 /// Which writes of a computer that was cut off are sent to the leader, and which are lost.
 #[derive(Debug, Default, PartialEq)]
 pub struct Merged {

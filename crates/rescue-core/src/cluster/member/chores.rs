@@ -39,10 +39,15 @@ impl Chores {
         self.say_at = Some(now);
     }
 
-    /// Has the file of kept writes deleted once the journal has record `seq`. If the leader lost its power before, the
-    /// writes would be lost without a report.
+    /// Keeps the file of kept writes as it is until the journal has record `seq`. If the leader lost its power before,
+    /// the writes would be lost without a report.
     pub(super) fn keep_until(&mut self, seq: u64) {
         self.kept_until = Some(seq);
+    }
+
+    /// Whether the file of kept writes must stay as it is.
+    pub(super) fn keeps_file(&self) -> bool {
+        self.kept_until.is_some()
     }
 }
 

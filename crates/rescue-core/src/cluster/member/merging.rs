@@ -11,7 +11,7 @@ use crate::{
     cluster::{
         machine::Role,
         merge::{
-            self, Changes, parameter_of, weight,
+            self, Changes, TELLER, parameter_of, weight,
             wire::{self, Ask, WriteOutcome},
         },
         mutant::Mutant,
@@ -22,8 +22,6 @@ use crate::{
 
 /// Pause before a request that the leader did not answer is sent again.
 const AGAIN: Duration = Duration::from_millis(100);
-/// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
-const TELLER: &str = "/rosrescue";
 /// How often the merge sets parameters again that others keep changing. The limit is low, because calls wait for the
 /// end of the merge, and each change by others notifies the nodes, too.
 const ROUNDS_MAX: u32 = 3;
@@ -291,7 +289,9 @@ impl Member {
         };
         self.cut_off.sent();
         self.chores.say_at(now);
-        self.keep_all();
+        if !self.chores.keeps_file() {
+            self.keep_all();
+        }
         self.adopt();
         if let (Role::Leading, Some(term)) = (self.role, self.machine.term()) {
             self.stand_leading(term);

@@ -53,11 +53,9 @@ impl Member {
                 self.act(Action::ServeOwnOnly(false));
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
-                if self.cut_off.is_empty() {
-                    let last = self.outgoing.changes().last().map_or(0, |of| of.seq());
-                    let at_once = Mutant::DeletesKeptWrites.lives();
-                    self.chores.keep_until(if at_once { 0 } else { last });
-                }
+                let last = self.outgoing.changes().last().map_or(0, |of| of.seq());
+                let at_once = Mutant::DeletesKeptWrites.lives();
+                self.chores.keep_until(if at_once { 0 } else { last });
             }
         }
         self.keep_term(term);
@@ -179,8 +177,8 @@ impl Member {
         if self.records() {
             self.chores.notifying.stop();
         }
-        // A computer that is cut off has its own history.
-        let binds = self.role != Role::Alone;
+        // A computer that is cut off and serves has its own history.
+        let binds = !self.keeps();
         self.act(Action::Leave { binds });
         let known = self.knows();
         self.stand(Standing::Nobody { known });

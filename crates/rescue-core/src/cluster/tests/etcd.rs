@@ -53,6 +53,8 @@ pub(super) struct Etcd {
     pub(super) log: Vec<(u64, Held)>,
     /// The term of each entry of the log.
     pub(super) terms: Vec<u64>,
+    /// The computer that added each entry of the log.
+    pub(super) writers: Vec<usize>,
     pub(super) now: u64,
     /// Whether all data was lost once.
     pub(super) lost: bool,
@@ -71,6 +73,7 @@ impl Etcd {
             claims: Vec::new(),
             log: Vec::new(),
             terms: Vec::new(),
+            writers: Vec::new(),
             now: 0,
             lost: false,
         }
@@ -121,6 +124,7 @@ impl Etcd {
             claims: std::mem::take(&mut self.claims),
             log: std::mem::take(&mut self.log),
             terms: std::mem::take(&mut self.terms),
+            writers: std::mem::take(&mut self.writers),
             now: self.now,
             lost: true,
             ..Self::new()
@@ -242,6 +246,7 @@ impl Etcd {
         }
         self.log.push((self.now, held.clone()));
         self.terms.push(self.view.guard().leader);
+        self.writers.push(*self.claims.last().unwrap());
         self.entries.insert(seq, (held, bytes));
         seq
     }
@@ -292,7 +297,10 @@ impl Etcd {
         if seq < first {
             return None;
         }
-        let entries = self.entries.range(seq + 1..=upto.max(seq + 1));
+        let entries = self
+            .entries
+            .range(seq + 1..)
+            .take_while(|(of, _)| **of <= upto);
         let entries = entries.map(|(seq, (held, bytes))| match held {
             Held::State(_) => Entry::Apart(*seq),
             Held::Records(records) => Entry::Records {

@@ -413,6 +413,7 @@ impl History {
                     continue;
                 }
                 let first = places.changed[of].first();
+                let first = first.filter(|at| etcd.writers[*at / 1000] != call.computer);
                 if first.is_some_and(|at| *at >= cut * 1000 && at < merged) {
                     return Err(format!("{call:?} has replaced {other:?} of others"));
                 }

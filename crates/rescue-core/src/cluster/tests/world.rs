@@ -465,7 +465,7 @@ impl World {
             if let Some(mut said) = said
                 && !actions.is_empty()
             {
-                said.truncate(300);
+                said.truncate(1500);
                 let mut all = format!("{actions:?}");
                 all.truncate(1500);
                 self.trace(|| format!("{at}: {said} -> {all}"));

@@ -235,12 +235,12 @@ impl World {
         self.start(leader);
     }
 
-    /// Stops etcd, which comes back without its data.
     /// Cuts a computer off until the world heals.
     pub(in super::super) fn cut_off(&mut self, at: usize) {
         self.strike(Fault::CutOff(at), u64::from(u32::MAX));
     }
 
+    /// Stops etcd, which comes back without its data.
     pub(in super::super) fn lose_etcd(&mut self) {
         let time = (20 + self.dice.below(6000)) * MS;
         self.strike(Fault::EtcdAway, time);
