@@ -129,6 +129,12 @@ impl Machine {
         self.leadership.map(|leadership| leadership.term)
     }
 
+    /// Whether recorded changes go to the journal: this process leads, and had read the whole journal before its first
+    /// change.
+    pub fn writes_journal(&self) -> bool {
+        self.leadership.is_some_and(|of| of.caught_up)
+    }
+
     /// The last record of this computer that is known to be in the journal.
     pub fn committed(&self) -> u64 {
         self.committed

@@ -114,13 +114,10 @@ pub struct Member {
     reading: Reading,
     place: Place,
     outgoing: Outgoing,
-    /// The last record whose call was answered, since calls began to be recorded here.
-    acknowledged: u64,
     cut_off: CutOff,
     merging: Merging,
     before: Before,
     namesake: Namesake,
-    deciding: bool,
     probing: Probing,
     release: Release,
     chores: Chores,
@@ -154,12 +151,10 @@ impl Member {
             reading: Reading::default(),
             place: Place::default(),
             outgoing: Outgoing::default(),
-            acknowledged: 0,
             cut_off: left,
             merging: Merging::new(id),
             before: Before::default(),
             namesake: Namesake::default(),
-            deciding: false,
             probing: Probing::default(),
             release: Release::default(),
             chores: Chores::default(),
@@ -187,7 +182,7 @@ impl Member {
             Input::Forwarded(calls) => self.cut_off.expect(calls),
             Input::Prepared(leads) => self.prepared(leads),
             Input::Decided { seq, goes_on } => {
-                self.deciding = false;
+                self.reading.deciding = false;
                 self.tell_machine(machine::Input::Decided { seq, goes_on });
             }
             Input::Probed { number, leads } => self.probed(number, leads),
@@ -332,7 +327,7 @@ impl Member {
                 machine::Action::CatchUp(seq) => self.reading.wanted = Some(seq),
                 machine::Action::Become(role) => self.become_role(now, role),
                 machine::Action::Acknowledge(seq) => {
-                    self.acknowledged = seq;
+                    self.outgoing.acknowledged = seq;
                     self.act(Action::Acknowledge(seq));
                 }
                 machine::Action::Yield {

@@ -25,6 +25,8 @@ pub struct Outgoing {
     ready: u64,
     /// The last change whose parts are all in etcd.
     written: u64,
+    /// The last change whose call was answered.
+    pub acknowledged: u64,
     /// Whether the parts of the next change are being written.
     pub preparing: bool,
 }
@@ -35,6 +37,7 @@ impl Outgoing {
         *self = Self {
             ready: seq,
             written: seq,
+            acknowledged: seq,
             ..Self::default()
         };
     }

@@ -31,6 +31,8 @@ pub(super) struct Reading {
     /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
     fresh: Option<u8>,
     watching: bool,
+    /// Whether it is being found out if the session in etcd continues.
+    pub(super) deciding: bool,
     /// The keys `leader` and `alive` as etcd showed them last, also before the machine starts.
     view: View,
 }
@@ -101,7 +103,7 @@ impl Member {
     fn decide(&mut self, seq: u64) {
         let waits = self.machine.role() == Role::CatchingUp
             && self.machine.session() == JournalSession::Unknown
-            && !self.deciding;
+            && !self.reading.deciding;
         if !waits {
             return;
         }
@@ -109,7 +111,7 @@ impl Member {
             let goes_on = true;
             return self.tell_machine(machine::Input::Decided { seq, goes_on });
         }
-        self.deciding = true;
+        self.reading.deciding = true;
         let (state, closed) = (self.journal.state.clone(), self.before.released);
         self.act(Action::Decide { seq, state, closed });
     }
@@ -181,7 +183,7 @@ impl Member {
         if self.follows() {
             let mut state = self.cut_off.on(&self.journal.state);
             // Also the writes answered as a leader, as long as it is unknown whether another computer leads.
-            let (held, answered) = (self.journal.progress.seq, self.acknowledged);
+            let (held, answered) = (self.journal.progress.seq, self.outgoing.acknowledged);
             self.outgoing.apply(held + 1..=answered, &mut state);
             self.act(Action::FollowState(state));
         }

@@ -46,7 +46,7 @@ impl Member {
             return;
         }
         let is_alone = self.machine.role() == Role::Alone;
-        let leads_on = self.machine.term().is_some();
+        let leads_on = self.machine.writes_journal();
         if self.keeps() {
             let ours = changes.iter().filter(|of| is_ours(of));
             let kept = self.cut_off.add(ours, leads_on);
@@ -57,7 +57,7 @@ impl Member {
             return self.prepare();
         }
         self.outgoing.all_ready();
-        // Without a term the changes never go to the journal. A later leader gets the kept writes instead.
+        // If the changes never go to the journal, a later leader gets the kept writes instead.
         match leads_on {
             false => self.outgoing.forget(),
             true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),

@@ -279,7 +279,7 @@ impl Member {
     }
 
     /// Finishes the oldest period of being cut off: all its writes have been sent.
-    fn merged(&mut self, now: Instant) {
+    pub(super) fn merged(&mut self, now: Instant) {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
         self.tell(News::Merged { sent, lost });
         self.merging = Merging {

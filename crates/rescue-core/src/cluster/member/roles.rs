@@ -82,7 +82,6 @@ impl Member {
         let owns = std::mem::take(&mut self.own_wins);
         let seq = self.machine.committed();
         self.outgoing.start(seq);
-        self.acknowledged = seq;
         let held = self.journal.state.clone();
         let state = match over {
             true => Some(Master::default()),
@@ -114,7 +113,7 @@ impl Member {
         self.act(Action::ServeOwnOnly(true));
         if led {
             // Recorded calls are answered from now on, except forwarded ones, which their computers send elsewhere.
-            let answered = self.acknowledged;
+            let answered = self.outgoing.acknowledged;
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
@@ -125,7 +124,6 @@ impl Member {
             self.act(Action::AskForwarded);
             let seq = self.machine.committed();
             self.outgoing.start(seq);
-            self.acknowledged = seq;
             let (held, state) = (base.clone(), Some(base));
             self.act(Action::Lead { seq, held, state });
         }

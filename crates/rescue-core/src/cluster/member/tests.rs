@@ -170,3 +170,18 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
     assert_eq!(states.next(), Some(&last.into()));
     assert_eq!(states.next(), None);
 }
+
+/// A leader that was cut off twice leads again, and its journal lacks the writes of the second time when those of the
+/// first have been merged. A power cut would lose them.
+#[test]
+fn the_end_of_a_merge_keeps_the_file_of_writes_that_the_journal_lacks() {
+    let keeps_nothing = |member: &mut Member| {
+        member.merged(Instant::now());
+        let mut actions = member.queue.actions.drain(..);
+        actions.any(|action| matches!(action, Action::KeepNothing))
+    };
+    assert!(keeps_nothing(&mut Merges::new().member));
+    let mut member = Merges::new().member;
+    member.chores.keep_until(5);
+    assert!(!keeps_nothing(&mut member));
+}

@@ -485,7 +485,23 @@ impl History {
                 same && (call.reported || brought_back(call))
             })
         };
-        for read in reads.iter().filter(|read| !lost(read.value)) {
+        // The same value may also come from a write that is in no journal, or was answered while cut off. Then it is
+        // unknown which write a read shows.
+        let in_vain = |read: &&Read| {
+            let mut calls = self.calls.iter().zip(&places.of);
+            calls.any(|(call, places)| {
+                let same = call.key == key && Some(call.value) == read.value;
+                let in_vain = places.is_empty() || call.alone.is_some();
+                same && in_vain && Some(call.made) <= read.done
+            })
+        };
+        let several = |read: &&Read| {
+            let same = self.calls.iter();
+            let same = same.filter(|of| of.key == key && Some(of.value) == read.value);
+            same.count() > 1
+        };
+        let counts = |read: &&&Read| !lost(read.value) && !(several(read) && in_vain(read));
+        for read in reads.iter().filter(counts) {
             if let Some((first, _)) = places.of_value(self, key, read.value) {
                 // What a leader showed early counts once the journal has it. If it was lost with the leader and made
                 // again, it may have been gone in between.
@@ -504,16 +520,6 @@ impl History {
                 }
             }
         }
-        // The same value may also come from a write that is in no journal, or was answered while cut off. Then it is
-        // unknown which write a read shows.
-        let in_vain = |read: &&Read| {
-            let mut calls = self.calls.iter().zip(&places.of);
-            calls.any(|(call, places)| {
-                let same = call.key == key && Some(call.value) == read.value;
-                let in_vain = places.is_empty() || call.alone.is_some();
-                same && in_vain && Some(call.made) <= read.done
-            })
-        };
         let counts = |read: &&Read| read.shows == Shows::Agreed && !in_vain(read);
         for read in reads.into_iter().filter(counts) {
             let Some((_, last)) = places.of_value(self, key, read.value) else {
