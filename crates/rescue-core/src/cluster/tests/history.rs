@@ -328,6 +328,7 @@ impl History {
             .clone()
             .map(|(_, call)| call.heard.unwrap_or(u64::MAX))
             .max();
+        let last_alone = same.clone().any(|(_, call)| call.alone.is_some());
         for (number, call) in of_key {
             let Some(heard) = call.heard.filter(|_| Some(call.value) != last) else {
                 continue;
@@ -360,7 +361,9 @@ impl History {
             });
             let unchanged = call.unchanged || in_vain || equalled;
             let excused = call.reported || call.unsynced || superseded || unchanged;
-            if may_be_lost && !alone || alone && excused {
+            // A write that changed nothing is in no journal, so it does not win over one that was answered alone before.
+            let unseen = call.unchanged && last_alone;
+            if (may_be_lost || unseen) && !alone || alone && excused {
                 continue;
             }
             let older = last_heard.is_none_or(|of| of < call.made);
