@@ -1,8 +1,8 @@
-//! Numbered writes, reads and notifications of all three computers under random failures. A checker that knows nothing of
-//! computers judges what was seen.
+//! Writes, reads and notifications on three computers under random failures. The checker compares what clients saw with
+//! the promises; it knows nothing about the implementation.
 //!
-//! `ROSRESCUE_FAULTS` is how many failures there are, `ROSRESCUE_SEED` decides which. Without the first one there are a
-//! few, of the kinds that are over soon.
+//! `ROSRESCUE_FAULTS` sets the number of failures and `ROSRESCUE_SEED` the random numbers. Without `ROSRESCUE_FAULTS` a
+//! few short failures are played.
 
 use std::fs;
 use std::thread::sleep;
@@ -22,15 +22,15 @@ use checker::violations;
 use clients::Clients;
 use faults::{Fault, Lasting};
 
-/// In a run of everything.
+/// How many failures are played by default.
 const FAULTS: usize = 6;
-/// After so many the robot comes to rest, and all is checked.
+/// After this many failures, nothing fails for a while, and the history is checked.
 const CHAPTER: usize = 8;
 /// The longest time that a failure lasts.
 const LONGEST: Duration = Duration::from_secs(5);
-/// How long what was acknowledged may take until it is everywhere when all computers already say the same.
+/// How long an acknowledged write may take to reach all computers after they agree on a state.
 const SETTLE: Duration = Duration::from_secs(30);
-/// What comes late is there by then.
+/// Pause before the state is checked again, for notifications that arrive late.
 const LATE: Duration = Duration::from_secs(2);
 
 #[test]
@@ -54,7 +54,7 @@ fn every_promise_is_kept_under_random_failures() {
     println!("{all} failures, {calls} calls that were answered, and no promise was broken");
 }
 
-/// So many failures one after the other, some at the same time, and the judgement. How many calls were answered?
+/// Plays `count` failures, some at the same time, and checks the history. Returns the number of answered calls.
 #[track_caller]
 fn chapter(fleet: &mut Fleet, name: &str, count: usize, chance: &mut Chance) -> usize {
     let begin = Instant::now();
@@ -115,7 +115,7 @@ fn chapter(fleet: &mut Fleet, name: &str, count: usize, chance: &mut Chance) -> 
     answered
 }
 
-/// Panics with all that is not as promised.
+/// Panics with all broken promises.
 #[track_caller]
 fn judge(fleet: &Fleet, clients: &Clients, name: &str) {
     let begin = Instant::now();

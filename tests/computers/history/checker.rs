@@ -1,22 +1,22 @@
-//! What was promised, and whether a recorded history keeps it. No clock, no network: times are microseconds from the start.
+//! Checks a recorded history against the promises. Times are microseconds from the start.
 //!
-//! * An acknowledged write is in the final state, or a later one is. The exception is a write that a computer
-//!   acknowledged while it was alone: it may lose against others, and then a warning names both values.
-//! * On one computer no read goes back, and none misses a write that was acknowledged there before, except while it is alone.
-//!   The value of a write that nobody acknowledged may disappear again.
-//! * Nobody reads what nobody wrote.
-//! * What a subscriber was told last is what the final state says.
-//! * No two computers lead at the same moment, and no two in the same term.
+//! * The final state has each acknowledged write, or a later one. The exception is a write that a computer acknowledged
+//!   while it was cut off: it may lose against others' writes, and then a warning names both values.
+//! * On one computer no read goes back, and none misses a write that was acknowledged there before, except while the
+//!   computer is cut off. The value of a write that was not acknowledged may disappear again.
+//! * Each value that is read was written.
+//! * The last notification of a subscriber has the value in the final state.
+//! * No two computers lead at the same time, and no two in the same term.
 //!
-//! A write is later than another one if it began after that one was acknowledged. Of writes that overlap either one may be
-//! the last. One that failed may still take effect at any time.
+//! A write is later than another one if it began after that one was acknowledged. Of two writes that overlap, either may
+//! be the last. A write that failed may take effect at any time.
 
 use std::collections::BTreeMap;
 
 /// Microseconds from the start of a history.
 pub(crate) type Time = u64;
 
-/// What a parameter is; each value is written once. None: it is not set.
+/// The value of a parameter. Each value is written once. `None` if the parameter is not set.
 pub(crate) type Value = Option<i32>;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,11 +32,11 @@ pub(crate) struct Op {
     pub(crate) key: String,
     pub(crate) what: What,
     pub(crate) start: Time,
-    /// When it was answered. None: it failed.
+    /// When the call was answered. `None` if it failed.
     pub(crate) end: Option<Time>,
 }
 
-/// A warning: what this computer acknowledged while it was alone does not hold.
+/// A warning about a lost write, which this computer acknowledged while it was cut off.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Loss {
     pub(crate) computer: usize,
@@ -44,7 +44,7 @@ pub(crate) struct Loss {
     pub(crate) value: i32,
 }
 
-/// What a computer said of itself, some time between the two moments.
+/// The role that a computer reported at some time between `from` and `to`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Sample {
     pub(crate) computer: usize,
@@ -56,13 +56,13 @@ pub(crate) struct Sample {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Says {
     Alone,
-    /// It leads, in this term if it says so, and calls pass to its master.
+    /// The computer leads, and calls pass to its master. The term, if it is known.
     Leads(Option<u64>),
-    /// Anything else.
+    /// Any other role.
     Other,
 }
 
-/// The last notification of a parameter that a subscriber got. None: there was none.
+/// The value in a subscriber's last notification of a parameter. `None` without a notification.
 #[derive(Clone, Debug)]
 pub(crate) struct Told {
     pub(crate) subscriber: String,
@@ -77,20 +77,20 @@ pub(crate) struct History {
     pub(crate) samples: Vec<Sample>,
 }
 
-/// The state after all failures, which all computers agree on.
+/// The final state, on which all computers agree.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct End {
     pub(crate) values: BTreeMap<String, i32>,
     pub(crate) told: Vec<Told>,
 }
 
-/// Whoever says that it is alone may have been so for this long without a sample, and until this long after the last one.
+/// A computer may have been cut off this long before the first sample that says so, and after the last one.
 const ALONE_SLACK: Time = 500_000;
 
-/// Two samples that are this close together leave no room for a leader that stood still in between.
+/// Between two samples this close together, a leader cannot have been paused and deposed.
 const CLOSE: Time = 400_000;
 
-/// All that is wrong, as sentences.
+/// Describes each broken promise in a sentence.
 pub(crate) fn violations(history: &History, end: &End) -> Vec<String> {
     let judge = Judge::new(history);
     let keys = judge.writes_by_key();
@@ -104,19 +104,19 @@ pub(crate) fn violations(history: &History, end: &End) -> Vec<String> {
     wrong
 }
 
-/// A write, and what is known of it.
+/// A write and what is known about it.
 #[derive(Clone, Copy, Debug)]
 struct Write<'a> {
     op: &'a Op,
     value: i32,
-    /// A computer that was alone may have acknowledged it.
+    /// Whether the computer may have been cut off when it acknowledged the write.
     alone: bool,
-    /// Nobody has to find it in the end.
+    /// Whether the final state may lack the write.
     excused: bool,
 }
 
 impl Write<'_> {
-    /// Whether every order of the two has this one first.
+    /// Whether this write was acknowledged before `other` began.
     fn is_before(&self, other: &Write<'_>) -> bool {
         self.op.end.is_some_and(|end| end < other.op.start)
     }
@@ -166,7 +166,7 @@ impl<'a> Judge<'a> {
         losses.any(|it| it.computer == op.computer && it.key == op.key && it.value == value)
     }
 
-    /// Acknowledged writes that are neither in the final state nor before a write that is there.
+    /// Acknowledged writes that are missing in the final state, and are not older than the write that is there.
     fn lost(&self, key: &str, writes: &[Write<'_>], end: &End) -> Vec<String> {
         let last = match end.values.get(key) {
             None => None,
@@ -191,11 +191,11 @@ impl<'a> Judge<'a> {
         )]
     }
 
-    /// Reads that are older than what their computer has shown or acknowledged before.
+    /// Reads that return an older value than one that their computer had shown or acknowledged before.
     fn reads(&self, key: &str, writes: &[Write<'_>]) -> Vec<String> {
         let mut wrong = Vec::new();
         let by_value: BTreeMap<i32, &Write<'_>> = writes.iter().map(|it| (it.value, it)).collect();
-        // From when on a computer may show nothing that is older than the start of which write.
+        // By computer: from this time on, no read may be older than this write.
         let mut floors: BTreeMap<usize, Vec<(Time, &Op)>> = BTreeMap::new();
         let mut reads = Vec::new();
         for op in self.history.ops.iter().filter(|op| op.key == key) {
@@ -217,8 +217,8 @@ impl<'a> Judge<'a> {
                 }
                 let write = write.flatten();
                 reads.push((op, write));
-                // A leader may have shown a write that etcd never got, and the writer's own computer has acknowledged it
-                // while it was cut off. The others get it with the merge.
+                // A leader may have shown a write that etcd never got, and the writer's computer acknowledged it later,
+                // while it was cut off. The others get such a write with the merge.
                 let elsewhere = |it: &&Write<'_>| it.alone && it.op.computer != op.computer;
                 if let Some(write) = write.filter(|it| !it.excused && !elsewhere(it))
                     && let Some(acknowledged) = write.op.end
@@ -261,7 +261,7 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// Only the last one of the writes that a computer acknowledges alone has to last, or to be reported.
+/// Of the writes that a computer acknowledged while it was cut off, only the last one must hold or be reported.
 fn excuse_replaced(writes: &mut [Write<'_>]) {
     let alone: Vec<Write<'_>> = writes.iter().filter(|it| it.alone).copied().collect();
     for write in writes.iter_mut().filter(|it| it.alone) {
@@ -286,7 +286,7 @@ fn told(end: &End) -> Vec<String> {
     wrong.collect()
 }
 
-/// Two that lead at the same moment, or one after the other in the same term.
+/// Pairs of computers that lead at the same time, or in the same term.
 fn leaders(samples: &[Sample]) -> Vec<String> {
     let mut spans: Vec<(usize, Time, Time)> = Vec::new();
     let mut before: BTreeMap<usize, &Sample> = BTreeMap::new();
@@ -363,7 +363,7 @@ mod tests {
         }
     }
 
-    /// What is wrong with these calls, if the parameter is that in the end. Computer 2 is alone from second 10 to 20.
+    /// The broken promises if the parameter has the value `end` finally. Computer 2 is cut off from second 10 to 20.
     fn judge(ops: &[Op], losses: &[(usize, i32)], end: Value) -> Vec<String> {
         let losses = losses.iter().map(|(computer, value)| Loss {
             computer: *computer,
@@ -420,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_write_that_was_made_alone_may_be_lost_and_only_if_it_is_reported() {
+    fn only_a_write_made_while_cut_off_may_be_lost_and_only_if_it_is_reported() {
         let others = write(0, 1, 12 * S, 13 * S);
         let alone =
             [14, 15, 16].map(|second| write(2, second, second as Time * S, second as Time * S + 1));
@@ -451,13 +451,13 @@ mod tests {
             Some(2),
             "goes back",
         );
-        // Two at the same time, and two computers.
+        // Two reads at the same time, and reads on two computers.
         good(&with(&[read(1, 2, 5, 7), read(1, 1, 6, 8)]), &[], Some(2));
         good(&with(&[read(1, 2, 5, 6), read(2, 1, 7, 8)]), &[], Some(2));
         bad(&with(&[read(1, 9, 5, 6)]), &[], Some(2), "nobody wrote");
         let early = [write(0, 1, 7, 8), read(1, 1, 5, 6)];
         bad(&early, &[], Some(1), "written later");
-        // Nobody is promised that what was not acknowledged stays.
+        // A write that was not acknowledged may disappear.
         let failed = [
             write(0, 1, 1, 2),
             write(0, 2, 3, None),
@@ -475,14 +475,14 @@ mod tests {
     }
 
     #[test]
-    fn a_caller_sees_what_was_acknowledged_to_it() {
+    fn a_caller_sees_its_own_acknowledged_writes() {
         let ops = |reader| [write(0, 1, 1, 2), write(0, 2, 3, 4), read(reader, 1, 5, 6)];
         bad(&ops(0), &[], Some(2), "goes back");
         good(&ops(1), &[], Some(2));
     }
 
     #[test]
-    fn a_computer_that_is_alone_has_a_history_of_its_own() {
+    fn a_computer_that_is_cut_off_has_its_own_history() {
         let others = [write(0, 1, S, 2 * S), write(0, 2, 11 * S, 12 * S)];
         let alone = [
             read(2, 1, 13 * S, 13 * S + 1),
@@ -491,20 +491,20 @@ mod tests {
         let with = |reads: &[Op]| [&others[..], &alone, reads].concat();
         good(&with(&[read(2, 3, 15 * S, 15 * S + 1)]), &[], Some(3));
         good(&with(&[read(2, 2, 25 * S, 25 * S + 1)]), &[(2, 3)], Some(2));
-        // It holds: nobody may miss it.
+        // The write holds, so no later read may miss it.
         bad(
             &with(&[read(2, 2, 25 * S, 25 * S + 1)]),
             &[],
             Some(3),
             "goes back",
         );
-        // A leader had shown it before, and the others do not have it before the merge.
+        // A leader had shown the write before, and the others lack it until the merge.
         let shown = [
             read(0, 3, 14 * S, 14 * S + 1),
             read(0, 2, 15 * S, 15 * S + 1),
         ];
         good(&with(&shown), &[], Some(3));
-        // What it had shown before binds it afterwards.
+        // Reads from before the computer was cut off count afterwards.
         let before = [
             write(0, 1, 1, 2),
             write(0, 2, 3, 4),
@@ -515,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_notification_is_what_the_end_is() {
+    fn the_last_notification_has_the_final_value() {
         let told = |value: Value| Told {
             subscriber: "/s".to_owned(),
             key: KEY.to_owned(),
@@ -556,7 +556,7 @@ mod tests {
             leads(0, 1, 100),
         ];
         assert!(leaders(&both)[0].contains("at once"));
-        // It stood still between the two, and another one led.
+        // Computer 0 was paused between its samples, and another one led.
         let stopped = [
             leads(0, 1, 0),
             leads(1, 2, 2500),

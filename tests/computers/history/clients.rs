@@ -1,4 +1,4 @@
-//! Writers, readers, subscribers and publishers on each computer, and what they saw.
+//! Writers, readers, subscribers and publishers on each computer. They record what they see.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
@@ -16,16 +16,16 @@ use crate::support::links::Dice;
 use crate::support::{Client, Finish, State, eventually, params, request};
 use crate::traffic::{Named, TYPE};
 
-/// Between two calls of one client.
+/// Pause between two calls of a client.
 const PAUSE: Duration = Duration::from_millis(25);
-/// Between two questions about the role of a computer.
+/// Pause between two requests for a computer's role.
 const SAMPLE: Duration = Duration::from_millis(40);
-/// How long the answer to such a question may take.
+/// Time limit of such a request.
 const ANSWER: Duration = Duration::from_millis(300);
-/// Parameters that all computers write. Each computer has one of its own besides.
+/// How many parameters all computers write. Each computer also has a parameter of its own.
 const SHARED: usize = 2;
 
-/// All clients of one history. They call until [`Self::finish`].
+/// All clients of one history. They call until this is dropped.
 #[derive(Debug)]
 pub(crate) struct Clients {
     subscribers: Vec<Named>,
@@ -38,16 +38,16 @@ pub(crate) struct Clients {
 #[derive(Debug)]
 struct Shared {
     start: Instant,
-    /// The name of the history, under which all its parameters are.
+    /// The name of the history and of the namespace of its parameters.
     name: String,
     written: AtomicI32,
-    /// How often etcd has begun anew, and with it the terms.
+    /// How often etcd was set up anew. Its terms then start over.
     etcds: AtomicU64,
     quiet: AtomicBool,
     finish: AtomicBool,
     ops: Mutex<Vec<Op>>,
     samples: Mutex<Vec<Sample>>,
-    /// Whether the publisher of each computer is registered, as it was answered last.
+    /// Whether each computer's publisher is registered, according to its last answer.
     publishes: [AtomicBool; COUNT],
 }
 
@@ -72,7 +72,7 @@ impl Shared {
 }
 
 impl Clients {
-    /// Subscribes everything, and lets them call. `seed` decides what they call.
+    /// Subscribes to all parameters and the topic, and starts the clients. `seed` decides what they call.
     #[track_caller]
     pub(crate) fn start(fleet: &Fleet, name: &str, seed: u64) -> Self {
         let shared = Arc::new(Shared {
@@ -135,7 +135,7 @@ impl Clients {
         clients
     }
 
-    /// No more writes. Those that are under way have ended when this returns.
+    /// Ends all writers, and waits for their calls that are under way.
     #[track_caller]
     pub(crate) fn quiet(&mut self) {
         self.shared.quiet.store(true, Ordering::Relaxed);
@@ -145,18 +145,18 @@ impl Clients {
         }
     }
 
-    /// No rosrescue runs, and etcd is empty: the terms are others from now on.
+    /// Notes that etcd was set up anew while no rosrescue ran, so its terms start over.
     pub(crate) fn forget_terms(&self) {
         self.shared.etcds.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How many calls were answered.
+    /// The number of answered calls.
     pub(crate) fn answered(&self) -> usize {
         let ops = self.shared.ops.lock().unwrap();
         ops.iter().filter(|op| op.end.is_some()).count()
     }
 
-    /// All that was seen up to now.
+    /// What the clients have recorded up to now.
     pub(crate) fn history(&self, fleet: &Fleet) -> History {
         History {
             ops: self.shared.ops.lock().unwrap().clone(),
@@ -165,7 +165,7 @@ impl Clients {
         }
     }
 
-    /// The final state, and what the subscribers were told last.
+    /// The final state and each subscriber's last notifications.
     pub(crate) fn end(&self, state: &State) -> End {
         let mut values = BTreeMap::new();
         for key in self.shared.keys() {
@@ -192,7 +192,7 @@ impl Clients {
         End { values, told }
     }
 
-    /// What is wrong with the topic: each publisher knows whether it is registered, and each subscriber knows them all.
+    /// Broken promises of the topic: the final state has the registered publishers, and each subscriber knows all of them.
     pub(crate) fn topic_wrongs(&self, state: &State) -> Vec<String> {
         let topic = self.shared.topic();
         let mut wrong = Vec::new();
@@ -247,7 +247,7 @@ impl Drop for Clients {
     }
 }
 
-/// One writer, which calls one after the other. What has failed is not called again: nobody knows whether it was done.
+/// Writes parameters one after the other. A failed write is not repeated, because it may have taken effect.
 fn write(shared: &Shared, computer: usize, _: &Named, mut dice: Dice) {
     let (client, keys) = (Client::new(PORT), shared.keys());
     let own = shared.own(computer);
@@ -280,7 +280,7 @@ fn read(shared: &Shared, computer: usize, _: &Named, mut dice: Dice) {
         let end = Some(shared.now());
         let value = match answer {
             Ok((1, _, value)) => Some(value.as_int()),
-            // It is not set.
+            // The parameter is not set.
             Ok((-1, _, _)) => Some(None),
             _ => None,
         };
@@ -297,7 +297,7 @@ fn read(shared: &Shared, computer: usize, _: &Named, mut dice: Dice) {
     }
 }
 
-/// Registers a publisher, and takes it back, again and again, and each until it is answered.
+/// Registers and unregisters a publisher in turns. Each call is repeated until it is answered.
 fn publish(shared: &Shared, computer: usize, node: &Named, mut dice: Dice) {
     let (client, topic, node) = (Client::new(PORT), shared.topic(), node.it());
     let mut is = false;
@@ -322,7 +322,7 @@ fn publish(shared: &Shared, computer: usize, node: &Named, mut dice: Dice) {
     }
 }
 
-/// Asks the computer again and again what it is.
+/// Records the computer's role again and again.
 fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
     let get = request("GET /status.json HTTP/1.1", &[], b"");
     let ask = || -> Option<serde_json::Value> {
@@ -342,7 +342,7 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
             let (pid, times) = (page["pid"].as_u64(), cluster["times_cut_off"].as_u64());
             let known = if pid == before.0 { before.1 } else { 0 };
             if times > Some(known) {
-                // It may be over already.
+                // The computer may be back already.
                 shared.samples.lock().unwrap().push(Sample {
                     computer,
                     from: before.2,
@@ -354,7 +354,7 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
             let says = match cluster["role"].as_str() {
                 Some("alone") => Says::Alone,
                 Some("leading") if page["open"] == true => {
-                    // Its page may name the leader before it for a moment.
+                    // For a moment the page may still name the previous leader.
                     let leader = &cluster["leader"];
                     let term = leader["term"].as_u64();
                     let term = term.filter(|_| leader["name"] == NAMES[computer]);
@@ -375,7 +375,7 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
     }
 }
 
-/// The warnings of all computers about these parameters.
+/// The warnings of all computers about lost writes of these parameters.
 fn losses(fleet: &Fleet, keys: &[String]) -> Vec<Loss> {
     let mut losses = Vec::new();
     for computer in &fleet.computers {

@@ -1,4 +1,4 @@
-//! What goes wrong.
+//! Random failures.
 
 use std::time::Duration;
 
@@ -11,38 +11,38 @@ use crate::fleet::Fleet;
 use crate::network::{COUNT, Quality};
 use crate::support::{Process, alive, eventually, signal, stop};
 
-/// Who is called by the number of a computer.
+/// A failure, with the number of the computer that it hits.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Fault {
-    /// SIGKILL for the process that answers.
+    /// SIGKILL for the worker.
     Worker(usize),
-    /// SIGKILL for it and for the process that starts it; somebody starts rosrescue again.
+    /// SIGKILL for the guardian and the worker. rosrescue is started again.
     Guardian(usize),
-    /// SIGKILL for everything, of which the kernel tells the others.
+    /// SIGKILL for all processes. The kernel closes their connections.
     Killed(usize),
-    /// The power fails.
+    /// The power fails: no connection is closed.
     Power(usize),
-    /// The power fails, and the disk lacks what the checkpoint was given last.
+    /// The power fails, and the disk lacks the checkpoint's last records.
     OlderDisk(usize),
-    /// The process that answers stands still.
+    /// The worker is stopped.
     Paused(usize),
-    /// Everything stands still, etcd too.
+    /// All processes are stopped, also etcd.
     Frozen(usize),
     OneWay(usize, usize),
     Pair(usize, usize),
     Cable(usize),
     Bad(usize, Quality),
-    /// It reaches the others, but no etcd.
+    /// The computer reaches the others, but no etcd.
     NoEtcd(usize),
     Etcd(usize),
     AllEtcds,
-    /// All etcds lose their data, and a person does what the documentation says.
+    /// All etcds lose their data, and are set up anew as the guide says.
     Wiped,
     Handover(usize),
 }
 
 impl Fault {
-    /// One that needs no more than a few seconds to be over, for a run of everything.
+    /// A random failure that is over within a few seconds.
     pub(super) fn roll_short(chance: &mut Chance) -> Self {
         loop {
             let fault = Self::roll(chance);
@@ -94,11 +94,11 @@ impl Fault {
         }
     }
 
-    /// The computers that it concerns.
+    /// The computers that the failure hits. No other failure may hit them at the same time.
     fn computers(&self) -> Vec<usize> {
         match *self {
             Self::AllEtcds | Self::Wiped => vec![0, 1, 2],
-            // Its commands and those of other faults must not meet: they change the same cables.
+            // Two failures must not change the same cable.
             Self::OneWay(one, other) | Self::Pair(one, other) => vec![one, other],
             Self::NoEtcd(_) => vec![0, 1, 2],
             Self::Worker(one)
@@ -115,7 +115,7 @@ impl Fault {
         }
     }
 
-    /// Lets it happen. It lasts, or is over.
+    /// Begins the failure. Returns it if it lasts.
     #[track_caller]
     pub(super) fn begin(
         self,
@@ -150,7 +150,7 @@ impl Fault {
                 let disk = Disk::of(&fleet.computers[one]);
                 signal(worker, Signal::CONT);
                 std::thread::sleep(chance.time(Duration::from_secs(1)));
-                // Nobody else has what it answers alone.
+                // What a computer answers while it is cut off is on no other disk.
                 let alone = fleet.computers[one].role_is("alone");
                 power_off(fleet, one);
                 if !alone {
@@ -179,7 +179,7 @@ impl Fault {
                 return None;
             }
             Self::Handover(one) => {
-                // There may be nobody to hand over to.
+                // There may be no computer to hand over to.
                 let (status, said) = fleet.computers[one].rosrescue(&["handover"]);
                 println!("handover: {status:?}, {said}");
                 return None;
@@ -192,18 +192,18 @@ impl Fault {
     }
 }
 
-/// A fault that goes on.
+/// A failure that lasts.
 #[derive(Debug)]
 pub(super) struct Lasting {
     pub(super) fault: Fault,
-    /// What stands still.
+    /// The stopped processes.
     pids: Vec<u32>,
-    /// What copies the packets of a bad cable.
+    /// The process that forwards the packets of a bad cable.
     cable: Option<Process>,
 }
 
 impl Lasting {
-    /// Whether it has to end before `fault` can begin.
+    /// Whether this failure must end before `fault` can begin.
     pub(super) fn meets(&self, fault: &Fault) -> bool {
         let concerned = fault.computers();
         self.fault
@@ -214,7 +214,7 @@ impl Lasting {
 
     #[track_caller]
     pub(super) fn end(self, fleet: &mut Fleet) {
-        // `nsenter` goes on last. See `Computer::processes`.
+        // `nsenter` continues last. See `Computer::processes`.
         for pid in self.pids.iter().rev() {
             signal(*pid, Signal::CONT);
         }
@@ -249,7 +249,7 @@ fn power_off(fleet: &mut Fleet, one: usize) {
     fleet.computers[one].power_off();
 }
 
-/// Without waiting for anything: another fault may go on.
+/// Does not wait for answers, because another failure may last.
 fn switch_on(fleet: &mut Fleet, one: usize) {
     let computer = &mut fleet.computers[one];
     computer.boot();
@@ -257,7 +257,7 @@ fn switch_on(fleet: &mut Fleet, one: usize) {
     computer.start_rescue();
 }
 
-/// As docs/several-computers.md says under "Backup".
+/// Sets etcd up anew, as docs/several-computers.md says under "Backup".
 #[track_caller]
 fn wipe(fleet: &mut Fleet, clients: &Clients) {
     for computer in &mut fleet.computers {
