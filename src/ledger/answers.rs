@@ -62,11 +62,14 @@ impl Ledger {
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
         let concern = Concern::of(Some(write));
         let mut inner = self.lock();
-        // Unregistrations are left out: they may concern a registration that the master has not run yet.
+        // Unregistrations are left out: they may concern a registration that the master has not run yet. With several
+        // computers, so is a parameter that is set again: this is its last write, which the journal must have.
+        let is_replicated = inner.is_replicated();
+        let counts = |call| is_unregistration(call) || is_replicated && sets_parameter(call);
         let idle = !inner.doubted
             && !inner.unconfirmed
             && !inner.is_elsewhere()
-            && !write.calls().into_iter().any(is_unregistration)
+            && !write.calls().into_iter().any(counts)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         let heard = concern.heard();
@@ -170,7 +173,9 @@ impl Ledger {
                 counts.map(|of| of.call).collect()
             }
         };
+        let mut set_again: Vec<&Request> = Vec::new();
         if !changes {
+            set_again.extend(writes.iter().copied().filter(|call| sets_parameter(call)));
             // A call that changes nothing still becomes pending, because the master may hold what the mirror lacks: a
             // registration that it ran for a rosrescue that died before the reply, or any state if the checkpoint is
             // older than the master. Parameter subscriptions are left out: they cannot be read from the master, and
@@ -182,13 +187,19 @@ impl Ledger {
             };
             writes.retain(|call| room && unsure(call) && !inner.pending.contains(call));
         }
+        // A parameter that is set again has no record here, but it is the last write also for the other computers.
+        set_again.retain(|call| !writes.contains(call));
+        let at = clock::wall_millis();
+        if inner.is_replicated() && !set_again.is_empty() {
+            inner.share_only(&set_again, source, Label { at, origin });
+            self.shared.notify_one();
+        }
         if writes.is_empty() {
             return Some((reply, inner.mark(), number));
         }
         // The new version outdates a running inspection, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
-        let at = clock::wall_millis();
         let entries = writes.iter().map(|&call| RecordContent::Call {
             call: call.clone().into(),
             pending: true,
@@ -208,4 +219,9 @@ impl Ledger {
 /// Whether a call is an unregistration. Multicalls are not.
 fn is_unregistration(call: &Request) -> bool {
     *call.method() != Method::Multicall && call.kind() == Kind::Unregister
+}
+
+/// Whether a call, which is no multicall, sets a parameter.
+fn sets_parameter(call: &Request) -> bool {
+    *call.method() == Method::SetParam
 }

@@ -14,7 +14,7 @@ use super::{
     summary::Divergences,
 };
 use crate::{
-    checkpoint::format::{Checkpoint, RecordContent, Session},
+    checkpoint::format::{Checkpoint, Label, RecordContent, Session},
     clock,
     cluster::sharing::Source,
     health::port_of,
@@ -227,6 +227,21 @@ impl Inner {
     /// Whether another computer has the master.
     pub(super) fn is_elsewhere(&self) -> bool {
         matches!(self.shared, Shared::Elsewhere)
+    }
+
+    /// Whether other computers get the writes of this one.
+    pub(super) fn is_replicated(&self) -> bool {
+        matches!(self.shared, Shared::Here { .. })
+    }
+
+    /// Passes `calls` from `source`, which change nothing, to the other computers only.
+    pub(super) fn share_only(&mut self, calls: &[&Request], source: &Source, label: Label) {
+        let entries = calls.iter();
+        let entries = entries.map(|&call| RecordContent::labelled(call.clone().into(), label));
+        let entries: Vec<_> = entries.collect();
+        self.share(&entries, &vec![source; entries.len()]);
+        // Later calls have other numbers than the session's record tells.
+        self.session_unwritten = true;
     }
 
     /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.

@@ -126,7 +126,7 @@ impl LeaderLease {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::{sync::Arc, time::Duration};
 
     use super::*;
     use crate::{
@@ -265,11 +265,34 @@ mod tests {
     async fn a_first_write_that_changes_nothing_does_not_wait() {
         let ledger = ledger();
         ledger.leave();
-        ledger.follow(&[record(7, set(1))]).unwrap();
-        ledger.lead(7, &state_of([set(1)]));
-        let mark = answer(&ledger, &set(1));
+        let watch = Request::new(Method::SubscribeParam, ["/n", "http://n:1/", "/a"]);
+        ledger.follow(&[record(7, watch.clone())]).unwrap();
+        ledger.lead(7, &state_of([watch.clone()]));
+        let mark = answer(&ledger, &watch);
         assert_eq!(acknowledged(&ledger, mark).await, Some(true));
         assert!(seqs(&ledger).is_empty());
+    }
+
+    /// Otherwise an older value from a computer that was cut off would replace it.
+    #[tokio::test]
+    async fn a_parameter_that_is_set_again_gets_a_record_for_the_others() {
+        let ledger = ledger();
+        ledger.leave();
+        ledger.follow(&[record(7, set(1))]).unwrap();
+        ledger.lead(7, &state_of([set(1)]));
+        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        let pending = ledger.pending();
+        let again = answer(&ledger, &set(1));
+        assert_eq!((seqs(&ledger), cluster_seq()), (vec![8], 8));
+        assert_eq!(ledger.pending(), pending);
+        assert_eq!(acknowledged(&ledger, again).await, None);
+        ledger.agreement.reach(8);
+        assert_eq!(acknowledged(&ledger, again).await, Some(true));
+        answer(&ledger, &set(2));
+        assert_eq!((seqs(&ledger), cluster_seq()), (vec![9], 9));
+        // A slow master runs it first.
+        let early = Arc::new(ledger).answer_if_unchanged(Instant::now(), &set(2));
+        assert!(early.is_none());
     }
 
     #[tokio::test]

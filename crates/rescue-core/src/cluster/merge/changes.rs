@@ -6,6 +6,7 @@ use std::{
     ops::Bound,
 };
 
+use super::TELLER;
 use crate::{
     cluster::mutant::Mutant,
     master::{Master, Method, Request, names},
@@ -37,9 +38,10 @@ impl ChangeSubject {
             }
     }
 
-    /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing.
+    /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing, and for a
+    /// value that a merge sets again.
     pub fn of(call: &Request) -> Vec<Self> {
-        let Some(caller) = call.caller() else {
+        let Some(caller) = call.caller().filter(|caller| *caller != TELLER) else {
             return Vec::new();
         };
         let node = Self::Node(caller.to_owned());

@@ -20,8 +20,6 @@ use crate::{
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Unanswered {
     pub(super) seq: u64,
-    /// Whether the call has changed something, so that it has a record.
-    pub(super) recorded: bool,
     pub(super) call: usize,
     /// The computer whose node made the call.
     pub(super) origin: usize,
@@ -55,21 +53,14 @@ impl Ledger {
         self.lease.is_none_or(|until| now < until)
     }
 
-    /// Runs a call, and records it if it changes anything. Returns the number of the record that the answer waits for,
-    /// whether the call changed anything, and the notifications. `None` if another computer records calls.
-    pub(super) fn run(
-        &mut self,
-        call: &Request,
-        source: &Source,
-    ) -> Option<(u64, bool, Vec<Notice>)> {
+    /// Runs a call, and records it. Returns the number of the record, for which the answer waits, and the notifications.
+    /// `None` if another computer records calls.
+    pub(super) fn run(&mut self, call: &Request, source: &Source) -> Option<(u64, Vec<Notice>)> {
         let sharing = self.sharing.as_mut()?;
-        let changes = self.mirror.would_change(call);
         let mut notices = Vec::new();
         self.mirror.apply_telling(call, &mut notices);
-        if changes {
-            sharing.record(call, source);
-        }
-        Some((sharing.last(), changes, notices))
+        sharing.record(call, source);
+        Some((sharing.last(), notices))
     }
 
     fn leave(&mut self) -> Vec<(u64, Asker, wire::MergeAnswer)> {

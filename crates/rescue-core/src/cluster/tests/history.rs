@@ -64,8 +64,6 @@ pub(super) struct Call {
     unsynced: bool,
     /// Whether the merge found that the write holds: it was made, or others had set the same value.
     held: bool,
-    /// Whether the write changed nothing where it ran, so it is in no journal.
-    unchanged: bool,
     /// When a leader made the write for a computer that was cut off, and the length of the log then.
     merged: Option<(u64, usize)>,
 }
@@ -112,7 +110,7 @@ pub(super) struct History {
     pub(super) reads: Vec<Read>,
     /// The value of each parameter in the last notification to each computer's node.
     pub(super) told: [[Option<i32>; KEYS]; COMPUTERS],
-    /// Each run of a write that was answered and changed something: the write, the computer and the moment.
+    /// Each run of a write that was answered: the write, the computer and the moment.
     runs: Vec<(usize, usize, u64)>,
     /// When the nodes of a computer died.
     died: Vec<(usize, u64)>,
@@ -156,7 +154,6 @@ impl History {
             reported: false,
             unsynced: false,
             held: false,
-            unchanged: false,
             merged: None,
         });
         number
@@ -216,7 +213,7 @@ impl History {
                 _ => false,
             }),
         });
-        in_log || call.reported || call.held || call.unchanged || etcd.lost
+        in_log || call.reported || call.held || etcd.lost
     }
 
     /// Notes that a leader has made `call` for the computer `from`.
@@ -235,13 +232,9 @@ impl History {
         call: usize,
         now: u64,
         alone: Option<(u64, usize)>,
-        changed: bool,
     ) {
-        if changed {
-            self.runs.push((call, by, now));
-        }
+        self.runs.push((call, by, now));
         let call = &mut self.calls[call];
-        call.unchanged |= !changed;
         call.by.get_or_insert(by);
         call.ran.get_or_insert(now);
         if call.heard.is_none() {
@@ -291,15 +284,7 @@ impl History {
             self.check_last(key, &places, etcd, commit)?;
             let last = value_of(&etcd.state, key);
             for (computer, told) in self.told.iter().enumerate() {
-                // A write that changed nothing on a computer that was cut off is kept nowhere, so its node cannot be
-                // corrected.
-                let mut calls = self.calls.iter();
-                let in_vain = calls.any(|call| {
-                    (call.computer, call.key, Some(call.value)) == (computer, key, told[key])
-                        && call.unchanged
-                        && call.alone.is_some()
-                });
-                if told[key] != last && !in_vain {
+                if told[key] != last {
                     let told = told[key];
                     return Err(format!(
                         "the node of {computer} was told last that {key} is {told:?}, and it is {last:?}"
@@ -328,7 +313,6 @@ impl History {
             .clone()
             .map(|(_, call)| call.heard.unwrap_or(u64::MAX))
             .max();
-        let last_alone = same.clone().any(|(_, call)| call.alone.is_some());
         for (number, call) in of_key {
             let Some(heard) = call.heard.filter(|_| Some(call.value) != last) else {
                 continue;
@@ -344,12 +328,6 @@ impl History {
             let in_log = recorded || places.of_value(self, key, Some(call.value)).is_some();
             let may_be_lost = commit == Commit::Interval && !recorded;
             let alone = call.alone.is_some();
-            // For the merge, a computer that changed a value and changed it back has changed nothing.
-            let in_vain = call.held
-                && call.merged.is_some_and(|(_, log)| {
-                    let mut changed = places.changed[number].iter();
-                    !changed.any(|at| *at >= log * 1000)
-                });
             // Others had or set the same value, so this write was not sent, and nothing was lost when they replaced it.
             let equalled = call.alone.is_some_and(|cut| {
                 let others = self.calls.iter().enumerate().any(|(of, other)| {
@@ -359,10 +337,19 @@ impl History {
                 let sent = !places.changed[number].is_empty();
                 !sent && (others || etcd.value_at(key, cut * 1000) == Some(call.value))
             });
-            let unchanged = call.unchanged || in_vain || equalled;
-            let excused = call.reported || call.unsynced || superseded || unchanged;
-            // A write that changed nothing is in no journal, so it does not win over one that was answered alone before.
-            let unseen = call.unchanged && last_alone;
+            let excused = call.reported || call.unsynced || superseded || equalled;
+            // The last value may come from a computer that was cut off, and could not tell this write from its own or
+            // from the value before: it compared two states.
+            let unseen = same.clone().any(|(_, last)| {
+                let (Some(cut), Some((moment, _))) = (last.alone, last.merged) else {
+                    return false;
+                };
+                let mut own = self.calls.iter();
+                let own = own
+                    .any(|of| (of.computer, of.key, of.value) == (last.computer, key, call.value));
+                let before = etcd.value_at(key, cut * 1000) == Some(call.value);
+                (own || before) && self.compared(last.computer, cut, moment, etcd)
+            });
             if (may_be_lost || unseen) && !alone || alone && excused {
                 continue;
             }
@@ -381,6 +368,14 @@ impl History {
         Ok(())
     }
 
+    /// Whether a computer that was cut off at `cut` compared two states before its writes were merged at `moment`, because
+    /// it had not read each change of the others.
+    fn compared(&self, computer: usize, cut: usize, moment: u64, etcd: &Etcd) -> bool {
+        let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
+        let mut skipped = self.skipped.iter();
+        skipped.any(|(of, at)| *of == computer && (since..=moment).contains(at))
+    }
+
     /// Checks that no write answered while cut off has replaced a write that others made meanwhile.
     fn check_merged(&self, places: &Places, etcd: &Etcd) -> Result<(), String> {
         for (number, call) in self.calls.iter().enumerate() {
@@ -389,10 +384,7 @@ impl History {
             };
             // A comparison of states does not show that others set a value and set it back, nor that they set what this
             // computer's nodes set, too, or what it answered as the leader before it was cut off.
-            let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
-            let mut skipped = self.skipped.iter();
-            let compared =
-                skipped.any(|(of, at)| *of == call.computer && (since..=moment).contains(at));
+            let compared = self.compared(call.computer, cut, moment, etcd);
             let merged = places.changed[number].iter().find(|at| **at >= log * 1000);
             let Some(merged) = merged else { continue };
             let before = etcd.value_at(call.key, *merged);
@@ -447,9 +439,7 @@ impl History {
         let brought_back = |call: &Call| commit == Commit::Interval && call.held;
         let mut floors: Vec<Floor> = Vec::new();
         for (number, call) in self.calls.iter().enumerate() {
-            // A write that changed nothing may have been run again later.
-            let counts = !call.reported && !call.unchanged;
-            if (call.computer, call.key) != (computer, key) || !counts {
+            if (call.computer, call.key) != (computer, key) || call.reported {
                 continue;
             }
             let Some(heard) = call.heard else { continue };

@@ -70,15 +70,13 @@ impl World {
         if waits.count() > 0 || !computer.ledger.has_lease(local) {
             return;
         }
-        let Some((seq, recorded, notices)) = computer.ledger.run(&request, &source) else {
+        let Some((seq, notices)) = computer.ledger.run(&request, &source) else {
             return;
         };
-        computer.ledger.unanswered.push(Unanswered {
-            seq,
-            recorded,
-            call,
-            origin,
-        });
+        computer
+            .ledger
+            .unanswered
+            .push(Unanswered { seq, call, origin });
         let agreed = computer.ledger.agreed;
         self.tell_notices(at, notices);
         self.agree(at, agreed);
@@ -99,24 +97,18 @@ impl World {
         for (_, asker, answer) in merged {
             self.merge_answered(asker, at, Some(answer));
         }
-        for Unanswered {
-            recorded,
-            call,
-            origin,
-            ..
-        } in answered
-        {
+        for Unanswered { call, origin, .. } in answered {
             self.counts.acknowledged += 1;
             let alone = self.computers[at].member.role() == Role::Alone;
             let term = self.computers[at].member.machine().term();
             if let Some(term) = term.filter(|_| !alone) {
                 // A call in the journal is safe, whichever computer answers it.
                 let committed = self.etcd.holds(&self.history.request(call));
-                if recorded && !committed && term < self.term {
+                if !committed && term < self.term {
                     self.history.breaks("two leaders answer");
                 }
                 let always = self.plan.commit == Commit::Always;
-                if recorded && !committed && always && !self.etcd.lost {
+                if !committed && always && !self.etcd.lost {
                     self.history
                         .breaks("a leader answers what no journal holds");
                 }
@@ -127,7 +119,7 @@ impl World {
             }
             let cut = self.computers[at].cut;
             self.history
-                .answered(at, call, self.now, alone.then_some(cut), recorded);
+                .answered(at, call, self.now, alone.then_some(cut));
             let shown = Place::shown_seq(false, agreed, self.computers[at].ledger.last());
             let place = place(term.unwrap_or(0), shown);
             let life = self.computers[origin].life;
@@ -189,7 +181,7 @@ impl World {
                             ]));
                             let log = self.etcd.log.len();
                             self.history.merged(from, call, self.now, log);
-                            if let Some((_, _, notices)) = ran {
+                            if let Some((_, notices)) = ran {
                                 self.tell_notices(at, notices);
                             }
                         }
