@@ -121,15 +121,15 @@ impl Plan {
 /// The outcome of one start.
 #[derive(Debug)]
 pub(crate) struct Start {
-    /// Number of links in the master's state.
+    /// The number of links in the master's state.
     pub(crate) links: usize,
-    /// The subscribers that are not connected to a publisher, each with what happened.
+    /// The missing links between a subscriber and a publisher, each with the events that led to it.
     pub(crate) never_made: Vec<String>,
     /// Links to nodes that are not publishers, and registrations that the state lacks.
     pub(crate) wrong: Vec<String>,
-    /// Answers whose list was older than one that the node had heard before, each with what happened.
+    /// Answers whose list was older than one that the node had received before, each with the events that led to it.
     pub(crate) overtaken: Vec<String>,
-    /// Updates whose list was older than one before, each with what happened.
+    /// Notifications whose list was older than an earlier one, each with the events that led to it.
     pub(crate) went_back: Vec<String>,
     /// The time until the last node had registered.
     pub(crate) time: Duration,
@@ -261,7 +261,7 @@ impl Fleet {
         self.wait_for_all("ready").iter().map(parse).collect()
     }
 
-    /// What each node was told. roscpp nodes report nothing.
+    /// The notifications and answers that each node received. roscpp nodes report nothing.
     #[track_caller]
     fn traces(&self, nodes: &[Ready]) -> Traces {
         let begin = nodes
