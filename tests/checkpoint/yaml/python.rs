@@ -11,7 +11,7 @@ use super::{file_with, in_array, in_struct, nested};
 
 const PYTHON: &str = "/usr/bin/python3";
 
-/// Prints what PyYAML reads, with types, in a notation for comparison.
+/// Prints the values that PyYAML reads, with types, in a notation for comparison.
 const DESCRIBE: &str = r#"
 import base64, datetime, struct, sys, yaml
 
