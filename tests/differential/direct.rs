@@ -81,7 +81,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
     Ok(())
 }
 
-/// Compares everything that can be heard or read.
+/// Compares the remaining callbacks and all reads.
 fn finish(stage: &mut Stage<'_>) -> Result<(), Failure> {
     stage.settle()?;
     let mut wire = stage.wires.remove(0);
