@@ -153,7 +153,7 @@ fn reads(servers: &Servers) -> u64 {
 /// A computer that merges its writes reads the journal again and again. With a long journal each complete read took
 /// over 10 s on a busy computer.
 #[tokio::test]
-async fn what_is_known_of_a_long_journal_is_not_read_again() {
+async fn known_records_of_a_long_journal_are_not_read_again() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     for seq in 1..=300 {
@@ -226,7 +226,7 @@ async fn a_snapshot_replaces_the_journal_before_it() {
 
 /// Without this, a slow reader would never finish while others write.
 #[tokio::test]
-async fn a_reader_gets_the_parts_that_it_was_told_of_although_the_leader_has_replaced_them() {
+async fn a_reader_gets_announced_parts_although_the_leader_has_replaced_them() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     let large = [record(1, 1 << 20)];

@@ -209,7 +209,7 @@ async fn without_a_majority_requests_fail_with_a_clear_error() {
 }
 
 #[tokio::test]
-async fn a_key_goes_with_its_lease() {
+async fn a_key_expires_with_its_lease() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let lease = client.grant(Duration::from_secs(1), LIMIT).await.unwrap();
@@ -271,7 +271,7 @@ async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again
 }
 
 #[tokio::test]
-async fn a_request_that_is_too_large_has_an_error_of_its_own() {
+async fn a_request_that_is_too_large_has_its_own_error() {
     let servers = Servers::new(1).await;
     let large = Put {
         key: keys().journal(1),
