@@ -52,7 +52,7 @@ fn log_lines_have_priorities_only_for_journald() {
 }
 
 #[test]
-fn what_comes_by_the_hundred_is_logged_ten_times() {
+fn repeated_log_lines_are_limited_to_ten() {
     let robot = Robot::start_with(Mode::Core, &[]);
     let client = robot.client();
     let foreign = request("POST / HTTP/1.1", &["Origin: http://elsewhere"], b"x");

@@ -179,7 +179,7 @@ fn a_core_keeps_rosout_alive() {
 /// A rosout that ends at once, for example without its libraries, is started after growing pauses. The log has its last
 /// output.
 #[test]
-fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
+fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
     let scratch = Scratch::new();
     let folder = scratch.path("bin");
     fs::create_dir(&folder).unwrap();

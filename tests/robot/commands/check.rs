@@ -187,7 +187,7 @@ fn a_node_of_another_master_is_found() {
 }
 
 #[test]
-fn something_else_at_the_port() {
+fn another_program_at_the_port_is_found() {
     let scratch = Scratch::new();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -204,7 +204,7 @@ fn something_else_at_the_port() {
 }
 
 #[test]
-fn traps_in_the_environment() {
+fn wrong_environment_variables_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     for (key, value, subject, words) in [

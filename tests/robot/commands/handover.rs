@@ -185,7 +185,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
 }
 
 #[test]
-fn one_computer_hands_over_to_nobody() {
+fn a_single_computer_cannot_hand_over() {
     let robot = Robot::start(Mode::Core);
     let alone = Tool::rosrescue(&robot.scratch, robot.port(), &["handover"]);
     assert!(alone.stderr.contains("runs without --cluster"), "{alone:?}");

@@ -97,7 +97,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
 }
 
 #[test]
-fn a_history_of_no_space_is_the_last_session() {
+fn a_history_without_space_keeps_only_the_last_session() {
     let options = ["--no-rosout", "--restore", "never", "--history", "0"];
     let mut robot = Robot::start_with(Mode::Core, &options);
     for session in 1..=2 {

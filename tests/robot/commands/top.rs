@@ -97,7 +97,7 @@ fn without_a_terminal_it_prints_blocks_or_json_lines() {
 }
 
 #[test]
-fn a_rosrescue_that_goes_away_is_waited_for() {
+fn it_waits_for_a_rosrescue_that_goes_away() {
     let mut robot = Robot::start(Mode::Proxy);
     let port = robot.port();
     let mut top = Process::start(

@@ -182,7 +182,7 @@ fn subscribers_hear_that_a_publisher_left_although_the_master_dies(mode: Mode) {
 }
 
 #[test]
-fn the_same_with_more_threads_than_callbacks() {
+fn the_master_may_die_with_more_threads_than_callbacks() {
     at_every_callback(Mode::Core, Change::Registration, "16");
     at_every_callback(Mode::Core, Change::Unregistration, "16");
 }

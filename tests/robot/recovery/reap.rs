@@ -206,7 +206,7 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
 
 /// A node that dies and is started again displaces only its ghost.
 #[test]
-fn a_node_that_is_started_again_and_again_is_no_feud() {
+fn a_node_that_restarts_repeatedly_is_not_reported_as_two_programs() {
     let robot = Robot::start_with(Mode::Core, &[]);
     for _ in 0..4 {
         let node = robot.node(Library::Rospy, "talker", &[]);
@@ -221,7 +221,7 @@ fn a_node_that_is_started_again_and_again_is_no_feud() {
 
 /// Many small nodes are killed, stopped, replaced and started again, some at the ports of dead ones.
 #[test]
-fn of_a_crowd_no_living_node_is_unregistered_and_no_innocent_one_shut_down() {
+fn in_a_crowd_no_living_node_is_unregistered_or_wrongly_shut_down() {
     let variable = |name: &str, other: u64| match std::env::var(name) {
         Ok(value) => value.parse().unwrap(),
         Err(_) => other,
