@@ -38,7 +38,7 @@ impl Document {
     }
 }
 
-/// A script that runs `text` on each of `computers`. The first line is changed for each computer, as the document says.
+/// A script that runs `text` on each of `computers`. Its first line is changed for each computer, as the document says.
 fn on(computers: &[&str], text: &str) -> String {
     let own = COMPUTERS
         .iter()
@@ -55,7 +55,7 @@ fn on(computers: &[&str], text: &str) -> String {
     scripts.collect()
 }
 
-/// Runs `script` in namespaces of its own. They end with the shell and everything that it has started.
+/// Runs `script` in new namespaces, which end with the shell and everything that it has started.
 #[track_caller]
 fn run(script: &str) -> String {
     let scratch = Scratch::new();

@@ -112,7 +112,7 @@ fn the_whole_records_of_a_damaged_checkpoint_are_restored_and_the_damage_is_repo
     rescue.kill();
     let checkpoint = rescue.checkpoint();
     let mut bytes = fs::read(&checkpoint).unwrap();
-    // The last record is incomplete, so as far as the file can tell it was never acknowledged.
+    // The last record is incomplete. According to the file it was never acknowledged.
     let end = bytes
         .iter()
         .rposition(|&byte| byte == b'{')

@@ -155,7 +155,7 @@ fn rosrescue_can_be_stopped_on_a_hung_disk_and_reports_it() {
     assert_eq!(rescue.client().param("/before"), Some(1.into()));
 }
 
-/// The first generation of the checkpoint cannot be written.
+/// rosrescue cannot write the first generation of the checkpoint.
 #[test]
 fn rosrescue_serves_calls_when_it_starts_on_a_hung_disk() {
     let scratch = Scratch::new();

@@ -79,7 +79,7 @@ fn planted_pipes_delay_no_call() {
     assert_rescued(&mut rescue);
 }
 
-/// Python would execute parts of it.
+/// Python would execute parts of a planted log configuration.
 #[test]
 fn rosmasters_log_configuration_is_not_a_file_that_others_could_plant() {
     let scratch = Scratch::new();

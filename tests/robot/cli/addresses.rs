@@ -48,7 +48,7 @@ fn core_is_reached_at_every_address_and_its_master_at_loopback_only() {
     }
 }
 
-/// `core` interprets ROS's variables for the computer's own address as ROS does.
+/// `core` reads the variables for the computer's own address in the same way as ROS.
 #[test]
 fn core_listens_at_loopback_only_if_ros_variables_say_so() {
     let net = Netns::new();

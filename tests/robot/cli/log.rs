@@ -7,7 +7,7 @@ use crate::support::{
     Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, in_both_modes, request,
 };
 
-/// Standard error is a file here. Like a socket of journald, it is recognised by device and inode.
+/// Standard error is a file in this test. rosrescue recognises it by device and inode, as it does a socket of journald.
 #[test]
 fn log_lines_have_priorities_only_for_journald() {
     let scratch = Scratch::new();

@@ -100,7 +100,7 @@ fn proxy_ignores_variables_of_core() {
             .env("ROSRESCUE_PORT", "bad")
     };
     setup().start();
-    // Its own variables are still checked.
+    // `proxy` still checks the variables that are meant for it.
     let said = refused(&scratch, setup().env("ROSRESCUE_HOLD", "bad"), 2);
     assert!(said.contains("--hold"), "{said}");
     for arguments in [&[][..], &["core"], &["--no-rosout"]] {
@@ -190,7 +190,7 @@ fn rosrescue_waits_for_a_port_that_becomes_free_soon() {
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
     let taken = TcpListener::bind(("0.0.0.0", setup.port)).unwrap();
     let mut rescue = setup.spawn();
-    // Otherwise it would end at once.
+    // A rosrescue that does not wait for the port would end within this time.
     holds(Duration::from_millis(300), || rescue.exited().is_none());
     drop(taken);
     rescue.wait_serving();
@@ -302,7 +302,7 @@ fn no_rosmaster_installed() {
     }
 }
 
-/// rosout is an ordinary client: it must find the master at the announced address.
+/// rosout is an ordinary client, so it must find the master at the printed address.
 #[test]
 fn the_printed_address_is_the_one_that_is_served() {
     let scratch = Scratch::new();

@@ -86,7 +86,7 @@ fn a_second_signal_ends_at_once() {
         // A rosout that stops slowly must not give rosrescue time to replace the hung master.
         let mut robot = Robot::start_with(Mode::Core, &["--probe-count", "1000"]);
         let master = robot.master_pid();
-        // A clean stop has to wait for this one.
+        // A clean stop must wait for the hung master.
         crate::support::stop(master);
         robot.rescue.signal(Signal::TERM);
         // The first signal has been handled. Two pending signals may be merged into one.
@@ -102,7 +102,7 @@ fn a_second_signal_ends_at_once() {
     }
 }
 
-/// Runs its arguments in a terminal of its own, closes the terminal once calls pass, and exits with their status.
+/// Runs its arguments in a new terminal, closes the terminal once calls pass, and exits with their status.
 const IN_A_TERMINAL: &str = r#"
 import os, pty, sys
 pid, terminal = pty.fork()
@@ -176,8 +176,8 @@ fn a_core_keeps_rosout_alive() {
     });
 }
 
-/// A rosout that ends at once, for example without its libraries, is started after growing pauses. The log has its last
-/// output.
+/// A rosout that ends at once, for example because its libraries are missing, is started again after growing pauses.
+/// The log has its last output.
 #[test]
 fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
     let scratch = Scratch::new();

@@ -41,7 +41,7 @@ impl Found {
             .collect()
     }
 
-    /// Asserts that this is the only problem, with these words.
+    /// Asserts that the only problem is about `subject` and contains `words`.
     #[track_caller]
     fn assert_problem(&self, subject: &str, words: &str) {
         let problems = self.of("problem");
@@ -101,7 +101,7 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let found = Found::by(&mut check(&scratch, port));
     let who = format!("rosmaster (process {}, port {port})", master.pid());
     found.assert_problem("port", &who);
-    // In front of that master there is no problem. In front of itself there is one.
+    // With this rosmaster as `--master` the check finds no problem. With rosrescue as `--master` it finds one.
     let uri = format!("http://127.0.0.1:{port}");
     let free = free_port();
     let found = Found::by(check(&scratch, free).args(["--master", &uri]));
@@ -153,7 +153,7 @@ fn a_launch_file_that_names_another_master_is_found() {
     fs::create_dir_all(launch.parent().unwrap()).unwrap();
     let port = free_port();
     let env = |uri: &str| format!("<env name=\"ROS_MASTER_URI\" value=\"{uri}\"/>\n");
-    // The first one is another form of the robot's own address.
+    // The first `env` names the robot's own master in another form.
     let own = env(&format!("http://localhost:{port}/"));
     let text = format!(
         "<launch>\n{own}{}</launch>\n",
@@ -306,7 +306,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
     few.args(["-c", r#"ulimit -n 100; exec "$0" "$@""#]);
     let found = Found::by(&mut behind(few, &check(&scratch, port)));
     found.assert_problem("descriptors", "100 open files");
-    // A user who may not write there.
+    // A user who may not write to the checkpoint's folder.
     let mut nobody = Command::new("setpriv");
     nobody.args([
         "--reuid",

@@ -232,7 +232,7 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
     assert_eq!(run(&["params", &torn]).ended(0), "\"one\": 1\n\"two\": 2");
 }
 
-/// Names come from the network.
+/// Names come from the network and may contain control characters.
 #[test]
 fn control_characters_in_names_are_not_printed() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);

@@ -47,7 +47,7 @@ fn assert_passed(verdict: &Value) {
     }
 }
 
-/// Asserts that the drill failed, with these words.
+/// Asserts that the drill failed and that a failure contains `words`.
 #[track_caller]
 fn assert_failed(verdict: &Value, words: &str) {
     assert_eq!(verdict["passed"], false, "{verdict:#}");

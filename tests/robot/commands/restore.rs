@@ -40,7 +40,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
         assert!(text.lines().any(|found| found == line), "{line}\n{text}");
     }
     assert_eq!(client.param("/gains/p"), Some(3.0.into()));
-    // Without a terminal it cannot ask.
+    // `restore` asks before it changes anything. Without a terminal it cannot.
     let refused = run(&robot, &["restore", "session-1"]);
     assert!(refused.stderr.contains("--yes"), "{refused:?}");
     refused.ended(2);

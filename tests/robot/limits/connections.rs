@@ -94,7 +94,7 @@ print(master.setParam('/c', '/x', 2))
     assert_eq!(robot.bare().param("/x"), Some(2.into()));
 }
 
-/// With the default limit of connections.
+/// This uses the default limit of connections.
 #[test]
 fn two_thousand_idle_connections_take_little_memory() {
     let robot = Robot::start(Mode::Proxy);

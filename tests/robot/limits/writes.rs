@@ -23,7 +23,7 @@ fn results(client: &Client, calls: impl IntoIterator<Item = Call>) -> Vec<Value>
     }
 }
 
-/// How long each `setParam` takes while `load` runs, and how long `load` takes.
+/// The times that each `setParam` takes while `load` runs, and the time that `load` takes.
 fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, Duration) {
     thread::scope(|scope| {
         let start = Instant::now();

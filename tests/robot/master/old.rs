@@ -1,5 +1,5 @@
 //! A master that behaves like rosmaster 1.14.3 and earlier: it also notifies the node that has set a parameter itself.
-//! While it is away, rosrescue does the same.
+//! While there is no master, rosrescue does the same.
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
 use rosrescue::xmlrpc::Value;

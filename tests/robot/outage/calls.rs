@@ -40,7 +40,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
         start.elapsed()
     );
 
-    // Calls that change something do not wait either.
+    // Calls that change the state do not wait either.
     let watcher = FakeNode::start("/watcher");
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     watcher.watch_param(&client, "/last");
@@ -76,14 +76,14 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     before.assert_same(&state, "in the next master");
 }
 
-/// The values of a parameter that a node was told, in order.
+/// The values of a parameter in a node's notifications, in order.
 fn told(node: &FakeNode, key: &str) -> Vec<i32> {
     let updates = node.heard("paramUpdate").into_iter();
     let of_key = updates.filter(|update| update[1].as_str() == Some(&format!("{key}/")));
     of_key.map(|update| update[2].as_int().unwrap()).collect()
 }
 
-/// A request in UTF-16, for which only a master knows the answer.
+/// The call is a request in UTF-16, which only a master understands.
 #[test]
 fn an_undecodable_call_is_held_for_a_limited_time_and_never_answered_wrongly() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);

@@ -12,7 +12,7 @@ use crate::support::{
 /// Maximum time until a living subscriber knows a new publisher. Waiting for one lookup would take 5 s.
 const SOON: Duration = Duration::from_millis(4_500);
 
-/// A `rosrescue core` that uses only the name server `server`, as does its master.
+/// A `rosrescue core` that uses only the name server `server`, also for its master.
 fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
     let setup = Setup::core(scratch, master_port);
     setup.wrapped(|own| server.serving(own)).start()
@@ -48,7 +48,7 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
         );
     }
     let living = FakeNode::start("/living");
-    // Under a name that the computer knows without a name server.
+    // This node is registered under a name that the computer knows without a name server.
     let api = format!("http://localhost:{}/", living.port());
     living.claim_subscription("/chatter", Some("std_msgs/String"));
     client.ok(
@@ -139,7 +139,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     let state = State::read(&Client::new(port));
     assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
 
-    // When a name begins to exist, its node is told everything.
+    // When a name begins to exist, its node gets all pending notifications.
     let found = &unresolvable[0];
     assert!(found.calls().is_empty(), "{:?}", found.calls());
     server.set("nobody0.test", Ipv4Addr::LOCALHOST);

@@ -1,5 +1,5 @@
-//! Restarts of rosrescue itself. It adopts a living master, fills an empty one, restores from the file what still
-//! applies, and takes over a system that ran without it.
+//! Restarts of rosrescue itself. It adopts a living master, fills an empty one, restores the parts of the checkpoint
+//! that still apply, and takes over a system that ran without it.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -47,7 +47,7 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
         "the living master was injected"
     );
 
-    // It can restore everything that it adopted. It knows parameter subscriptions from the checkpoint.
+    // rosrescue can restore everything that it adopted. It knows parameter subscriptions from the checkpoint.
     robot.crash_master();
     before.assert_same(&robot.state(), "after the master's crash that followed");
     client.set_param("/watched", 2);
@@ -177,8 +177,8 @@ fn a_system_that_ran_without_rosrescue_is_taken_over() {
     talker.assert_no_link_lost();
 }
 
-/// A parameter that rosmaster cannot return makes all parameters unreadable. They are unknown until it is
-/// gone, and rosrescue reports that.
+/// A parameter that rosmaster cannot return makes all parameters unreadable. They are unknown until it is deleted, and
+/// rosrescue reports this.
 #[test]
 fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     let scratch = Scratch::new();
@@ -209,7 +209,7 @@ fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     assert_eq!(client.param("/gain"), None);
 }
 
-/// `rosrescue core` whose rosmaster uses a port of its own choice.
+/// `rosrescue core` whose rosmaster uses any free port.
 fn core(scratch: &Scratch) -> Rescue {
     let port = free_port();
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
@@ -244,7 +244,7 @@ fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     (rescue, port)
 }
 
-/// Starts a server on the port where the master was. `what` says what it does with each connection.
+/// Starts a server on the port where the master was. `what` selects how it treats each connection.
 fn squat(port: u16, what: &'static str) {
     let listener = eventually_some("the port is free", || {
         TcpListener::bind(("127.0.0.1", port)).ok()
@@ -431,7 +431,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     let (_, at) = master_of(&rescue);
     assert_eq!(Client::new(at).param("/kept"), Some(2.into()));
 
-    // Its death is noticed like that of a child.
+    // rosrescue notices the death of an adopted master like that of a child.
     signal(starting, Signal::KILL);
     eventually("another master serves", || {
         client.master_pid().is_some_and(|pid| pid != starting)
@@ -439,7 +439,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     assert_eq!(client.param("/kept"), Some(2.into()));
 }
 
-/// Master and rosrescue die within 200 ms of each other. However far the next master has got, it is used.
+/// The master and rosrescue die within 200 ms of each other. The next master is used, however far it has got.
 #[test]
 fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
     let scratch = Scratch::new();
