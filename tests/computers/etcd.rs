@@ -17,7 +17,7 @@ fn without_etcd_each_computer_serves_its_nodes_and_afterwards_one_leads() {
         computer.kill_etcd();
     }
     for computer in &fleet.computers {
-        let what = format!("{} says that it is alone", computer.name);
+        let what = format!("{} is alone", computer.name);
         eventually(&what, || computer.role_is("alone"));
     }
     let alone = begin.elapsed();
@@ -54,7 +54,7 @@ fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
         computer.kill_etcd();
     }
     for computer in &fleet.computers {
-        let what = format!("{} says that it is alone", computer.name);
+        let what = format!("{} is alone", computer.name);
         eventually(&what, || computer.role_is("alone"));
     }
     let lonely = &fleet.computers[(leader + 1) % 3];

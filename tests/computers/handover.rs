@@ -33,7 +33,7 @@ fn the_leader_hands_over_when_it_is_told_to_and_when_it_is_stopped() {
         traffic.await_writes(&[0, 1, 2]);
         let [write, read] = traffic.longest(&[0, 1, 2], begin);
         println!(
-            "{} hands over to {}: longest write {write:.2?}, read {read:.2?}; it says: {said}",
+            "{} hands over to {}: longest write {write:.2?}, read {read:.2?}; output: {said}",
             NAMES[leader], NAMES[to]
         );
         assert!(write < HANDOVER && read < READ);

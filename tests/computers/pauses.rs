@@ -113,7 +113,7 @@ fn a_leader_that_was_stopped_sends_no_old_notifications() {
         // Late repetitions of notifications have arrived by then.
         if !holds(Duration::from_secs(1), told_last) {
             panic!(
-                "round {round}: {last:?} are the last values; told: {:?}",
+                "round {round}: the last values are {last:?}; notified: {:?}",
                 told(watcher)
             );
         }

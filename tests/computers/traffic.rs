@@ -134,7 +134,7 @@ impl Traffic {
                 .get(&format!("count_{name}"));
             assert!(
                 last.is_none_or(|last| count.and_then(Value::as_int) >= Some(last.number)),
-                "the last count on {name} was {last:?}, and it is {count:?}"
+                "the last acknowledged count on {name} was {last:?}, and the state has {count:?}"
             );
             // The parameters of earlier rounds have been deleted.
             let kept = answered.filter(|call| {
@@ -144,7 +144,7 @@ impl Traffic {
             let lost: Vec<_> = kept.filter(|call| !holds(&state, name, call)).collect();
             assert!(
                 lost.is_empty(),
-                "answered on {name}, and lost in round {round}: {} calls, the first: {:?}, the last: {:?}",
+                "acknowledged on {name}, and lost in round {round}: {} calls, the first: {:?}, the last: {:?}",
                 lost.len(),
                 lost.first(),
                 lost.last()
@@ -152,10 +152,10 @@ impl Traffic {
         }
         for node in &self.nodes {
             let told = node.it().heard("shutdown");
-            assert!(told.is_empty(), "{node:?} is told to end: {told:?}");
+            assert!(told.is_empty(), "{node:?} is told to shut down: {told:?}");
         }
         assert!(total > 0, "nothing was written in round {round}");
-        println!("round {round}: {total} writes are there");
+        println!("round {round}: none of {total} writes is lost");
         let all = format!("/round{round}");
         let leader = fleet.await_whole();
         let leader = &fleet.computers[leader];

@@ -105,7 +105,7 @@ fn play_or_shorten(
     // Printed at once and not with the test's output, because the search takes long.
     let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
     say(format!(
-        "{what} fails: {first}\n\n{}\nIt is made shorter now, for at most {SHRINKING:?}.",
+        "{what} fails: {first}\n\n{}\nIt is being shortened, for at most {SHRINKING:?}.",
         script.print()
     ));
     let deadline = Instant::now() + SHRINKING;

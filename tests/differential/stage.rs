@@ -96,7 +96,7 @@ impl<'n> Stage<'n> {
         match words.is_empty() {
             true => Ok(()),
             false => Err(format!(
-                "the mirror that took what the reply {reply:?} says differs: {words:?}"
+                "a mirror that has applied the reply {reply:?} differs: {words:?}"
             )),
         }
     }

@@ -99,7 +99,7 @@ impl Computer {
         }
         // A killed process loses its environment before its sockets are closed.
         let port = self.rescue.port();
-        eventually("nobody listens at its port", || {
+        eventually("no process listens at the computer's port", || {
             TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
         });
     }

@@ -22,7 +22,7 @@ fn robot_without_master() -> (Robot, Client) {
 fn time_to_hear(client: &Client, publisher: &FakeNode, subscriber: &FakeNode) -> Duration {
     let start = Instant::now();
     publisher.publish(client, "/chatter", "std_msgs/String");
-    eventually_some("the subscriber hears of the publisher", || {
+    eventually_some("the subscriber knows the publisher", || {
         let updates = subscriber.updates("/chatter");
         let knows = updates.iter().any(|list| list.contains(&publisher.api));
         knows.then(|| start.elapsed())
@@ -49,7 +49,7 @@ fn unreachable_subscribers_delay_no_other_node() {
     let [first, second] = ["/first", "/second"].map(FakeNode::start);
     let times = [&first, &second].map(|publisher| time_to_hear(&client, publisher, &living));
     println!(
-        "with {UNREACHABLE} unreachable nodes beside it, the subscriber was told after {times:?}"
+        "with {UNREACHABLE} unreachable nodes, the living subscriber was notified after {times:?}"
     );
     assert!(times.iter().all(|time| *time < SOON), "{times:?}");
 }
@@ -70,7 +70,7 @@ fn a_subscriber_that_does_not_answer_delays_no_other_node() {
     silent.release();
     // As soon as the silent subscriber answers again, it gets the latest list of publishers.
     let both = [first.api.clone(), second.api.clone()];
-    eventually("the silent subscriber is told at last", || {
+    eventually("the silent subscriber is notified at last", || {
         silent
             .updates("/chatter")
             .last()

@@ -40,7 +40,7 @@ impl Living {
         let start = Instant::now();
         publisher.publish(client, "/chatter", "std_msgs/String");
         let mut heard = vec![None; LIVING + 2];
-        eventually("every living subscriber hears of a publisher", || {
+        eventually("every living subscriber knows the publisher", || {
             for (i, heard) in heard.iter_mut().enumerate() {
                 if heard.is_none() {
                     let updates = match i.checked_sub(LIVING) {

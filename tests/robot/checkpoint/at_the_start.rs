@@ -31,7 +31,7 @@ fn rosrescue_serves_calls_without_a_writable_checkpoint() {
         client.set_param("/kept", 1);
         let dead = client.master_pid().expect("the master's process id");
         crate::support::signal(dead, Signal::KILL);
-        eventually("another master is there", || {
+        eventually("another master answers", || {
             client.master_pid().is_some_and(|pid| pid != dead)
         });
         assert_eq!(client.param("/kept"), Some(1.into()));

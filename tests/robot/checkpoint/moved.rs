@@ -50,8 +50,14 @@ fn assert_survives(rescue: &mut Rescue, deed: impl FnOnce(&Path), second: impl F
     rescue.client().set_param("/before", 1);
     deed(&rescue.checkpoint());
     let start = Instant::now();
-    eventually("rosrescue reports it", || said(rescue, "unprotected: ") > 0);
-    assert!(start.elapsed() < SAID, "said after {:?}", start.elapsed());
+    eventually("rosrescue reports that it is unprotected", || {
+        said(rescue, "unprotected: ") > 0
+    });
+    assert!(
+        start.elapsed() < SAID,
+        "reported after {:?}",
+        start.elapsed()
+    );
     rescue.client().set_param("/between", 2);
     eventually("rosrescue is protected again", || {
         said(rescue, "protected again") > 0 && status(&rescue.client())["unprotected"].is_null()

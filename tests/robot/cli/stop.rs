@@ -168,7 +168,7 @@ fn a_core_keeps_rosout_alive() {
     eventually("another rosout runs", || {
         rosout(&robot).is_some_and(|pid| pid != old)
     });
-    eventually("it is registered", || {
+    eventually("the new rosout is registered", || {
         let now = robot.settled_state();
         now.publishers == before.publishers
             && now.subscribers == before.subscribers
@@ -200,7 +200,7 @@ fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
         lines.filter(|line| line.contains("started rosout")).count()
     };
     let (first, start) = (starts(&rescue), Instant::now());
-    eventually("it is started three times more", || {
+    eventually("rosout is started three more times", || {
         starts(&rescue) >= first + 3
     });
     // The pauses are 1, 2 and 4 seconds.

@@ -54,7 +54,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert_eq!(client.param("/wifi/password"), Some("geheim".into()));
     assert_eq!(client.param("/extra"), Some(true.into()));
     assert_eq!(client.param("/run_id"), run_id);
-    eventually("the watcher is told", || {
+    eventually("the watcher is notified", || {
         let heard = watcher.heard("paramUpdate");
         heard
             .iter()

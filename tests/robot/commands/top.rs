@@ -106,7 +106,7 @@ fn it_waits_for_a_rosrescue_that_goes_away() {
     );
     eventually("a first line", || !top.stdout().is_empty());
     robot.rescue.kill();
-    top.wait_line("that nobody is there", |line| {
+    top.wait_line("that no rosrescue answers", |line| {
         line.contains("no rosrescue at ")
     });
     let before = top.stdout().len();

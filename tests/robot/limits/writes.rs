@@ -156,7 +156,10 @@ fn other_writes_are_not_delayed_by_calls_that_only_the_master_understands() {
             }
         });
     });
-    println!("{} writes in {time:?}, {alone:?} each alone", waits.len());
+    println!(
+        "{} writes in {time:?}; without load {alone:?} each",
+        waits.len()
+    );
     let possible = time.as_secs_f64() / alone.as_secs_f64();
     assert!(waits.len() as f64 > possible / 16.0, "{possible} alone");
     for number in 0..CALLS {

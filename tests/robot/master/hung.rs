@@ -95,20 +95,20 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
         "except for the running calls",
     );
     let both = [node.api.clone(), coming.api.clone()];
-    eventually("the subscriber is told of the new publisher", || {
+    eventually("the subscriber knows the new publisher", || {
         watcher
             .updates("/topic")
             .last()
             .is_some_and(|it| *it == both)
     });
     // The node need not get outdated values.
-    eventually("the node is told of the last value", || {
+    eventually("the node gets the last value", || {
         told(&node, "/standing").last() == Some(&(3, true))
     });
     let heard = told(&node, "/standing");
     assert!(heard.is_sorted(), "{heard:?}");
     // This value comes when the master counts as hung. Until then the master itself may notify the node.
-    eventually("the node is told of what was under way", || {
+    eventually("the node gets the value that was under way", || {
         told(&node, "/flying").contains(&(1, true))
     });
 
@@ -132,7 +132,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     );
     // The master notifies the subscribers of its parameters as before.
     client.set_param("/standing", 4);
-    eventually("the node is told by the master", || {
+    eventually("the master notifies the node", || {
         told(&node, "/standing").contains(&(4, false))
     });
     for node in [&node, &watcher, &coming] {
@@ -203,7 +203,7 @@ fn ten_hangs_under_writes_lose_nothing() {
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
         // rosrescue leaves out outdated values. The last value may come from rosrescue before the master sends the
         // value before that; then it is sent again.
-        eventually("the last value that the node is told is the newest", || {
+        eventually("the node's last value is the newest", || {
             told(&watcher, key)
                 .last()
                 .is_some_and(|(value, _)| *value == written)

@@ -21,7 +21,7 @@ fn a_node_that_sets_a_parameter_is_notified_as_by_the_old_master(mode: Mode) {
             values.any(|call| call.params[2] == Value::Int(value))
         };
         let is_told = |value| match is_old {
-            true => eventually("the node is told", || told(value)),
+            true => eventually("the node is notified", || told(value)),
             false => assert!(holds(Duration::from_millis(300), || !told(value))),
         };
         set(1);

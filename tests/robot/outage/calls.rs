@@ -54,12 +54,12 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
         "{:?}",
         setting.elapsed()
     );
-    eventually("the subscriber is told every value", || {
+    eventually("the subscriber gets every value", || {
         told(&watcher, "/last") == [0, 1, 2, 3, 4]
     });
     let coming = FakeNode::start("/coming");
     coming.publish(&client, "/topic", "std_msgs/String");
-    eventually("the subscriber is told of the publisher", || {
+    eventually("the subscriber knows the publisher", || {
         watcher.updates("/topic") == [[coming.api.as_str()]]
     });
     assert!(!robot.is_open(), "a master was there during the outage");
@@ -71,7 +71,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     assert_eq!(robot.bare().param("/last"), Some(Value::Int(4)));
     assert!(
         !state.knows("/fake"),
-        "what was unregistered in the gap is back:\n{state}"
+        "a node that was unregistered during the outage is back:\n{state}"
     );
     before.assert_same(&state, "in the next master");
 }
@@ -98,7 +98,7 @@ fn an_undecodable_call_is_held_for_a_limited_time_and_never_answered_wrongly() {
     assert!(error.to_string().contains("closed after []"), "{error}");
     assert!(
         waited >= Duration::from_millis(1400),
-        "it was held only {waited:?}"
+        "the call was held only for {waited:?}"
     );
     robot.revive_master();
     robot.await_gate();

@@ -57,7 +57,7 @@ fn a_core_answers_at_once_and_gives_its_master_all_writes_later() {
         assert_eq!(bare.param("/early/gain"), Some(1.5.into()));
         // The master also has the parameter subscription, which rosrescue cannot read from a master.
         client.set_param("/early/gain", 2.5);
-        eventually("the parameter's subscriber is told", || {
+        eventually("the parameter's subscriber is notified", || {
             // The node gets the value twice if another node had not answered yet, because then rosrescue notifies nodes
             // too.
             let heard = publisher.heard("paramUpdate");

@@ -53,7 +53,7 @@ fn leave(client: &Client, bare: &Client, calls: Calls, pause: Duration) {
         assert_eq!(client.status(method, params).unwrap(), expected, "{method}");
         let is_last = i + 1 == count;
         let stays = || is_last || knows(client);
-        assert!(holds(pause, stays), "it was removed after {method}");
+        assert!(holds(pause, stays), "the node was removed after {method}");
     }
     assert!(!knows(client));
 }

@@ -77,7 +77,7 @@ fn a_subscriber_of_a_parameter_is_told_values_in_order_and_the_last_one() {
     let last = states.len() - 1;
     // The second node gets two updates for the last two states, and perhaps each twice.
     for (node, twice) in [(exact, last), (above, last - 1)] {
-        eventually("the last value is told", || {
+        eventually("the last value arrives", || {
             let heard = node.heard("paramUpdate");
             heard.last().is_some_and(|it| states[last].contains(it))
         });

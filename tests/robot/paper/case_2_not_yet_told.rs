@@ -158,7 +158,7 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
             }
         }
     }
-    println!("{once} fake nodes were told without a repeat");
+    println!("{once} fake nodes were notified without a repeat");
     let nodes = audience.fakes.iter().chain(&there).chain(&gone);
     for node in nodes {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());

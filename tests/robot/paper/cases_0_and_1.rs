@@ -141,7 +141,7 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
         }
     }
     eventually(
-        "the subscribers are told that only one publisher is left",
+        "the subscribers know that only one publisher is left",
         || {
             observer
                 .updates("/chatter")

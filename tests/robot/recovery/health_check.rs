@@ -55,7 +55,7 @@ fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mod
     drop(dead);
     robot.crash_master();
     robot.await_state(&after, "after the dead node was unregistered");
-    eventually("the subscriber is told", || {
+    eventually("the subscriber is notified", || {
         subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
     });
     report(&robot, "the removed node", |report| {
@@ -236,7 +236,7 @@ fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
     }));
     talker.kill();
     robot.await_state(&after, "after the standing health check");
-    eventually("the listener is told", || {
+    eventually("the listener is notified", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });
 

@@ -61,11 +61,11 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
     let publisher = FakeNode::start("/publisher");
     publisher.publish(&client, "/chatter", "std_msgs/String");
     let registered = start.elapsed();
-    eventually("the living subscriber is told", || {
+    eventually("the living subscriber is notified", || {
         living.updates("/chatter").last() == Some(&vec![publisher.api.clone()])
     });
     let told = start.elapsed() - registered;
-    println!("registration {registered:?}, told {told:?} later");
+    println!("registration {registered:?}, notified {told:?} later");
     assert!(registered < SOON, "{registered:?}");
     assert!(told < SOON, "{told:?}");
     // While the lookups are under way, calls pass, and new publishers register.
@@ -80,7 +80,7 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
     let second = FakeNode::start("/second");
     let start = Instant::now();
     second.publish(&client, "/chatter", "std_msgs/String");
-    eventually("the living subscriber is told of the second", || {
+    eventually("the living subscriber knows the second publisher", || {
         living
             .updates("/chatter")
             .last()
@@ -126,7 +126,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     );
     let start = Instant::now();
     let all = vec![publisher.api.clone()];
-    eventually("the living subscriber is told", || {
+    eventually("the living subscriber is notified", || {
         living.updates("/chatter").last() == Some(&all)
     });
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
@@ -187,7 +187,7 @@ fn a_node_is_found_again_when_its_host_name_gets_another_address() {
     assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
     assert_eq!(names(&recovered["unreachable"]), Vec::<String>::new());
     let all = vec![publisher.api.clone()];
-    eventually("the node is told at the new address", || {
+    eventually("the node is notified at the new address", || {
         second.updates("/chatter").last() == Some(&all)
     });
     let asked = second.calls().into_iter().any(|call| call.from_rosrescue);
@@ -203,7 +203,7 @@ fn a_node_is_found_again_when_its_host_name_gets_another_address() {
     eventually("the node is reachable again", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
-    eventually("the node is told everything at the new address", || {
+    eventually("the node gets all notifications at the new address", || {
         third.updates("/chatter").last() == Some(&all)
     });
     assert!(kept());

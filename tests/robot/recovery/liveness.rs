@@ -85,7 +85,7 @@ fn a_node_whose_port_has_no_listener_is_reported_as_dead() {
         names(&robot.status().unwrap_or_default()["dead_nodes"]) == ["/dead"]
     });
     let said = |line: &String| line.contains("a registered node is dead") && line.contains("/dead");
-    eventually("the log reports it", || {
+    eventually("the log reports the dead node", || {
         robot.rescue.output().iter().any(said)
     });
 }

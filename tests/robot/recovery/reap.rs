@@ -148,7 +148,7 @@ fn by_default_a_shutdown_of_the_wrong_node_is_reported() {
     eventually("the master shuts down the wrong node", || {
         innocent.heard("shutdown").len() == 1
     });
-    eventually("the log reports it", || {
+    eventually("the log reports the shutdown", || {
         has_logged(
             &robot,
             &[
@@ -178,7 +178,7 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
         });
         if let Some(last) = last.replace(program) {
             // This is an ordinary displacement, as with a bare master.
-            eventually("the displaced program is told", || {
+            eventually("the displaced program is told to shut down", || {
                 last.heard("shutdown").len() == 1
             });
         }

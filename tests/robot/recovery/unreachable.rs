@@ -66,7 +66,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     let mut publishers = Vec::new();
     for value in 1..=3 {
         client.set_param("/gain", value);
-        eventually("the node is told of the parameter", || {
+        eventually("the node is notified of the parameter", || {
             let told = node.heard("paramUpdate");
             told.iter().any(|told| told[2] == value.into())
         });
@@ -78,7 +78,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
             names(&status(&client)["unreachable"]).is_empty()
                 && node.updates("/topic").last() != Some(&all)
         });
-        assert!(!reachable, "the node was not told of publisher {value}");
+        assert!(!reachable, "the node was not notified of publisher {value}");
         let unreachable = names(&status(&client)["unreachable"]);
         assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
     }

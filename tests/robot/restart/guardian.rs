@@ -424,7 +424,7 @@ fn a_worker_survives_its_guardian_and_reports_it() {
     let client = rescue.client();
     let worker = worker(&scratch);
     rescue.kill();
-    eventually("the status reports it", || {
+    eventually("the log reports the missing guardian", || {
         let lines = rescue.stderr().into_iter();
         let warned = lines.filter(|line| line.contains("unguarded")).count();
         warned == 1
@@ -496,7 +496,7 @@ fn a_guardian_works_as_the_first_process_of_a_container() {
     eventually("no zombie is left", || {
         !Path::new(&format!("/proc/{master}")).exists()
     });
-    eventually("another master is there", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| Some(pid) != named)
     });
     assert_eq!(client.param("/kept"), Some("yes".into()));
@@ -547,7 +547,7 @@ fn rosrescue_and_the_master_run_before_the_nodes() {
     signal(dead, Signal::KILL);
     worker_after(&scratch, dead);
     let client = rescue.client();
-    eventually("there is another master", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
     });
     assert_eq!(values(), allowed, "after the death of worker and master");

@@ -51,7 +51,7 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
     robot.crash_master();
     before.assert_same(&robot.state(), "after the master's crash that followed");
     client.set_param("/watched", 2);
-    eventually("the parameter's subscriber is told", || {
+    eventually("the parameter's subscriber is notified", || {
         node.heard("paramUpdate")
             .last()
             .is_some_and(|call| call[2] == Value::Int(2))
@@ -161,7 +161,10 @@ fn a_system_that_ran_without_rosrescue_is_taken_over() {
     });
 
     let rescue = Setup::proxy(&scratch, master.port).start();
-    before.assert_same(&State::read(&rescue.client()), "after it was taken over");
+    before.assert_same(
+        &State::read(&rescue.client()),
+        "after rosrescue took over the system",
+    );
     let dead = master.pid();
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
@@ -358,7 +361,7 @@ fn an_empty_master_that_was_left_behind_is_used_or_ended() {
             all.filter(|(pid, words)| words.contains("rosmaster") && alive(*pid))
                 .count()
         };
-        eventually("there is one rosmaster", || masters() == 1);
+        eventually("exactly one rosmaster runs", || masters() == 1);
         assert_eq!(rescue.terminate().code(), Some(0));
         // The killed rosrescue may have been asking for the version of ROS.
         eventually("every process has ended", || scratch.survivors().is_empty());
@@ -412,7 +415,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     client.set_param("/kept", 1);
     fs::write(scratch.path("away"), "").unwrap();
     kill_master_and_rescue(&mut rescue, Duration::ZERO);
-    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+    let starting = eventually_some("exactly one rosmaster runs", || only_master(&scratch));
 
     rescue.start_again();
     eventually("rosrescue listens", || client.connect().is_ok());
@@ -465,7 +468,7 @@ fn a_starting_master_that_has_lost_its_port_is_ended() {
     let (_, master_port) = master_of(&rescue);
     fs::write(scratch.path("away"), "").unwrap();
     kill_master_and_rescue(&mut rescue, Duration::ZERO);
-    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+    let starting = eventually_some("exactly one rosmaster runs", || only_master(&scratch));
     squat(master_port, "closes");
     fs::remove_file(scratch.path("away")).unwrap();
     rescue.start_again();
