@@ -229,7 +229,7 @@ async fn a_key_expires_with_its_lease() {
 }
 
 #[tokio::test]
-async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again() {
+async fn a_full_etcd_is_reported_can_be_read_and_later_accepts_writes() {
     let quota = ["--quota-backend-bytes", "8388608"];
     let servers = Servers::with(crate::support::Scratch::new(), 1, "http", &quota).await;
     let (client, keys) = (servers.client(), keys());

@@ -1,4 +1,4 @@
-//! A CPython process that runs beside the test.
+//! A CPython process that runs during the test.
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};

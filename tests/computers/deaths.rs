@@ -108,8 +108,8 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     fleet.assert_nodes_live();
 }
 
-/// When the worker dies, the guardian starts a new one, and the computer stays the leader. No other nodes or clients
-/// use the processor.
+/// When the worker dies, the guardian starts a new one, and the computer stays the leader. The test runs without
+/// [`Traffic`], so that the processor is idle.
 #[test]
 fn writes_go_on_soon_after_the_death_of_the_leaders_worker_or_computer() {
     let _alone = alone();

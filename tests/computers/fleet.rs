@@ -189,7 +189,7 @@ impl Fleet {
         }
     }
 
-    /// Panics if a node has ended that the test did not stop.
+    /// Panics if a node of a computer has ended.
     #[track_caller]
     pub(crate) fn assert_nodes_live(&mut self) {
         for computer in &mut self.computers {

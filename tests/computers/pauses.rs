@@ -55,7 +55,7 @@ fn watch(computer: &Computer) -> Named {
 /// The leader's worker is stopped for longer than the time to live while calls of a follower are under way. The next
 /// leader answers these and newer calls.
 #[test]
-fn a_leader_that_was_stopped_sends_no_old_notifications() {
+fn a_leader_that_was_paused_sends_no_old_notifications() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let (mut first, mut watcher) = (0, None);
@@ -125,7 +125,7 @@ fn a_leader_that_was_stopped_sends_no_old_notifications() {
 /// A follower without etcd learns of new writes only from the leader's answers. Its mirror must not return older
 /// values, however long the leader is stopped.
 #[test]
-fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_stopped() {
+fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
     let _alone = alone();
     // The leader is stopped for less than this time to live.
     let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);

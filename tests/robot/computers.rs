@@ -185,7 +185,7 @@ fn rosrescue_can_be_run_and_handed_over_as_documented() {
         three_etcd(&document),
         on(&ALL, &core),
         on(&["head"], &look),
-        // The exit status says whether the next master is there yet.
+        // The exit status depends on whether the next master already answers, which the test does not check.
         on(&["base"], "rosrescue status || true"),
         // On such a computer `check` has further findings.
         on(&["head"], &format!("{} || true", check.trim_end())),

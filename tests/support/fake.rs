@@ -182,7 +182,7 @@ impl FakeNode {
         claim(&self.inner.subscriptions, topic, topic_type);
     }
 
-    /// The node's address for services. No TCPROS server is there.
+    /// The node's address for services. No TCPROS server listens there.
     pub(crate) fn service_api(&self) -> String {
         format!("rosrpc://127.0.0.1:{}", self.server.port)
     }

@@ -33,7 +33,7 @@ const LOOK: Duration = Duration::from_millis(250);
 pub(crate) enum Order {
     /// All nodes register in the order of topics, so that those of one topic register at about the same time.
     Same,
-    /// Each node registers in a random order of its own.
+    /// Each node registers in a different random order.
     Shuffled,
 }
 
@@ -44,7 +44,7 @@ pub(crate) struct Plan {
     pub(crate) nodes: usize,
     pub(crate) links: usize,
     pub(crate) order: Order,
-    /// Number of busy processes that run beside them.
+    /// Number of busy processes that run at the same time.
     pub(crate) load: usize,
     /// How long a link may take after the last node was ready, on a computer without other load.
     pub(crate) wait: Duration,
@@ -136,8 +136,8 @@ pub(crate) struct Start {
 }
 
 impl Start {
-    /// Panics unless every link was made. On an overloaded computer a node may read an answer after a
-    /// notification that was sent later; it is then told once more.
+    /// Panics unless every link was made. On an overloaded computer a node may read an answer after a notification that
+    /// was sent later; the notification is then repeated.
     #[track_caller]
     pub(crate) fn assert_whole(&self, plan: &Plan) {
         println!("answers read too late: {}", self.overtaken.len());

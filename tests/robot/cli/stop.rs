@@ -1,5 +1,5 @@
-//! How rosrescue stops, and what it keeps running until then. Signals stop it cleanly whatever hangs. Nothing is left
-//! behind, and no call gets a false answer.
+//! How rosrescue stops, and what it keeps running until then. Signals stop it cleanly even if another process hangs.
+//! Nothing is left behind, and no call gets a false answer.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;

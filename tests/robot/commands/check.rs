@@ -289,7 +289,7 @@ fn wrong_environment_variables_are_found() {
 }
 
 #[test]
-fn no_rosmaster_no_descriptors_and_no_permission() {
+fn missing_rosmaster_descriptors_and_permissions_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     let found = Found::by(check(&scratch, port).env("PATH", "/nowhere"));
@@ -340,7 +340,7 @@ fn open_to_all(folder: &std::path::Path) {
 
 /// On Debian the computer's own name resolves to 127.0.1.1. A roscore also starts at boot.
 #[test]
-fn the_hosts_file_and_the_units_of_this_computer() {
+fn problems_in_the_hosts_file_and_units_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     let hosts = scratch.path("hosts");

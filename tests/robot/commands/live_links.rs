@@ -21,7 +21,7 @@ fn a_link_that_was_broken_is_found_and_named() {
         let words = [&["check", "--live"], more].concat();
         Tool::rosrescue(&robot.scratch, robot.port(), &words)
     };
-    // Four connections of /chatter, and those of /rosout.
+    // There are four connections of /chatter, and those of /rosout.
     eventually("all links are made", || {
         let checked = check(&[]);
         checked.exit() == 0 && checked.stdout.ends_with("No problems found.")

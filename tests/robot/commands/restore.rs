@@ -60,7 +60,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
             .iter()
             .any(|update| update[1..] == params!["/gains/i/", 2])
     });
-    // The real master has the value as well.
+    // The real master also has the value.
     assert_eq!(robot.bare().param("/gains/i"), Some(Value::from(2)));
 
     let json = run(

@@ -20,7 +20,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     let dead = robot.master_pid();
     robot.kill_master();
 
-    // roslaunch waits five seconds for getPid, and then starts a master of its own on this port.
+    // roslaunch waits five seconds for getPid, and then starts another master on this port.
     let start = Instant::now();
     assert_eq!(client.master_pid(), Some(dead));
     assert_eq!(

@@ -78,8 +78,8 @@ fn is_unprotected(rescue: &Rescue) -> bool {
     !status(&rescue.client())["unprotected"].is_null()
 }
 
-/// The disk fills up while `rescue` serves the master at `bare`, and the robot changes. rosrescue ends by
-/// `end` while the disk is full and is started again, and once more when there is room.
+/// The disk fills up while `rescue` serves the master at `bare`, and the robot changes. rosrescue ends by `end` while
+/// the disk is full and is started again, and a second time when the disk has room.
 fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn(&mut Rescue)) {
     let client = rescue.client();
     let mut nodes = Nodes::begin(&client);

@@ -31,7 +31,7 @@ fn cut_power(robot: &mut Robot) {
     eventually("the master is dead", || !alive(master));
 }
 
-/// Files beside the checkpoint that contain `text`.
+/// The files next to the checkpoint that contain `text`.
 fn kept(robot: &Robot, text: &str) -> Vec<String> {
     let checkpoint = robot.rescue.checkpoint();
     let is_old = |path: &Path| path != checkpoint && path.to_string_lossy().contains("chkpt");
