@@ -99,7 +99,7 @@ fn a_leader_that_was_paused_sends_no_old_notifications() {
                 .zip(&last)
                 .all(|(index, last)| told[&key(index)].last() == Some(last))
         };
-        eventually("the last values are notified", told_last);
+        eventually("the watcher gets the last values", told_last);
         signal(worker, Signal::CONT);
         fleet.await_same_state();
         for (index, last) in (0..).zip(&last) {
