@@ -48,7 +48,7 @@ fn record(seq: u64) -> Record {
     }
 }
 
-/// A checkpoint as of record 7, followed by `count` records; also where each line starts, and the stamp.
+/// A checkpoint as of record 7, followed by `count` records. Also returns the position of each line and the stamp.
 fn file(count: u64, generation: u64) -> (Vec<u8>, Vec<usize>, Stamp) {
     let encoded = encode_checkpoint(&checkpoint(7), generation).unwrap();
     let mut bytes = encoded.bytes;
@@ -60,8 +60,7 @@ fn file(count: u64, generation: u64) -> (Vec<u8>, Vec<usize>, Stamp) {
     (bytes, starts, encoded.stamp)
 }
 
-/// Checks that everything that was read had been written. Returns whether all of it was read and no damage
-/// was found.
+/// Checks that all that was read had been written. Returns whether everything was read and no damage was found.
 fn is_untouched(decoded: &Decoded, count: u64) -> bool {
     if let Ok(found) = &decoded.checkpoint {
         assert_eq!(*found, checkpoint(7));
@@ -224,7 +223,7 @@ fn label(origin: Origin) -> Label {
     Label { at, origin }
 }
 
-/// A file whose session and records also tell which writes have not reached the master yet.
+/// A checkpoint file whose session and records also say which writes the master has not run yet.
 fn file_with_pending_writes() -> Vec<u8> {
     let mut checkpoint = checkpoint(7);
     checkpoint.session.incarnation = 2;
@@ -274,7 +273,7 @@ fn files_of_format_1_are_read() {
     }
 }
 
-/// Files of this format stay readable, and files are still written exactly like those.
+/// Files of this format can still be read, and new files are written in exactly the same way.
 #[test]
 fn golden_files_are_read_and_written_unchanged() {
     let files = [

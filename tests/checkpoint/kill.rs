@@ -1,4 +1,4 @@
-//! SIGKILL, at any moment, to a process that records on a real disk.
+//! A process that records on a real disk is killed with SIGKILL at any moment.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! The checkpoint without ROS: its bytes, its YAML, and the store on a real disk.
+//! Tests of the checkpoint without ROS: its bytes, its YAML, and the store on a real disk.
 
 #![allow(
     clippy::unwrap_used,
@@ -7,12 +7,12 @@
     reason = "a test"
 )]
 
-/// Damage of any kind to the bytes of a file.
+/// Files with damaged bytes.
 mod damaged_bytes;
-/// SIGKILL to a process that records.
+/// SIGKILL for a process that records.
 mod kill;
 mod log;
 /// The store on a disk: locks, generations, compaction.
 mod store;
-/// How Python reads a checkpoint.
+/// PyYAML reads a checkpoint like rosrescue.
 mod yaml;

@@ -51,7 +51,7 @@ async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
     let client = servers.client_of(0, with_user("root", "secret"));
     client.view(&keys, LIMIT).await.unwrap();
     let mut watch = client.watch(keys.small(), 0, Duration::from_secs(1));
-    // Tokens expire after 2 s without use, and when their member ends.
+    // Tokens expire after 2 s without use, and when the member that issued them ends.
     let start = std::time::Instant::now();
     while start.elapsed() < Duration::from_secs(4) {
         let _ = tokio::time::timeout(Duration::from_secs(4), watch.next()).await;
@@ -60,7 +60,7 @@ async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
     assert!(!format!("{:?}", with_user("root", "secret")).contains("secret"));
 }
 
-/// The gateway of etcd is a client of its own server, so a certificate for servers alone is not enough.
+/// etcd's gateway is a client of its own server, so a certificate for servers only is not enough.
 async fn for_servers_alone(access: Credentials, folder: &Path) {
     std::fs::write(folder.join("usage"), "extendedKeyUsage=serverAuth\n").unwrap();
     certificate(folder, "half", "ca", 9);

@@ -1,4 +1,4 @@
-//! The base of running on several computers, with real etcd servers on loopback.
+//! The client of etcd and the robot's state in etcd, with real etcd servers on loopback.
 
 #![allow(
     clippy::unwrap_used,
@@ -16,9 +16,9 @@ mod servers;
 mod access;
 /// The robot's state in etcd, read by another computer.
 mod replica;
-/// Requests while members die, hang, are full, or are no majority.
+/// Requests while members of etcd die, hang, are full, or have no majority.
 mod requests;
-/// Two state machines on a real etcd: which one leads when the other dies.
+/// Two state machines on a real etcd: one of them leads when the other dies.
 mod takeover;
-/// Watches while members die, and when etcd has discarded what was watched.
+/// Watches while members of etcd die, and after etcd has compacted the watched revisions.
 mod watches;

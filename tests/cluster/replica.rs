@@ -34,7 +34,7 @@ fn record(seq: u64, bytes: usize) -> Record {
     Record { seq, entry }
 }
 
-/// A leader, as simple as possible.
+/// The simplest possible leader.
 struct Leader {
     replica: Replica,
     guard: RevisionGuard,
@@ -116,7 +116,7 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
     let loaded = follower.load(Progress::default()).await.unwrap();
     assert!(loaded.records == records && loaded.checkpoint.is_none());
     assert_eq!(loaded.view.guard(), leader.guard);
-    // The same records, as they arrive.
+    // A watch returns the same records when they arrive.
     let (mut progress, mut seen) = (Progress::default(), Vec::new());
     while seen.len() < records.len() {
         for change in watch.next().await.unwrap() {
@@ -128,13 +128,13 @@ async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb
         }
     }
     assert!(seen == records);
-    // After one more record there is little to read.
+    // After one more record, only that record is read.
     leader.commit(&[record(7, 1)]).await;
     let more = follower.load(loaded.progress).await.unwrap();
     assert_eq!(more.records, [record(7, 1)]);
 }
 
-/// How many read requests the only member has answered.
+/// The number of read requests that the only member has answered.
 fn reads(servers: &Servers) -> u64 {
     let address = servers.endpoints(0)[0].replace("http://", "");
     let mut stream = TcpStream::connect(&address).unwrap();
@@ -150,10 +150,10 @@ fn reads(servers: &Servers) -> u64 {
     count.unwrap().parse().unwrap()
 }
 
-/// While a computer merges what it wrote while cut off, it reads the journal again and again. With a long journal each
-/// reading took over 10 s on a busy computer.
+/// A computer that merges its writes reads the journal again and again. With a long journal each complete read took
+/// over 10 s on a busy computer.
 #[tokio::test]
-async fn what_is_known_of_a_long_journal_is_not_read_again() {
+async fn known_records_of_a_long_journal_are_not_read_again() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     for seq in 1..=300 {
@@ -217,16 +217,16 @@ async fn a_snapshot_replaces_the_journal_before_it() {
     known.seq = 51;
     let on = follower.load(known).await.unwrap();
     assert!(on.checkpoint.is_none() && on.records == [record(52, 10)]);
-    // Nothing is left of the old journal.
+    // The old journal has been deleted.
     let all = format!("{}a", keys().prefix())..format!("{}z", keys().prefix());
     let all = follower.client.range(&all, LIMIT).await.unwrap();
     let sizes: usize = all.kvs.iter().map(|kv| kv.value.len()).sum();
     assert!(sizes < 4 << 20, "{sizes}");
 }
 
-/// Otherwise a slow reader never gets to the end while others write.
+/// Without this, a slow reader would never finish while others write.
 #[tokio::test]
-async fn a_reader_gets_the_parts_that_it_was_told_of_although_the_leader_has_replaced_them() {
+async fn a_reader_gets_announced_parts_although_the_leader_has_replaced_them() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     let large = [record(1, 1 << 20)];

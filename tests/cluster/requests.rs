@@ -1,4 +1,4 @@
-//! Requests to etcd while members die, hang, are full, or are no majority.
+//! Requests to etcd while members die, hang, are full, or have no majority.
 
 use std::time::{Duration, Instant};
 
@@ -47,7 +47,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     else {
         panic!("{first:?}");
     };
-    // The second claim is answered with the present leader.
+    // The answer to the second claim names the present leader.
     let second = client
         .run(&keys, &settings("b"), &claim(1), None, LIMIT)
         .await
@@ -64,7 +64,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
         (leader.uri.as_str(), leader.version.as_str()),
         ("http://a:11311", "0.1.0")
     );
-    // A heartbeat, and the same one again.
+    // The same heartbeat is sent twice.
     let op = beat(view.guard(), 1, 7);
     let made = client
         .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
@@ -131,7 +131,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
 async fn a_range_is_read_in_pages_of_the_same_revision() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
-    // Nobody leads, so the term is 0.
+    // There is no leader, so the term is 0.
     let puts: Vec<_> = (1..=100).map(entry).collect();
     assert!(client.put(&keys, 0, &puts, LIMIT).await.unwrap());
     let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
@@ -193,7 +193,7 @@ async fn without_a_majority_requests_fail_with_a_clear_error() {
         said.contains("cannot connect to etcd at http://127.0.0.1:"),
         "{said}"
     );
-    // The member that is left learns of it when its own time for an election is over.
+    // The remaining member notices that it has no majority when its own election timeout is over.
     let mut statuses = client.status(limit).await;
     while start.elapsed() < LIMIT && statuses[0].as_ref().unwrap().errors.is_empty() {
         statuses = client.status(limit).await;
@@ -209,7 +209,7 @@ async fn without_a_majority_requests_fail_with_a_clear_error() {
 }
 
 #[tokio::test]
-async fn a_key_goes_with_its_lease() {
+async fn a_key_expires_with_its_lease() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let lease = client.grant(Duration::from_secs(1), LIMIT).await.unwrap();
@@ -229,7 +229,7 @@ async fn a_key_goes_with_its_lease() {
 }
 
 #[tokio::test]
-async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again() {
+async fn a_full_etcd_is_reported_can_be_read_and_later_accepts_writes() {
     let quota = ["--quota-backend-bytes", "8388608"];
     let servers = Servers::with(crate::support::Scratch::new(), 1, "http", &quota).await;
     let (client, keys) = (servers.client(), keys());
@@ -252,7 +252,7 @@ async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again
     );
     let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
     assert!(!found.kvs.is_empty());
-    // rosrescue can only delete entries. The rest is up to the operator.
+    // rosrescue can only delete entries. The operator must compact, defragment and disarm the alarm.
     assert!(
         client
             .delete(&keys, 0, &keys.behind(seq), LIMIT)
@@ -271,7 +271,7 @@ async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again
 }
 
 #[tokio::test]
-async fn a_request_that_is_too_large_has_an_error_of_its_own() {
+async fn a_request_that_is_too_large_has_its_own_error() {
     let servers = Servers::new(1).await;
     let large = Put {
         key: keys().journal(1),

@@ -1,5 +1,4 @@
-//! Two state machines on a real etcd, each with the simplest possible driver: which one leads when the other
-//! dies.
+//! Two state machines on a real etcd, each with the simplest possible driver: one of them leads when the other dies.
 
 use std::time::{Duration, Instant};
 
@@ -135,7 +134,7 @@ async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
             next.at - began
         );
         assert_eq!(next.name, other);
-        // It takes 2 s, and some more on a busy computer. With an etcd lease it would take 4.4 to 6.1 s.
+        // A takeover takes 2 s, and longer on a busy computer. With an etcd lease it would take 4.4 to 6.1 s.
         assert!(next.at - began < Duration::from_secs(4));
         if round.contains("etcd") {
             servers.start(member);
@@ -144,7 +143,7 @@ async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
             shells[at] = (leads, start(&servers, leads, at));
             assert_eq!(until(&mut heard, Role::Following).await.name, leads);
         }
-        // The next round expects to be told who leads.
+        // The next round needs a message that says which computer leads.
         let leader = Became {
             name: other,
             role: Role::Leading,

@@ -1,4 +1,4 @@
-//! Watches while members die, and when etcd has discarded what was watched.
+//! Watches while members of etcd die, and after etcd has compacted the watched revisions.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use rosrescue::cluster::{
 
 use crate::servers::{LIMIT, Servers, keys};
 
-/// Longer than a write takes, and shorter than a test may take.
+/// How long a watch may be silent: longer than a write takes, and shorter than a test may take.
 const QUIET: Duration = Duration::from_secs(2);
 
 fn entry(seq: u64) -> Put {
@@ -24,7 +24,7 @@ async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
     while *seen < last {
         let end = Instant::now() + LIMIT;
         let changes = loop {
-            // The real driver stops waiting again and again too, because it has other events to wait for.
+            // The real driver also stops waiting again and again, because it waits for other events too.
             if let Ok(changes) = tokio::time::timeout(QUIET / 20, watch.next()).await {
                 break changes;
             }
@@ -81,7 +81,7 @@ async fn a_watch_reports_that_etcd_has_discarded_older_changes() {
     let mut watch = client.watch(keys.small(), 1, QUIET);
     let end = watch.next().await.unwrap_err();
     assert!(matches!(end, WatchEnd::Compacted), "{end:?}");
-    // A watch that starts at what has been read goes on.
+    // A watch continues from the revision that has been read.
     let mut watch = client.watch(keys.small(), found.revision, QUIET);
     assert!(client.put(&keys, 0, &[entry(11)], LIMIT).await.unwrap());
     let mut seen = 10;

@@ -75,7 +75,7 @@ pub(crate) fn values(more: BoxedStrategy<Value>) -> impl Strategy<Value = Value>
     })
 }
 
-/// A piece of a document that is mostly well-formed and seldom makes sense.
+/// A document fragment that is mostly well-formed and rarely a valid call.
 pub(crate) fn mess() -> impl Strategy<Value = String> {
     let text = proptest::sample::select(vec![
         "",

@@ -1,4 +1,4 @@
-//! Documents that were written by hand.
+//! Handwritten documents.
 
 /// Contents of a `<value>`.
 #[rustfmt::skip]
@@ -332,7 +332,7 @@ fn utf16_of(text: &str, mark: &[u8]) -> Vec<u8> {
     mark.iter().copied().chain(units).collect()
 }
 
-/// Documents that CPython accepts and this decoder refuses, so that they are only forwarded.
+/// Documents that CPython accepts and this decoder refuses, so that rosrescue only forwards them.
 pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         (

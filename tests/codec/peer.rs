@@ -1,4 +1,4 @@
-//! A CPython process that runs beside the test.
+//! A CPython process that runs during the test.
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
@@ -43,7 +43,7 @@ impl Peer {
         answer.trim_end().to_owned()
     }
 
-    /// CPython's answer to a call of a method that returns this value.
+    /// CPython's answer to a call that returns `value`.
     pub(crate) fn echo(&mut self, value: &Value) -> Vec<u8> {
         let answer = self.ask(
             "echo",

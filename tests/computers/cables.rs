@@ -11,7 +11,7 @@ use crate::support::{Library, PATIENCE, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
 use crate::{alone, rounds};
 
-/// Waits until `value` is there, on each computer.
+/// Waits until the parameter has the value `value` on each computer.
 #[track_caller]
 fn await_param(fleet: &Fleet, key: &str, value: i32) {
     let all = || fleet.computers.iter().map(|computer| computer.param(key));
@@ -26,7 +26,7 @@ fn await_param(fleet: &Fleet, key: &str, value: i32) {
 }
 
 #[test]
-fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
+fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
     let _alone = alone();
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
@@ -45,12 +45,12 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
         let next = fleet.await_leader_of(&rest);
         let led = begin.elapsed();
         let lonely = &fleet.computers[cut];
-        eventually("it says that it is alone", || lonely.role_is("alone"));
+        eventually("the computer is alone", || lonely.role_is("alone"));
         let alone = begin.elapsed();
         traffic.await_writes(&[0, 1, 2]);
         lonely.set_param(&contested, 2);
         fleet.computers[next].set_param(&contested, 3);
-        // Its own nodes go on, and others can be started.
+        // The cut-off computer's nodes go on, and new nodes can be started there.
         let name = format!("late_{round}");
         let rename = format!("__name:={name}");
         let mut late = lonely.node(Library::Roscpp, "talker", &["30", &rename]);
@@ -63,7 +63,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
         fleet.await_whole();
         let healed = mended.elapsed();
         fleet.await_flow(&[0, 1, 2]);
-        // They hear of what was started there.
+        // The others' nodes receive messages from the node that was started while its computer was cut off.
         for &index in &rest {
             let listener = fleet.computers[index].listener.as_ref().unwrap();
             listener.wait_messages(&format!("/{name}"), 1);
@@ -75,23 +75,23 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
              cable; longest write {write:.2?}, read {read:.2?}",
             NAMES[cut], NAMES[leader], NAMES[next],
         );
-        // TCP itself takes a while to go on after a cable was mended.
-        // A read waits for the next leader if this mirror lacks the last record that the dead one had told of. The
-        // members of etcd learn that a record is committed from etcd's leader, which may have died as well.
+        // TCP takes a while to resume after a cable was mended. A read waits for the next leader if the follower's
+        // mirror lacks the last record that the dead leader announced. The members of etcd learn from etcd's leader
+        // that a record is committed, and that leader may have been cut off too.
         let limit = TTL + TAKEOVER;
         assert!(
             led < limit && write < limit && read < limit,
             "longest read {read:?}, write {write:?}"
         );
         await_param(&fleet, &contested, 3);
-        // Mostly by the one that was cut off. If etcd chooses a leader meanwhile, another one can have been alone.
-        // It says so once the others have its writes.
+        // The warning usually comes from the computer that was cut off. If etcd elects a leader meanwhile, another
+        // computer may have been alone too. The warning is logged once the other computers have the writes.
         let warnings = || -> Vec<_> {
             let computers = fleet.computers.iter();
             let reported = computers.flat_map(|it| it.logged(&contested));
             reported.filter(|line| line.contains("WARN")).collect()
         };
-        eventually("the write that lost is reported", || !warnings().is_empty());
+        eventually("the lost write is reported", || !warnings().is_empty());
         let warnings = warnings();
         assert_eq!(warnings.len(), 1, "{warnings:#?}");
         send(&late, Signal::TERM);
@@ -101,9 +101,10 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
     }
 }
 
-/// The second time begins as soon as the first one is over: its writes have reached the leader, or have not.
+/// The computer is cut off for the second time as soon as the first time is over, whether or not its writes have
+/// reached the leader.
 #[test]
-fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
+fn a_computer_that_is_cut_off_twice_continues_from_its_own_writes() {
     let _alone = alone();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
@@ -111,14 +112,16 @@ fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
     let lonely = &fleet.computers[cut];
     for value in 1..=3 {
         fleet.network.cut_cable(cut);
-        eventually("it says that it is alone", || lonely.role_is("alone"));
+        eventually("the computer is alone", || lonely.role_is("alone"));
         if value > 1 {
             assert_eq!(lonely.param("/count"), Some(Value::Int(value - 1)));
         }
         lonely.set_param("/count", value);
         lonely.set_param(&format!("/written_{value}"), value);
         fleet.network.mend_cable(cut);
-        eventually("it is not alone any more", || !lonely.role_is("alone"));
+        eventually("the computer is not alone any more", || {
+            !lonely.role_is("alone")
+        });
     }
     fleet.await_whole();
     await_param(&fleet, "/count", 3);
@@ -133,7 +136,7 @@ fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
 }
 
 #[test]
-fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
+fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
     let _alone = alone();
     let mut fleet = Fleet::start(&["--alone", "refuse"]);
     let leader = fleet.await_whole();
@@ -143,9 +146,11 @@ fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
         let key = format!("/written_{cut}");
         fleet.network.cut_cable(cut);
         let lonely = &fleet.computers[cut];
-        eventually("it says that it is alone", || lonely.role_is("alone"));
+        eventually("the computer is alone", || lonely.role_is("alone"));
         fleet.await_leader_of(&fleet.others(cut));
-        eventually("it runs no master", || lonely.master_state().is_err());
+        eventually("the computer runs no master", || {
+            lonely.master_state().is_err()
+        });
         let answer = scope(|scope| {
             let write = || {
                 let params = params!["/test", key.as_str(), 1];
@@ -156,7 +161,7 @@ fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
                 assert_eq!(lonely.param("/steady"), Some(Value::Int(7)));
                 !write.is_finished()
             });
-            assert!(waits, "it was answered: {:?}", write.join());
+            assert!(waits, "the write was answered: {:?}", write.join());
             fleet.network.mend_cable(cut);
             write.join().unwrap()
         });
@@ -171,10 +176,10 @@ fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
     }
 }
 
-/// Those who were alone with it know another state. What they were told there must not reach a node of the others, which
+/// A computer that was cut off has another list of publishers. It must not send that list to the others' nodes, which
 /// would drop a stream.
 #[test]
-fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
+fn a_computer_that_was_cut_off_does_not_notify_nodes_of_others() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     for round in 0..rounds() {
@@ -190,7 +195,7 @@ fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
         }
         fleet.await_same_state();
         fleet.network.cut_cable(cut);
-        eventually("it says that it is alone", || lonely.role_is("alone"));
+        eventually("the computer is alone", || lonely.role_is("alone"));
         fleet.await_leader_of(&rest);
         let publishers = [lonely, healthy].map(|computer| {
             let publisher = Named::new(computer, &format!("/publisher_{}_{round}", computer.name));
@@ -198,7 +203,7 @@ fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
             publisher
         });
         let [of_lonely, of_healthy] = [0, 1].map(|nth| publishers[nth].it().api.clone());
-        // One after the other: its master would try again and again to reach the subscribers.
+        // Calls one by one, because the master of the cut-off computer repeats its attempts to reach the subscribers.
         for _ in 0..20 {
             lonely.within(|| {
                 publishers[0].it().unpublish(&lonely.client(), &topic);
@@ -206,7 +211,7 @@ fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
             });
         }
         let heard = |of: &Named| of.it().updates(&topic);
-        eventually("the subscribers hear of their publisher", || {
+        eventually("the subscribers know their publisher", || {
             subscribers
                 .iter()
                 .all(|it| heard(it).last() == Some(&vec![of_healthy.clone()]))
@@ -218,10 +223,10 @@ fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
             let last = heard(it).pop().unwrap_or_default();
             last.contains(&of_lonely) && last.contains(&of_healthy)
         };
-        eventually("the subscribers hear of both", || {
+        eventually("the subscribers know both publishers", || {
             subscribers.iter().all(all)
         });
-        // TCP tries again after 1, 2, 4 and 8 seconds.
+        // TCP retransmits after 1, 2, 4 and 8 seconds.
         holds(Duration::from_secs(8), || subscribers.iter().all(all));
         for (subscriber, before) in subscribers.iter().zip(before) {
             let since = heard(subscriber).split_off(before);

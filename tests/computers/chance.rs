@@ -1,15 +1,15 @@
-//! Where every random number of these tests comes from.
+//! The random numbers of these tests.
 
 use std::time::Duration;
 
 use crate::support::links::Dice;
 
-/// Random numbers of one test. `ROSRESCUE_SEED` is their seed; without it, each test gets one of its own.
+/// Random numbers of one test. `ROSRESCUE_SEED` sets the seed; by default each test gets a new one.
 #[derive(Debug)]
 pub(crate) struct Chance(Dice);
 
 impl Chance {
-    /// Prints the seed, for the output of a test that fails.
+    /// Chooses a seed and prints it, so that a failed test can be repeated.
     pub(crate) fn new() -> Self {
         use std::hash::{BuildHasher, RandomState};
         let seed = match std::env::var("ROSRESCUE_SEED") {
@@ -28,7 +28,7 @@ impl Chance {
         self.below(times) == 0
     }
 
-    /// Some time below `most`.
+    /// A random duration below `most`.
     pub(crate) fn time(&mut self, most: Duration) -> Duration {
         most.mul_f64(self.below(1 << 20) as f64 / f64::from(1 << 20))
     }

@@ -1,4 +1,4 @@
-//! A computer: namespaces for its network and its processes, which end all at once when its power is cut.
+//! One simulated computer: a network namespace and a PID namespace. All its processes end at once when its power fails.
 
 use std::fs;
 use std::path::PathBuf;
@@ -16,13 +16,13 @@ use crate::support::{
 
 pub(crate) const NAMES: [&str; COUNT] = ["a", "b", "c"];
 
-/// The port of rosrescue on each.
+/// The port of rosrescue on each computer.
 pub(crate) const PORT: u16 = 11311;
 
-/// The port of rosmaster on the one that leads.
+/// The port of rosmaster on the leader.
 const MASTER_PORT: u16 = 11411;
 
-/// What rosrescue says of the cluster.
+/// The state of the cluster as one rosrescue reports it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Seen {
     pub(crate) role: String,
@@ -31,7 +31,7 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// All that this program reads of the page `/status.json`.
+    /// Reads the part of `/status.json` that the tests use.
     fn read(page: &serde_json::Value) -> Option<Self> {
         let cluster = page.get("cluster")?;
         let leader = cluster["leader"]["name"].as_str();
@@ -43,10 +43,10 @@ impl Seen {
     }
 }
 
-/// From when until when; without an end as long as it lasts.
+/// Start and end of a time span. `None` while it lasts.
 type Span = (Instant, Option<Instant>);
 
-/// Times in which calls to a computer's rosrescue may fail.
+/// The times during which calls to a computer's rosrescue may fail.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Downtimes(Arc<Mutex<Vec<Span>>>);
 
@@ -67,7 +67,7 @@ impl Downtimes {
         matches!(self.0.lock().unwrap().last(), Some((_, None)))
     }
 
-    /// Whether one falls into that time.
+    /// Whether one of the downtimes overlaps the time from `start` to `end`.
     pub(crate) fn touch(&self, start: Instant, end: Instant) -> bool {
         let downtimes = self.0.lock().unwrap();
         let touches = |&(from, to): &Span| from <= end && to.is_none_or(|to| start <= to);
@@ -84,20 +84,20 @@ pub(crate) struct Computer {
     pub(crate) talker: Option<Node>,
     pub(crate) listener: Option<Node>,
     rescue: Option<Process>,
-    /// What its rosrescues have logged that have ended.
+    /// The log lines of earlier rosrescue processes, which have ended.
     earlier: Vec<String>,
     etcd: Option<Process>,
-    /// Its first process. With it all end.
+    /// The init process of the PID namespace. All other processes end with it.
     power: Option<Process>,
     boots: u32,
     scratch: Arc<Scratch>,
-    /// More options of rosrescue.
+    /// Further options for rosrescue.
     pub(crate) options: Vec<String>,
-    /// More options of etcd.
+    /// Further options for etcd.
     pub(crate) etcd_options: Vec<String>,
-    /// Its `--cluster-name`.
+    /// The computer's `--cluster-name`.
     pub(crate) called: String,
-    /// Its `--cluster`, if it is not as it must be.
+    /// The value of `--cluster`, if a test sets a wrong one.
     pub(crate) cluster: Option<String>,
 }
 
@@ -131,16 +131,16 @@ impl Computer {
         address(self.index)
     }
 
-    /// A file or folder of its own.
+    /// The path of a file or folder of this computer.
     pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.scratch.path(self.name).join(name)
     }
 
-    /// Switches it on. Nothing runs there yet.
+    /// Switches the computer on. No program is started yet.
     #[track_caller]
     pub(crate) fn boot(&mut self) {
-        // The first process of a computer has to bury the dead; and a boot has an id, which is the kernel's
-        // and so the same in all namespaces.
+        // The init process must reap its children. Each boot has its own boot id, which would otherwise be the
+        // kernel's, the same in all namespaces.
         const INIT: &str = r#"mount --bind "$0" /proc/sys/kernel/random/boot_id && trap "" CHLD &&
             echo booted && exec sleep infinity"#;
         self.boots += 1;
@@ -156,7 +156,7 @@ impl Computer {
         self.power = Some(power);
     }
 
-    /// SIGKILL to all that runs there, at the same moment.
+    /// Kills all processes of the computer with SIGKILL at once.
     #[track_caller]
     pub(crate) fn power_off(&mut self) {
         self.downtimes.begin();
@@ -166,7 +166,7 @@ impl Computer {
         if let Some(init) = child_of(&power) {
             signal(init, Signal::KILL);
         }
-        // It ends when the kernel has seen the last one of them off.
+        // The init process ends after all other processes of the namespace.
         power.wait();
         self.etcd = None;
         self.bury_rescue();
@@ -178,7 +178,7 @@ impl Computer {
         self.power.is_some()
     }
 
-    /// `command`, to be run on this computer.
+    /// Wraps `command` so that it runs on this computer.
     fn inside(&self, inner: &Command) -> Command {
         let power = self.power.as_ref().expect("the computer is off");
         let init = child_of(power).expect("the first process of a computer");
@@ -205,7 +205,7 @@ impl Computer {
         let cluster: Vec<_> = (0..COUNT)
             .map(|index| format!("{}={}", NAMES[index], url(index, 2380)))
             .collect();
-        // Its thousands of lines are of use only to whoever looks for them.
+        // etcd's thousands of log lines go to a file and are not shown when a test fails.
         let mut command = Command::new("sh");
         command.args(["-c", r#"log=$0; exec "$@" >>"$log" 2>&1"#]);
         command.arg(self.path("etcd.log"));
@@ -230,7 +230,7 @@ impl Computer {
         self.etcd = Some(etcd);
     }
 
-    /// The process id, seen from outside, of the process that answers calls.
+    /// The process id of the worker in the test's PID namespace.
     #[track_caller]
     pub(crate) fn worker(&self) -> u32 {
         let rescue = self.rescue.as_ref().expect("a rosrescue");
@@ -242,20 +242,21 @@ impl Computer {
         })
     }
 
-    /// The process id, seen from outside, of the process that starts the worker.
+    /// The process id of the guardian in the test's PID namespace.
     #[track_caller]
     pub(crate) fn guardian(&self) -> u32 {
         let rescue = self.rescue.as_ref().expect("a rosrescue");
         eventually_some("there is a guardian", || child_of(rescue))
     }
 
-    /// Removes the data of its etcd, which does not run.
+    /// Removes the data of this computer's etcd, which must not run.
     pub(crate) fn wipe_etcd(&self) {
-        assert!(self.etcd.is_none(), "it runs");
+        assert!(self.etcd.is_none(), "etcd runs");
         fs::remove_dir_all(self.path("etcd")).unwrap();
     }
 
-    /// The process ids, seen from outside, of all that runs there but for its first process, and of what started them.
+    /// The ids, in the test's PID namespace, of all processes of the computer except its init process, and of the
+    /// `nsenter` processes that started them.
     pub(crate) fn processes(&self) -> Vec<u32> {
         let power = self.power.as_ref().expect("the computer is off");
         let init = child_of(power).expect("the first process of a computer");
@@ -265,14 +266,14 @@ impl Computer {
         let inside: Vec<u32> = all
             .filter(|&pid| pid != init && space(pid) == own)
             .collect();
-        // `nsenter` outside stops itself when its child stops, and nobody would continue it. It stops first, so that it
-        // notices nothing.
+        // An `nsenter` outside stops itself when its child stops, and would never continue. So it must be stopped
+        // before its child.
         let parents = inside.iter().filter_map(|&pid| parent_of(pid));
         let outside = parents.filter(|pid| *pid != init && !inside.contains(pid));
         [outside.collect(), inside.clone()].concat()
     }
 
-    /// SIGKILL.
+    /// Kills etcd with SIGKILL.
     #[track_caller]
     pub(crate) fn kill_etcd(&mut self) {
         let mut etcd = self.etcd.take().expect("an etcd");
@@ -280,7 +281,7 @@ impl Computer {
         etcd.wait();
     }
 
-    /// Whether its etcd belongs to a majority.
+    /// Whether this computer's etcd belongs to a majority.
     pub(crate) fn etcd_is_healthy(&self) -> bool {
         let page = self.within(|| {
             let get = request("GET /health HTTP/1.1", &[], b"");
@@ -292,7 +293,7 @@ impl Computer {
         page.is_some_and(|page| page.text().contains(r#""health":"true""#))
     }
 
-    /// Starts rosrescue, as a person does, and waits for nothing.
+    /// Starts rosrescue without waiting.
     #[track_caller]
     pub(crate) fn start_rescue(&mut self) {
         let cluster = match &self.cluster {
@@ -315,7 +316,7 @@ impl Computer {
         self.rescue = Some(Process::start(name, &mut self.inside(&command)));
     }
 
-    /// Waits until rosrescue answers.
+    /// Waits until rosrescue answers calls.
     #[track_caller]
     pub(crate) fn await_answers(&mut self) {
         let name = self.name;
@@ -332,14 +333,14 @@ impl Computer {
         self.downtimes.end();
     }
 
-    /// The exit status of rosrescue, which ends by itself. All its log lines are there then.
+    /// Waits until rosrescue ends by itself and its log is complete. Returns the exit status.
     #[track_caller]
     pub(crate) fn await_end(&mut self) -> Option<i32> {
         let rescue = self.rescue.as_mut().expect("a rosrescue");
         rescue.wait_output().code()
     }
 
-    /// SIGTERM to rosrescue alone, and its end.
+    /// Stops rosrescue with SIGTERM and waits for its end.
     #[track_caller]
     pub(crate) fn stop_rescue(&mut self) {
         self.downtimes.begin();
@@ -349,7 +350,7 @@ impl Computer {
         self.bury_rescue();
     }
 
-    /// Starts rosrescue again, which has ended or is about to.
+    /// Starts rosrescue again after it has ended, or is about to end.
     #[track_caller]
     pub(crate) fn restart_rescue(&mut self) {
         let rescue = self.rescue.as_mut().expect("a rosrescue");
@@ -358,7 +359,7 @@ impl Computer {
         self.start_rescue();
     }
 
-    /// Keeps what it has logged.
+    /// Keeps the log of a rosrescue that has ended.
     fn bury_rescue(&mut self) {
         self.assert_no_panic();
         let rescue = self.rescue.take();
@@ -366,7 +367,7 @@ impl Computer {
             .extend(rescue.iter().flat_map(|it| it.output()));
     }
 
-    /// Runs `rosrescue ARGUMENTS` to its end: exit status and output.
+    /// Runs `rosrescue ARGUMENTS` on this computer until it ends. Returns exit status and output.
     #[track_caller]
     pub(crate) fn rosrescue(&self, arguments: &[&str]) -> (Option<i32>, String) {
         let mut command = command(&self.scratch, PORT, arguments);
@@ -377,7 +378,7 @@ impl Computer {
         (status.code(), process.output().join("\n"))
     }
 
-    /// Starts a node and waits until it is at work.
+    /// Starts a node and waits until it is ready.
     #[track_caller]
     pub(crate) fn node(&self, library: Library, node: &str, arguments: &[&str]) -> Node {
         let mut command = library.command(&self.scratch, PORT, node);
@@ -386,7 +387,7 @@ impl Computer {
         Node::run(&mut self.inside(&command))
     }
 
-    /// Panics if a node has ended, as one does that is told to shut down.
+    /// Panics if a node has ended, for example because it was told to shut down.
     #[track_caller]
     pub(crate) fn assert_nodes_live(&mut self) {
         let nodes = self.talker.iter_mut().chain(&mut self.listener);
@@ -396,7 +397,7 @@ impl Computer {
         }
     }
 
-    /// A client of rosrescue there, to be used [`within`](Self::within).
+    /// A client of this computer's rosrescue. It must be used [`within`](Self::within) the computer.
     pub(crate) fn client(&self) -> Client {
         Client::new(PORT)
     }
@@ -415,24 +416,24 @@ impl Computer {
         self.within(|| self.client().param(key))
     }
 
-    /// What rosrescue there says to everybody.
+    /// The state that this computer's rosrescue shows to its clients.
     pub(crate) fn state(&self) -> std::io::Result<State> {
         self.within(|| State::try_read(&self.client()))
     }
 
-    /// What the rosmaster there says to rosrescue.
+    /// The state of this computer's rosmaster, read without rosrescue.
     pub(crate) fn master_state(&self) -> std::io::Result<State> {
         self.within(|| State::try_read(&Client::new(MASTER_PORT)))
     }
 
-    /// The page `/status.json`, if somebody answers.
+    /// The content of `/status.json`. `None` if rosrescue does not answer.
     pub(crate) fn status(&self) -> Option<serde_json::Value> {
         let get = request("GET /status.json HTTP/1.1", &[], b"");
         let page = self.within(|| self.client().exchange(&get)).ok()?;
         serde_json::from_slice(&page.body).ok()
     }
 
-    /// What rosrescue there says of the cluster.
+    /// The state of the cluster as this computer's rosrescue reports it.
     pub(crate) fn seen(&self) -> Option<Seen> {
         Seen::read(&self.status()?)
     }
@@ -441,13 +442,13 @@ impl Computer {
         self.seen().is_some_and(|seen| seen.role == role)
     }
 
-    /// The lines of rosrescue's log that hold `text`, since it was started.
+    /// The lines with `text` in the log of the present rosrescue.
     pub(crate) fn logged(&self, text: &str) -> Vec<String> {
         let lines = self.rescue.iter().flat_map(|rescue| rescue.output());
         lines.filter(|line| line.contains(text)).collect()
     }
 
-    /// As [`Self::logged`], since the computer was made.
+    /// Like [`Self::logged`], with the logs of earlier rosrescue processes of this computer.
     pub(crate) fn ever_logged(&self, text: &str) -> Vec<String> {
         let earlier = self.earlier.iter().filter(|line| line.contains(text));
         earlier.cloned().chain(self.logged(text)).collect()
@@ -463,7 +464,7 @@ impl Computer {
 impl Drop for Computer {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            // Its processes show what they have said when they are dropped.
+            // The processes are kept until they are dropped, because they print their output then.
             if let Some(init) = self.power.as_ref().and_then(child_of) {
                 signal(init, Signal::KILL);
             }
@@ -473,13 +474,13 @@ impl Drop for Computer {
     }
 }
 
-/// The clients' ports of all members of etcd.
+/// The client URLs of all members of etcd.
 pub(crate) fn endpoints() -> Vec<String> {
     let all = (0..COUNT).map(|index| format!("http://{}:2379", address(index)));
     all.collect()
 }
 
-/// What was started by `ip netns exec … unshare` or `nsenter`, which stay as its parents.
+/// The child of `ip netns exec … unshare` or `nsenter`, which stay as the parents of what they start.
 fn child_of(parent: &Process) -> Option<u32> {
     children(parent.pid()).first().copied()
 }
@@ -497,12 +498,12 @@ fn children(pid: u32) -> Vec<u32> {
     pids.collect::<Result<_, _>>().unwrap_or_default()
 }
 
-/// Sends a signal to what runs on the computer.
+/// Sends a signal to a process on the computer that was started with `nsenter`.
 #[track_caller]
 pub(crate) fn send(process: &Process, which: Signal) {
     let child = eventually_some("a process has been started on a computer", || {
         child_of(process)
     });
-    assert!(alive(child), "it has ended:\n{}", process.log());
+    assert!(alive(child), "the process has ended:\n{}", process.log());
     signal(child, which);
 }

@@ -9,9 +9,10 @@ use crate::traffic::{Named, TYPE, Traffic};
 use crate::{alone, rounds};
 use rustix::process::Signal;
 
-/// By its power, of which nobody hears anything, or by SIGKILL to all that runs there, of which the kernel tells.
+/// The computer dies by a power cut, after which the others get no packet from it, or by SIGKILL for all its processes,
+/// after which the kernel closes their connections.
 #[test]
-fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
+fn no_node_notices_that_another_computer_dies_and_comes_back() {
     let _alone = alone();
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
@@ -54,8 +55,9 @@ fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
             NAMES[leader],
             NAMES[next],
         );
-        // A read waits for the next leader if this mirror lacks the last record that the dead one had told of. The
-        // members of etcd learn that a record is committed from etcd's leader, which may have died as well.
+        // A read waits for the next leader if the follower's mirror lacks the last record that the dead leader
+        // announced. The members of etcd learn from etcd's leader that a record is committed, and that leader may have
+        // died too.
         let limit = TTL + TAKEOVER;
         assert!(
             took < limit && write < limit && read < limit,
@@ -75,7 +77,7 @@ fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
     }
 }
 
-/// The leader cannot reach it, and dies before it has told it.
+/// The leader cannot reach the old node, and dies before it has told it to shut down.
 #[test]
 fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     let _alone = alone();
@@ -96,7 +98,9 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     assert!(!told(&old), "the leader has reached it");
     fleet.computers[leader].power_off();
     fleet.await_leader_of(&rest);
-    eventually("the next leader tells it", || told(&old));
+    eventually("the next leader tells the old node to shut down", || {
+        told(&old)
+    });
     assert!(!told(&new));
     fleet.network.mend_port(leader, rest[0], old.it().port());
     fleet.bring_back(leader);
@@ -104,7 +108,8 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     fleet.assert_nodes_live();
 }
 
-/// Its guardian starts it again, and the computer goes on leading. Idle: nothing else takes the processor's time.
+/// When the worker dies, the guardian starts a new one, and the computer stays the leader. The test runs without
+/// [`Traffic`], so that the processor is idle.
 #[test]
 fn writes_go_on_soon_after_the_death_of_the_leaders_worker_or_computer() {
     let _alone = alone();
@@ -158,7 +163,7 @@ fn writes_go_on_soon_after_the_death_of_the_leaders_worker_or_computer() {
     fleet.assert_nodes_live();
 }
 
-/// How long after `begin` the first write is answered there.
+/// The time from `begin` until the first write is answered on `computer`.
 fn first_write(computer: &Computer, begin: Instant) -> Duration {
     let write = || {
         computer

@@ -7,7 +7,7 @@ use crate::alone;
 use crate::computer::Computer;
 use crate::fleet::Fleet;
 
-/// The checkpoint and what is beside it, at one moment.
+/// A copy of the checkpoint files.
 pub(crate) struct Disk(Vec<(PathBuf, Vec<u8>)>);
 
 impl Disk {
@@ -25,7 +25,7 @@ impl Disk {
         )
     }
 
-    /// The computer has what was on the disk then.
+    /// Replaces the computer's checkpoint files with this copy.
     pub(crate) fn put_back(&self, computer: &Computer) {
         for (path, _) in Self::of(computer).0 {
             fs::remove_file(path).unwrap();
@@ -36,8 +36,8 @@ impl Disk {
     }
 }
 
-/// The power fails before the leader's disk has the last writes. etcd has them. The others' rosrescues are being upgraded, so
-/// that nobody else can lead.
+/// The power fails before the last writes are on the leader's disk; etcd has them. On the other computers rosrescue is
+/// stopped, as during an upgrade, so only this one can lead.
 #[test]
 fn a_leader_whose_disk_is_older_than_etcds_journal_takes_the_journal() {
     let _alone = alone();

@@ -5,18 +5,18 @@ use crate::fleet::{Fleet, TAKEOVER, TTL};
 use crate::support::{Library, Node, eventually};
 use crate::{alone, rounds};
 
-/// A driver as robots have them: at 50 Hz it publishes, logs and reads parameters that are not set.
+/// Starts a driver like those of real robots: it publishes and logs at 50 Hz, and reads parameters that are not set.
 #[track_caller]
 fn driver(fleet: &Fleet, index: usize) -> Node {
     let name = format!("__name:=driver_{}", NAMES[index]);
     fleet.computers[index].node(Library::Rospy, "driver", &[&name])
 }
 
-/// Waits until the driver has made passes for a second more.
+/// Waits until the driver's loop has run for another second.
 #[track_caller]
 fn go_on(driver: &Node) {
     let before = driver.said("pass").len();
-    eventually("a driver goes on", || {
+    eventually("the driver goes on", || {
         driver.said("pass").len() >= before + 5
     });
 }

@@ -6,7 +6,7 @@ use crate::support::eventually;
 use crate::traffic::Traffic;
 
 #[test]
-fn without_etcd_each_serves_its_nodes_and_afterwards_one_leads() {
+fn without_etcd_each_computer_serves_its_nodes_and_afterwards_one_leads() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
@@ -17,7 +17,7 @@ fn without_etcd_each_serves_its_nodes_and_afterwards_one_leads() {
         computer.kill_etcd();
     }
     for computer in &fleet.computers {
-        let what = format!("{} says that it is alone", computer.name);
+        let what = format!("{} is alone", computer.name);
         eventually(&what, || computer.role_is("alone"));
     }
     let alone = begin.elapsed();
@@ -42,7 +42,7 @@ fn without_etcd_each_serves_its_nodes_and_afterwards_one_leads() {
 }
 
 #[test]
-fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
+fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
@@ -54,7 +54,7 @@ fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
         computer.kill_etcd();
     }
     for computer in &fleet.computers {
-        let what = format!("{} says that it is alone", computer.name);
+        let what = format!("{} is alone", computer.name);
         eventually(&what, || computer.role_is("alone"));
     }
     let lonely = &fleet.computers[(leader + 1) % 3];

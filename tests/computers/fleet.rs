@@ -1,4 +1,4 @@
-//! The robot: three computers, and what has to be so of all of them.
+//! The robot with three computers, and the conditions that must hold for all of them.
 
 use std::sync::Arc;
 use std::thread::sleep;
@@ -8,27 +8,27 @@ use crate::computer::{Computer, NAMES};
 use crate::network::{COUNT, Network};
 use crate::support::{PATIENCE, Scratch, State, eventually, eventually_some};
 
-/// The time to live, as it is without an option.
+/// The default of `--cluster-ttl`.
 pub(crate) const TTL: Duration = Duration::from_secs(2);
 
-/// Another one leads after the time to live and 300 ms, or when etcd has elected a leader of its own (1.1 to 2.6 s). On a
-/// machine that others use as well this may take longer.
+/// The limit for a takeover after the time to live. It usually takes 300 ms, or 1.1 to 2.6 s if etcd must elect a new
+/// leader too; on a busy machine it may take longer.
 pub(crate) const TAKEOVER: Duration = Duration::from_secs(5);
 
-/// No read waits longer, on a machine that others use as well: alone on it, 0.1 s. One that waited for another
-/// leader would take longer than this.
+/// The limit for a read on a busy machine; on an idle one, a read takes up to 0.1 s. A read that had to wait for a
+/// takeover would exceed it.
 pub(crate) const READ: Duration = TTL;
 
 #[derive(Debug)]
 pub(crate) struct Fleet {
-    // The order is that of the drops.
+    // Fields are dropped in this order.
     pub(crate) computers: Vec<Computer>,
     pub(crate) network: Network,
     pub(crate) scratch: Arc<Scratch>,
 }
 
 impl Fleet {
-    /// Three computers, each with an etcd, and nothing else. `options` are rosrescue's.
+    /// Starts three computers with etcd, without rosrescue and nodes. `options` are for rosrescue.
     #[track_caller]
     pub(crate) fn empty(options: &[&str]) -> Self {
         Self::with(options, &[])
@@ -54,13 +54,13 @@ impl Fleet {
         fleet
     }
 
-    /// A whole robot: rosrescue and nodes on each.
+    /// Starts three computers with etcd, rosrescue and nodes.
     #[track_caller]
     pub(crate) fn start(options: &[&str]) -> Self {
         Self::empty(options).whole()
     }
 
-    /// As [`Self::start`], with the settings of etcd that docs/several-computers.md recommends.
+    /// Like [`Self::start`], with the settings of etcd that docs/several-computers.md recommends.
     #[track_caller]
     pub(crate) fn quick(options: &[&str]) -> Self {
         let etcd = [
@@ -92,7 +92,7 @@ impl Fleet {
         }
     }
 
-    /// A computer that was switched off comes back, with all that it had.
+    /// Switches a computer on again and starts etcd, rosrescue and its nodes.
     #[track_caller]
     pub(crate) fn bring_back(&mut self, index: usize) {
         let computer = &mut self.computers[index];
@@ -103,18 +103,18 @@ impl Fleet {
         self.start_nodes(index);
     }
 
-    /// Those who are on, without one.
+    /// The computers that are switched on, except `index`.
     pub(crate) fn others(&self, index: usize) -> Vec<usize> {
         let on = |&other: &usize| other != index && self.computers[other].is_on();
         (0..COUNT).filter(on).collect()
     }
 
-    /// Who says that it leads, if it is one.
+    /// The computer that says that it leads. `None` if there are none or several.
     pub(crate) fn leader(&self) -> Option<usize> {
         self.leader_of(&[0, 1, 2])
     }
 
-    /// Who of them says that it leads, if it is one.
+    /// The one of `those` computers that says that it leads. `None` if there are none or several.
     pub(crate) fn leader_of(&self, those: &[usize]) -> Option<usize> {
         let mut leaders = those.iter().filter(|&&index| {
             let computer = &self.computers[index];
@@ -125,10 +125,11 @@ impl Fleet {
 
     #[track_caller]
     pub(crate) fn await_leader_of(&self, those: &[usize]) -> usize {
-        eventually_some("one of them leads", || self.leader_of(those))
+        eventually_some("one of the computers leads", || self.leader_of(those))
     }
 
-    /// Waits until one leads, and the others follow it and have all that it has. Panics with what they say.
+    /// Waits until one computer leads, and the others follow it and are not behind. Returns the leader; panics with
+    /// what each computer reports.
     #[track_caller]
     pub(crate) fn await_whole(&self) -> usize {
         let start = Instant::now();
@@ -159,7 +160,7 @@ impl Fleet {
         }
     }
 
-    /// Waits until all computers say the same, and the leader's rosmaster says it, too. Answers what it is.
+    /// Waits until all computers and the leader's rosmaster have the same state, and returns it.
     #[track_caller]
     pub(crate) fn await_same_state(&self) -> State {
         let start = Instant::now();
@@ -188,7 +189,7 @@ impl Fleet {
         }
     }
 
-    /// Panics if a node that nobody has killed has ended.
+    /// Panics if a node of a computer has ended.
     #[track_caller]
     pub(crate) fn assert_nodes_live(&mut self) {
         for computer in &mut self.computers {
@@ -197,7 +198,8 @@ impl Fleet {
     }
 }
 
-/// `leader`, if this is the round for it, else one that follows: each is hit in turn, and the leader more often.
+/// The computer that fails in this round: in turn the leader, one follower, the leader, the leader, the other follower
+/// and the leader.
 pub(crate) fn victim(round: usize, leader: usize) -> usize {
     let shift = usize::from(round % 3 == 1) * (1 + round / 3 % 2);
     (leader + shift) % COUNT

@@ -8,7 +8,7 @@ use crate::support::eventually;
 use crate::traffic::Traffic;
 use crate::{alone, rounds};
 
-/// 200 ms are promised; others use the machine as well.
+/// The documented limit is 200 ms; the test allows more, because the machine is busy.
 const HANDOVER: Duration = Duration::from_secs(2);
 
 #[test]
@@ -25,15 +25,15 @@ fn the_leader_hands_over_when_it_is_told_to_and_when_it_is_stopped() {
         sleep(chance.time(Duration::from_millis(500)));
         let begin = Instant::now();
         let to = rest[round % 2];
-        // Told by whom is the same.
+        // The command may be run on any computer.
         let (status, said) =
             fleet.computers[(leader + round) % 3].rosrescue(&["handover", "--to", NAMES[to]]);
         assert_eq!(status, Some(0), "{said}");
-        eventually("it leads", || fleet.leader() == Some(to));
+        eventually("the computer leads", || fleet.leader() == Some(to));
         traffic.await_writes(&[0, 1, 2]);
         let [write, read] = traffic.longest(&[0, 1, 2], begin);
         println!(
-            "{} hands over to {}: longest write {write:.2?}, read {read:.2?}; it says: {said}",
+            "{} hands over to {}: longest write {write:.2?}, read {read:.2?}; output: {said}",
             NAMES[leader], NAMES[to]
         );
         assert!(write < HANDOVER && read < READ);

@@ -9,19 +9,19 @@ use crate::fleet::Fleet;
 use crate::network::enter;
 use crate::support::{Client, Finish, eventually, params};
 
-/// Keys of the writes in bulk.
+/// Number of parameters that are written while the computer is cut off.
 const KEYS: usize = 1500;
-/// One in so many is written by others after the network was mended.
+/// Others also write each 50th of these parameters during the merge.
 const SHARED: usize = 50;
 
 fn key(number: usize) -> String {
     format!("/bulk/k{number}")
 }
 
-/// Waits until the writes of the time alone are where they belong.
+/// Waits until the computer has sent the leader the writes that it acknowledged while it was cut off.
 #[track_caller]
 fn await_merged(computer: &Computer) {
-    eventually("its writes have been sent", || {
+    eventually("the writes made while cut off have been sent", || {
         !computer
             .logged("sent the writes made while cut off")
             .is_empty()
@@ -33,7 +33,7 @@ fn lost_writes(computer: &Computer) -> Option<u64> {
 }
 
 #[test]
-fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
+fn writes_of_the_majority_win_and_each_lost_write_is_reported() {
     let _alone = alone();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
@@ -46,11 +46,11 @@ fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
     fleet.network.cut_cable(cut);
     let next = fleet.await_leader_of(&fleet.others(cut));
     let (others, lonely) = (&fleet.computers[next], &fleet.computers[cut]);
-    eventually("it says that it is alone", || lonely.role_is("alone"));
+    eventually("the computer is alone", || lonely.role_is("alone"));
     others.set_param("/estop", 1);
     lonely.set_param("/estop", 1);
     lonely.set_param("/estop", 0);
-    // As it was, and yet they have written it.
+    // The value is the same as before, but the others have written the parameter.
     others.set_param("/back", 2);
     others.set_param("/back", 1);
     lonely.set_param("/back", 7);
@@ -94,7 +94,7 @@ fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
 }
 
 #[test]
-fn no_write_from_alone_replaces_what_others_write_while_it_is_being_sent() {
+fn a_write_made_while_cut_off_does_not_replace_one_made_during_the_merge() {
     let _alone = alone();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
@@ -102,7 +102,7 @@ fn no_write_from_alone_replaces_what_others_write_while_it_is_being_sent() {
     fleet.network.cut_cable(cut);
     let next = fleet.await_leader_of(&fleet.others(cut));
     let (others, lonely) = (&fleet.computers[next], &fleet.computers[cut]);
-    eventually("it says that it is alone", || lonely.role_is("alone"));
+    eventually("the computer is alone", || lonely.role_is("alone"));
     lonely.within(|| {
         let client = lonely.client();
         for number in 0..KEYS {
@@ -111,13 +111,13 @@ fn no_write_from_alone_replaces_what_others_write_while_it_is_being_sent() {
     });
     fleet.network.mend_cable(cut);
     let finish = AtomicBool::new(false);
-    // The value of each shared key that was answered last.
+    // The last acknowledged value of each shared parameter.
     let written = scope(|scope| {
         let writer = scope.spawn(|| {
             others.within(|| {
                 let client = others.client();
                 let mut written = vec![0; KEYS / SHARED];
-                // The first ones are there: the last ones are on their way.
+                // The merge has reached the first parameters, and the last ones are not sent yet.
                 while client.param(&key(1)).is_none() && !finish.load(Ordering::Relaxed) {}
                 for round in 1.. {
                     for (nth, last) in written.iter_mut().enumerate().rev() {
@@ -166,9 +166,10 @@ fn no_write_from_alone_replaces_what_others_write_while_it_is_being_sent() {
     fleet.assert_nodes_live();
 }
 
-/// Its own calls are answered alone; those that were forwarded to it are made again by the others.
+/// The former leader acknowledges the calls of its own nodes while it is alone. The followers make their forwarded
+/// calls again at the new leader.
 #[test]
-fn a_leader_without_etcd_keeps_no_call_that_others_make_elsewhere() {
+fn a_leader_without_etcd_drops_forwarded_calls_that_the_others_repeat() {
     let _alone = alone();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
@@ -196,7 +197,7 @@ fn a_leader_without_etcd_keeps_no_call_that_others_make_elsewhere() {
         let await_more = || {
             for &index in &rest {
                 let before = counts[index].load(Ordering::Relaxed);
-                eventually("they go on", || {
+                eventually("the writers go on", || {
                     counts[index].load(Ordering::Relaxed) > before + 20
                 });
             }
@@ -208,7 +209,7 @@ fn a_leader_without_etcd_keeps_no_call_that_others_make_elsewhere() {
         fleet.computers[leader].kill_etcd();
         fleet.await_leader_of(&rest);
         let lonely = &fleet.computers[leader];
-        eventually("it says that it is alone", || lonely.role_is("alone"));
+        eventually("the computer is alone", || lonely.role_is("alone"));
         lonely.set_param("/alone", 1);
         await_more();
         for &other in &rest {

@@ -1,5 +1,5 @@
-//! Three computers, each with an etcd, a rosrescue and nodes of its own: network namespaces on one switch. They are
-//! killed and cut off. One test at a time: each keeps the machine busy. Needs root.
+//! Tests with three simulated computers, each with an etcd, a rosrescue and nodes: network namespaces on one switch.
+//! Computers are killed and cut off. The tests run one at a time, because each keeps the machine busy. They need root.
 
 #![allow(
     clippy::unwrap_used,
@@ -20,39 +20,39 @@ mod network;
 mod streams;
 mod traffic;
 
-/// Cables are cut, and mended.
+/// Cables are cut and mended.
 mod cables;
-/// Computers die, and come back.
+/// Computers die and come back.
 mod deaths;
-/// A computer's disk is older than what was acknowledged.
+/// The checkpoint of a computer is older than the last acknowledged write.
 mod disks;
-/// Loops of drivers, while another computer takes over.
+/// Loops of drivers during a takeover.
 mod drivers;
-/// etcd is away altogether.
+/// No etcd runs.
 mod etcd;
-/// Another computer leads because somebody says so.
+/// Handover to another computer on request.
 mod handover;
-/// Calls of all computers under random failures, and whether all that was promised was kept.
+/// Random failures, and a check of all promises.
 mod history;
-/// What a computer that was cut off has written meets what others have.
+/// Writes of a computer that was cut off are merged with the others' writes.
 mod lonely;
-/// Two computers do not see each other, or not all of each other.
+/// Two computers cannot reach each other, or only some of each other's ports.
 mod pairs;
-/// A leader stands still, and goes on when another one leads.
+/// The leader is stopped, and continued after a takeover.
 mod pauses;
-/// The first start, one that joins, and a start after all have stopped.
+/// The first start, a computer that joins, and a start after all have stopped.
 mod starts;
-/// The harness itself.
+/// Tests of the simulated computers themselves.
 mod wiring;
 
-/// Whoever holds this runs alone. A test takes it first, so that it is let go after all that the test has
-/// started has ended.
+/// Lock for tests that must not run side by side. A test takes it first, so that it is released after everything that
+/// the test started has ended.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// How often computers are killed, cut off and told to hand over.
+/// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.
 fn rounds() -> usize {
     let rounds = std::env::var("ROSRESCUE_ROUNDS");
     rounds.map_or(3, |rounds| {

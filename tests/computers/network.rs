@@ -1,4 +1,4 @@
-//! A switch with three cables, and what can be wrong with them.
+//! A switch with three cables that can be cut or made worse.
 
 use std::fs::File;
 use std::os::fd::AsFd;
@@ -17,23 +17,23 @@ const BAD_NETWORK: &str = concat!(
     "/tests/computers/bad_network.py"
 );
 
-/// What is wrong with a cable that is not cut.
+/// The defects of a bad cable.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Quality {
-    /// Each way, in milliseconds.
+    /// Delay in each direction, in milliseconds.
     pub(crate) delay: u32,
-    /// Up to so many milliseconds more.
+    /// Additional random delay of up to this many milliseconds.
     pub(crate) jitter: u32,
-    /// Of a hundred packets each way.
+    /// Percentage of packets that are lost in each direction.
     pub(crate) loss: u32,
 }
 
-/// The address of a computer. No other test sees it: the switch has a namespace of its own, too.
+/// The address of a computer. Other tests may use the same one, because the switch has its own namespace.
 pub(crate) fn address(computer: usize) -> String {
     format!("10.77.0.{}", computer + 1)
 }
 
-/// Namespaces for three computers and the switch between them. They go on drop.
+/// Network namespaces for three computers and the switch between them. They are removed on drop.
 #[derive(Debug)]
 pub(crate) struct Network {
     prefix: String,
@@ -71,7 +71,7 @@ impl Network {
         format!("{}-{computer}", self.prefix)
     }
 
-    /// The computer's cable is pulled.
+    /// Cuts the computer's cable.
     pub(crate) fn cut_cable(&self, computer: usize) {
         ip(&format!("-n {} link set port{computer} down", self.prefix));
     }
@@ -80,7 +80,7 @@ impl Network {
         ip(&format!("-n {} link set port{computer} up", self.prefix));
     }
 
-    /// Packets between these two vanish.
+    /// Drops all packets between two computers.
     pub(crate) fn cut_pair(&self, one: usize, other: usize) {
         self.cut_way(one, other);
         self.cut_way(other, one);
@@ -91,9 +91,9 @@ impl Network {
         self.mend_way(other, one);
     }
 
-    /// Packets of the first one to the other one vanish.
+    /// Drops packets in one direction.
     pub(crate) fn cut_way(&self, from: usize, to: usize) {
-        // A permanent entry for an Ethernet address that nobody has.
+        // A permanent entry for an Ethernet address that no device has.
         ip(&format!(
             "-n {} neigh replace {} lladdr 02:00:00:00:00:99 dev eth0 nud permanent",
             self.namespace(from),
@@ -109,7 +109,8 @@ impl Network {
         ));
     }
 
-    /// The computer's cable delays packets, and loses some, until the answer is handed to [`Self::mend_quality`].
+    /// Makes the computer's cable delay and lose packets, until the returned process is passed to
+    /// [`Self::mend_quality`].
     #[track_caller]
     pub(crate) fn worsen(&self, computer: usize, quality: &Quality, seed: u64) -> Process {
         let switch = &self.prefix;
@@ -137,7 +138,11 @@ impl Network {
 
     #[track_caller]
     pub(crate) fn mend_quality(&self, computer: usize, mut bad: Process) {
-        assert!(bad.exited().is_none(), "it has ended:\n{}", bad.log());
+        assert!(
+            bad.exited().is_none(),
+            "the process of the bad cable has ended:\n{}",
+            bad.log()
+        );
         bad.kill();
         let switch = &self.prefix;
         ip(&format!("-n {switch} link del inner{computer}"));
@@ -146,7 +151,7 @@ impl Network {
         ));
     }
 
-    /// What the server answers to this client vanishes; other ports and the other direction work.
+    /// Drops packets from `port` of the server to the client. Other ports and the other direction work.
     pub(crate) fn cut_port(&self, client: usize, server: usize, port: u16) {
         ip(&self.rule("add", client, server, port));
     }
@@ -175,13 +180,13 @@ impl Drop for Network {
     }
 }
 
-/// From now on this thread opens its sockets on that computer.
+/// Moves this thread to the computer's network: sockets are opened there from now on.
 pub(crate) fn enter(namespace: &str) {
     let file = File::open(format!("/run/netns/{namespace}")).unwrap();
     move_into_link_name_space(file.as_fd(), Some(LinkNameSpaceType::Network)).unwrap();
 }
 
-/// Does `work` with the sockets of that computer.
+/// Runs `work` in the computer's network.
 #[track_caller]
 pub(crate) fn within<T: Send>(namespace: &str, work: impl FnOnce() -> T + Send) -> T {
     let done = thread::scope(|scope| {

@@ -6,7 +6,8 @@ use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
 use crate::support::eventually;
 use crate::traffic::Traffic;
 
-/// `cut` is done to the leader and a follower, then `mend`. Meanwhile everybody serves; the follower is alone.
+/// Runs `cut` with the leader and a follower, and later `mend`. Meanwhile all computers must serve; the follower is
+/// alone.
 #[track_caller]
 fn without_each_other(
     fleet: &mut Fleet,
@@ -28,7 +29,7 @@ fn without_each_other(
     assert_eq!(
         fleet.await_leader_of(&[0, 1, 2]),
         leader,
-        "it leads as before"
+        "the leader stays the same"
     );
     for index in [leader, follower] {
         fleet.assert_streams_whole(&[index, (leader + 2) % 3], &mark);
@@ -49,7 +50,7 @@ fn without_each_other(
 }
 
 #[test]
-fn two_that_do_not_reach_each_other_serve_both() {
+fn two_computers_that_do_not_reach_each_other_both_serve() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     without_each_other(
@@ -67,7 +68,7 @@ fn two_that_do_not_reach_each_other_serve_both() {
 }
 
 #[test]
-fn a_leader_that_everybody_reaches_and_that_reaches_no_etcd_leads_no_more() {
+fn a_leader_without_etcd_stops_leading_although_all_reach_it() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);

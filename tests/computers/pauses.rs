@@ -13,14 +13,15 @@ use crate::support::{Client, FakeNode, eventually, holds, params, signal};
 use crate::traffic::Named;
 use crate::{alone, rounds};
 
-/// Each has a writer of its own.
+/// Number of parameters, each with its own writer.
 const KEYS: usize = 8;
 
 fn key(index: usize) -> String {
     format!("/of_writer_{index}")
 }
 
-/// Counts `key` up from `number` on until `stop`. Returns the last number, which was answered.
+/// Sets `key` to increasing numbers, starting with `number`, until `stop`. Returns the last number, which was
+/// acknowledged.
 fn count(key: &str, mut number: i32, stop: &AtomicBool) -> i32 {
     let client = Client::new(PORT);
     loop {
@@ -32,7 +33,7 @@ fn count(key: &str, mut number: i32, stop: &AtomicBool) -> i32 {
     }
 }
 
-/// The values of each key that the node was told, in order.
+/// The values of each parameter that the node was notified of, in order.
 fn told(node: &FakeNode) -> BTreeMap<String, Vec<i32>> {
     let mut told: BTreeMap<String, Vec<i32>> = BTreeMap::new();
     for update in node.heard("paramUpdate") {
@@ -42,7 +43,7 @@ fn told(node: &FakeNode) -> BTreeMap<String, Vec<i32>> {
     told
 }
 
-/// A node that is told all values of all keys.
+/// A node that subscribes to all parameters.
 fn watch(computer: &Computer) -> Named {
     let watcher = Named::new(computer, "/watcher");
     for index in 0..KEYS {
@@ -51,10 +52,10 @@ fn watch(computer: &Computer) -> Named {
     watcher
 }
 
-/// Its worker stands still for longer than the time to live, with calls of a follower under way. They are answered by the
-/// next leader, and newer ones as well.
+/// The leader's worker is stopped for longer than the time to live while calls of a follower are under way. The next
+/// leader answers these and newer calls.
 #[test]
-fn a_leader_that_stood_still_tells_no_node_anything_old() {
+fn a_leader_that_was_paused_sends_no_old_notifications() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let (mut first, mut watcher) = (0, None);
@@ -98,7 +99,7 @@ fn a_leader_that_stood_still_tells_no_node_anything_old() {
                 .zip(&last)
                 .all(|(index, last)| told[&key(index)].last() == Some(last))
         };
-        eventually("the last values are told", told_last);
+        eventually("the watcher gets the last values", told_last);
         signal(worker, Signal::CONT);
         fleet.await_same_state();
         for (index, last) in (0..).zip(&last) {
@@ -109,10 +110,10 @@ fn a_leader_that_stood_still_tells_no_node_anything_old() {
                 key(index)
             );
         }
-        // Whatever is told once more is told by then.
+        // Late repetitions of notifications have arrived by then.
         if !holds(Duration::from_secs(1), told_last) {
             panic!(
-                "round {round}: {last:?} are the last values; told: {:?}",
+                "round {round}: the last values are {last:?}; notified: {:?}",
                 told(watcher)
             );
         }
@@ -121,12 +122,12 @@ fn a_leader_that_stood_still_tells_no_node_anything_old() {
     fleet.assert_nodes_live();
 }
 
-/// A follower that reaches no etcd knows of new writes by the leader's answers alone. Its mirror must not answer from before
-/// them, however long the leader stands still.
+/// A follower without etcd learns of new writes only from the leader's answers. Its mirror must not return older
+/// values, however long the leader is stopped.
 #[test]
-fn no_read_goes_back_where_etcd_is_out_of_reach_and_the_leader_stands_still() {
+fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
     let _alone = alone();
-    // The leader stands still for less than that.
+    // The leader is stopped for less than this time to live.
     let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);
     let leader = fleet.await_whole();
     let follower = fleet.others(leader)[0];

@@ -17,7 +17,7 @@ fn two_start_at_the_same_moment_and_a_third_joins_later() {
         fleet.computers[index].await_answers();
     }
     let leader = fleet.await_leader_of(&[0, 1]);
-    eventually("the other one follows", || {
+    eventually("the other computer follows", || {
         fleet.computers[1 - leader].role_is("following")
     });
     fleet.computers[1 - leader].set_param("/early", 1);
@@ -28,7 +28,11 @@ fn two_start_at_the_same_moment_and_a_third_joins_later() {
     let mark = fleet.mark();
     fleet.computers[2].start_rescue();
     fleet.computers[2].await_answers();
-    assert_eq!(fleet.await_whole(), leader, "who joins changes nothing");
+    assert_eq!(
+        fleet.await_whole(),
+        leader,
+        "a computer that joins does not change the leader"
+    );
     assert_eq!(fleet.computers[2].param("/early"), Some(Value::Int(1)));
     fleet.start_nodes(2);
     fleet.await_flow(&[0, 1, 2]);
@@ -40,7 +44,7 @@ fn two_start_at_the_same_moment_and_a_third_joins_later() {
 }
 
 #[test]
-fn the_session_goes_on_where_nodes_live_and_begins_anew_when_all_are_booted() {
+fn a_session_goes_on_after_restarts_and_a_new_one_begins_after_a_reboot_of_all() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     fleet.computers[1].set_param("/of_this_session", 1);
@@ -89,7 +93,7 @@ fn a_new_session_goes_on_when_its_first_leader_leads_again() {
         let leader = fleet.await_whole();
         let (status, said) = fleet.computers[leader].rosrescue(&["handover", "--to", NAMES[to]]);
         assert_eq!(status, Some(0), "{said}");
-        eventually("it leads", || fleet.leader() == Some(to));
+        eventually("the computer leads", || fleet.leader() == Some(to));
     }
     fleet.await_same_state();
     for (index, computer) in fleet.computers.iter().enumerate() {
@@ -100,7 +104,7 @@ fn a_new_session_goes_on_when_its_first_leader_leads_again() {
 }
 
 #[test]
-fn a_computer_with_the_name_of_a_living_one_does_not_start_and_the_others_notice_nothing() {
+fn a_computer_with_a_name_in_use_does_not_start_and_disturbs_nothing() {
     let _alone = alone();
     let mut fleet = Fleet::empty(&[]);
     for index in [0, 1] {
@@ -150,20 +154,23 @@ fn a_computer_that_has_another_address_than_before_starts() {
     let leader = fleet.await_leader_of(&[0, 1]);
     let follower = 1 - leader;
     await_entry(&fleet, leader, follower);
-    // It dies without a word, and the third computer is the same one with another address.
+    // The follower dies without notice. The third computer then takes its name, like the same computer with a new
+    // address.
     fleet.computers[follower].power_off();
     let third = &mut fleet.computers[2];
     third.called = NAMES[follower].to_owned();
     third.start_rescue();
     third.await_answers();
-    eventually("it follows", || fleet.computers[2].role_is("following"));
+    eventually("the computer follows", || {
+        fleet.computers[2].role_is("following")
+    });
     assert_eq!(fleet.leader_of(&[leader]), Some(leader));
     let waits = fleet.computers[2].logged("knows this computer's name at another address");
     assert_eq!(waits.len(), 1, "{waits:?}");
 }
 
 #[test]
-fn what_is_wrong_with_the_options_of_one_computer_is_said_with_what_to_do() {
+fn wrong_options_are_reported_with_what_to_do() {
     let _alone = alone();
     let mut fleet = Fleet::empty(&[]);
     fleet.computers[0].start_rescue();
@@ -193,9 +200,9 @@ fn what_is_wrong_with_the_options_of_one_computer_is_said_with_what_to_do() {
     fleet.computers[1].await_answers();
 }
 
-/// Waits until the follower's entry in etcd says that it follows.
+/// Waits until the follower's entry in etcd has the role `following`.
 fn await_entry(fleet: &Fleet, leader: usize, follower: usize) {
-    eventually("the other one says that it follows", || {
+    eventually("the follower's entry has the role", || {
         let page = fleet.computers[leader].status();
         let all = page.and_then(|page| page["cluster"]["computers"].as_array().cloned());
         all.is_some_and(|all| {
@@ -205,7 +212,7 @@ fn await_entry(fleet: &Fleet, leader: usize, follower: usize) {
     });
 }
 
-/// What a takeover or the death of a worker would change: worker restarts, role, takeovers, leader and term.
+/// Facts that a takeover or the death of a worker would change: worker restarts, role, takeovers, leader and term.
 fn lasting(computer: &Computer) -> [serde_json::Value; 5] {
     let page = computer.status().unwrap();
     let cluster = &page["cluster"];
@@ -220,7 +227,7 @@ fn lasting(computer: &Computer) -> [serde_json::Value; 5] {
     .map(Clone::clone)
 }
 
-/// The power of all computers fails, and comes back.
+/// Cuts the power of all computers and switches them on again.
 fn switch_off_and_on(fleet: &mut Fleet) {
     for index in 0..COUNT {
         fleet.computers[index].power_off();

@@ -1,4 +1,4 @@
-//! Messages from each computer to each.
+//! Messages from each computer to each computer.
 
 use crate::computer::{Computer, NAMES};
 use crate::fleet::Fleet;
@@ -8,15 +8,15 @@ use crate::support::{Library, eventually};
 const TALKERS: [Library; COUNT] = [Library::Roscpp, Library::Rospy, Library::Roscpp];
 const LISTENERS: [Library; COUNT] = [Library::Rospy, Library::Roscpp, Library::Roscpp];
 
-/// How many messages a listener says at once.
+/// A listener prints each fifth message.
 const EVERY: usize = 5;
 
-/// How many gaps each listener had seen, by computer.
+/// The number of gaps that each computer's listener has seen so far.
 #[derive(Debug)]
 pub(crate) struct Mark(Vec<usize>);
 
 impl Fleet {
-    /// A talker and a listener on each computer, at one topic.
+    /// Starts a talker and a listener on each computer, all on the same topic.
     #[track_caller]
     pub(crate) fn start_all_nodes(&mut self) {
         for index in 0..COUNT {
@@ -36,7 +36,7 @@ impl Fleet {
         computer.listener = Some(computer.node(LISTENERS[index], "listener", &arguments));
     }
 
-    /// Waits until messages have come from each of these to each.
+    /// Waits until messages arrive from each of these computers at each of them.
     #[track_caller]
     pub(crate) fn await_flow(&self, those: &[usize]) {
         let messages = |(listener, talker): (usize, usize)| {
@@ -62,7 +62,7 @@ impl Fleet {
         Mark(gaps.collect())
     }
 
-    /// Panics if a message from one of these to one of these was lost since then, or none comes any more.
+    /// Panics if a message between these computers was lost since `mark`, or no more messages arrive.
     #[track_caller]
     pub(crate) fn assert_streams_whole(&self, those: &[usize], mark: &Mark) {
         self.await_flow(those);

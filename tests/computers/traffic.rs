@@ -1,4 +1,4 @@
-//! Writers and readers on each computer, which remember each call.
+//! Writers and readers on each computer, which record each call.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, RwLock, RwLockWriteGuard};
@@ -12,10 +12,10 @@ use crate::fleet::Fleet;
 use crate::network::{enter, within};
 use crate::support::{Client, FakeNode, Finish, State, eventually, params};
 
-/// Time between two calls of one.
+/// Pause between two calls of a client.
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// What no reader must get: the parameter is set to something else.
+/// A parameter that always has the same value. Each reader must get it, never a default.
 const STEADY: &str = "/steady";
 
 pub(crate) const TYPE: &str = "std_msgs/String";
@@ -29,7 +29,7 @@ struct Call {
     failed: Option<String>,
 }
 
-/// The calls of one.
+/// The recorded calls of one client.
 type Log = Arc<Mutex<Vec<Call>>>;
 
 #[derive(Debug)]
@@ -39,7 +39,7 @@ struct Caller {
     thread: Option<JoinHandle<()>>,
 }
 
-/// They call from now on until it is dropped.
+/// Writers and readers that call until this is dropped.
 #[derive(Debug)]
 pub(crate) struct Traffic {
     nodes: Vec<Named>,
@@ -52,7 +52,7 @@ pub(crate) struct Traffic {
 struct Common {
     finish: AtomicBool,
     round: AtomicUsize,
-    /// Read by whoever makes a call.
+    /// Held for reading during each call.
     pause: RwLock<()>,
 }
 
@@ -85,7 +85,7 @@ impl Traffic {
         }
     }
 
-    /// Waits until each writer of those has made another call that was answered.
+    /// Waits until each of these computers' writers has made another call that was answered.
     #[track_caller]
     pub(crate) fn await_writes(&self, those: &[usize]) {
         let now = Instant::now();
@@ -99,12 +99,12 @@ impl Traffic {
         }
     }
 
-    /// Nobody calls while this is held; calls that were under way have ended.
+    /// Waits until the calls under way have ended, and prevents further calls while the lock is held.
     fn pause(&self) -> RwLockWriteGuard<'_, ()> {
         self.common.pause.write().unwrap()
     }
 
-    /// The longest write and read of those since then. Panics if a call failed, or was answered with a default.
+    /// The longest write and read of these computers since `since`. Panics if a call failed or returned a wrong value.
     #[track_caller]
     pub(crate) fn longest(&self, those: &[usize], since: Instant) -> [Duration; 2] {
         [&self.writers, &self.readers].map(|callers| {
@@ -115,7 +115,8 @@ impl Traffic {
         })
     }
 
-    /// Waits until all computers say the same, which holds every write that was answered. The next round has others.
+    /// Waits until all computers have the same state, and checks that it has every acknowledged write. The next round
+    /// uses new parameters.
     #[track_caller]
     pub(crate) fn assert_nothing_lost(&self, fleet: &Fleet) {
         let _pause = self.pause();
@@ -133,9 +134,9 @@ impl Traffic {
                 .get(&format!("count_{name}"));
             assert!(
                 last.is_none_or(|last| count.and_then(Value::as_int) >= Some(last.number)),
-                "the last count on {name} was {last:?}, and it is {count:?}"
+                "the last acknowledged count on {name} was {last:?}, and the state has {count:?}"
             );
-            // Parameters of earlier rounds have been deleted.
+            // The parameters of earlier rounds have been deleted.
             let kept = answered.filter(|call| {
                 registers(call.number) || call.round == round && !counts(call.number)
             });
@@ -143,7 +144,7 @@ impl Traffic {
             let lost: Vec<_> = kept.filter(|call| !holds(&state, name, call)).collect();
             assert!(
                 lost.is_empty(),
-                "answered on {name}, and lost in round {round}: {} calls, the first: {:?}, the last: {:?}",
+                "acknowledged on {name}, and lost in round {round}: {} calls, the first: {:?}, the last: {:?}",
                 lost.len(),
                 lost.first(),
                 lost.last()
@@ -151,10 +152,10 @@ impl Traffic {
         }
         for node in &self.nodes {
             let told = node.it().heard("shutdown");
-            assert!(told.is_empty(), "{node:?} is told to end: {told:?}");
+            assert!(told.is_empty(), "{node:?} is told to shut down: {told:?}");
         }
         assert!(total > 0, "nothing was written in round {round}");
-        println!("round {round}: {total} writes are there");
+        println!("round {round}: none of {total} writes is lost");
         let all = format!("/round{round}");
         let leader = fleet.await_whole();
         let leader = &fleet.computers[leader];
@@ -238,7 +239,7 @@ impl Caller {
     }
 }
 
-/// A node on a computer. Nothing kills it: it is only out of reach for a while.
+/// A fake node on a computer. It never dies, but may be unreachable for a while.
 #[derive(Clone, Debug)]
 pub(crate) struct Named {
     namespace: String,
@@ -262,18 +263,18 @@ impl Named {
 
 impl Drop for Named {
     fn drop(&mut self) {
-        // The node ends its server by a connection to it.
+        // The node's server ends by a connection to itself, which must be made in the computer's network.
         let node = self.node.take();
         within(&self.namespace, || drop(node));
     }
 }
 
-/// Whether this call of a writer registers a topic; the others set a parameter.
+/// Whether this call of a writer registers a publisher. All other calls set a parameter.
 fn registers(number: i32) -> bool {
     number % 10 == 0
 }
 
-/// Whether this call of a writer sets the one parameter that it sets again and again.
+/// Whether this call of a writer sets the parameter that is used in all rounds.
 fn counts(number: i32) -> bool {
     number % 10 == 5
 }
@@ -313,7 +314,7 @@ fn read(client: &Client) -> Result<(), String> {
     }
 }
 
-/// Whether the state has what that call wrote.
+/// Whether the state has the result of this call.
 fn holds(state: &State, name: &str, call: &Call) -> bool {
     let Call { round, number, .. } = call;
     if registers(*number) {

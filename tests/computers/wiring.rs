@@ -1,4 +1,4 @@
-//! What the other tests rest on: cuts cut, and etcd lives through what it should.
+//! Tests of the simulated computers: cables and ports are cut, and etcd survives what it should survive.
 
 use std::net::TcpStream;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use crate::fleet::Fleet;
 use crate::network::address;
 use crate::support::{alive, eventually};
 
-/// Whether a connection comes about within half a second.
+/// Whether a connection can be made within half a second.
 fn reaches(fleet: &Fleet, from: usize, to: usize, port: u16) -> bool {
     let address = format!("{}:{port}", address(to)).parse().unwrap();
     let limit = Duration::from_millis(500);

@@ -253,7 +253,7 @@ fn is_complete(model: &Master) -> bool {
         && !model.subscribers_of("/rosout").is_empty()
 }
 
-/// A number of cases, and how many of them there could have been.
+/// How many cases happened, of those that were requested.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Share {
     pub(crate) happened: usize,
@@ -267,7 +267,7 @@ pub(crate) struct Tally {
     pub(crate) sound: Share,
     /// The same for sequences with values that a master cannot return.
     pub(crate) with_unreturnable: Share,
-    /// What prevented crashes, because a successor could not have got it.
+    /// The values that prevented crashes, because a successor could not have got them.
     pub(crate) spared: Vec<Skipped>,
 }
 
@@ -300,7 +300,7 @@ pub(crate) fn run(
                     rig.revive();
                 }
                 if stage.away && !skipped(&after).is_empty() {
-                    // Only a running master can answer for what a successor could not get.
+                    // Only a running master can return what a successor could not get.
                     rig.revive();
                     rig.await_gate(true)?;
                 }

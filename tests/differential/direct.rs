@@ -81,7 +81,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
     Ok(())
 }
 
-/// Compares everything that can be heard or read.
+/// Compares the remaining callbacks and all reads.
 fn finish(stage: &mut Stage<'_>) -> Result<(), Failure> {
     stage.settle()?;
     let mut wire = stage.wires.remove(0);
@@ -163,7 +163,7 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
         look.arrange_like(model);
     }
     if look.bears() != Bears::Nothing {
-        return Err("a mark that nobody left".to_owned());
+        return Err("the master has a token, although none was set".to_owned());
     }
     let second = match look.second_call(model) {
         Some(call) => Some(wire.call(&call.into())?),

@@ -1,21 +1,23 @@
-//! The model against the real thing: random sequences of calls must be answered alike, leave the same
-//! state, and cause the same callbacks. Once with a bare rosmaster, whose state is brought whole to
-//! a fresh one on the way; and once through rosrescue, with a rosmaster that is killed again and
-//! again, while the model is a master that never crashed; and once through several rosrescues on an
-//! etcd, of which the one that leads is killed or hands over. (`together.rs` has callers that do not take
-//! turns.)
+//! Compares the model with real masters: both must answer random sequences of calls alike, have the same state, and
+//! cause the same callbacks. A sequence is played in one of three ways:
 //!
-//! A sequence that fails is made as short as possible and printed. The variables are:
+//! * with a bare rosmaster, whose state is injected into a fresh one on the way;
+//! * through rosrescue with a rosmaster that is killed again and again, while the model never crashes;
+//! * through several rosrescues on an etcd, whose leader is killed or hands over.
+//!
+//! `together.rs` has callers that do not take turns.
+//!
+//! A sequence that fails is shortened as far as possible and printed. The variables are:
 //!
 //! | variable | |
 //! |---|---|
-//! | `ROSRESCUE_SEQUENCES` | how many sequences with a bare rosmaster |
-//! | `ROSRESCUE_CRASH_SEQUENCES` | how many through rosrescue; every [`CORE_EACH`]th with `core` |
-//! | `ROSRESCUE_TAKEOVER_SEQUENCES` | how many through several computers; every [`THREE_EACH`]th through three |
-//! | `ROSRESCUE_CALLS` | calls of each |
-//! | `ROSRESCUE_CRASHES` | crashes, or takeovers, of each that goes through rosrescue |
-//! | `ROSRESCUE_SEED` | the first sequence's number; the others follow it |
-//! | `ROSRESCUE_SCRIPT` | a file with a printed sequence: nothing but that is played |
+//! | `ROSRESCUE_SEQUENCES` | number of sequences with a bare rosmaster |
+//! | `ROSRESCUE_CRASH_SEQUENCES` | number of sequences through rosrescue; every [`CORE_EACH`]th with `core` |
+//! | `ROSRESCUE_TAKEOVER_SEQUENCES` | number through several computers; every [`THREE_EACH`]th through three |
+//! | `ROSRESCUE_CALLS` | number of calls in each sequence |
+//! | `ROSRESCUE_CRASHES` | number of crashes, or takeovers, in each sequence through rosrescue |
+//! | `ROSRESCUE_SEED` | number of the first sequence; the others follow it |
+//! | `ROSRESCUE_SCRIPT` | a file with a printed sequence, which is played instead of all others |
 
 #![allow(
     clippy::expect_used,
@@ -75,7 +77,7 @@ fn number(name: &str, default: u64) -> u64 {
     }
 }
 
-/// The scripts to play before random sequences: all that ever failed, or only the file in `ROSRESCUE_SCRIPT`.
+/// The scripts to play before random sequences: all scripts that ever failed, or only the file in `ROSRESCUE_SCRIPT`.
 fn scripts() -> (Vec<(String, Script)>, bool) {
     let read = |path: &Path| {
         let script = Script::parse(&std::fs::read_to_string(path).unwrap());
@@ -103,7 +105,7 @@ fn play_or_shorten(
     // Printed at once and not with the test's output, because the search takes long.
     let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
     say(format!(
-        "{what} fails: {first}\n\n{}\nIt is made shorter now, for at most {SHRINKING:?}.",
+        "{what} fails: {first}\n\n{}\nIt is being shortened, for at most {SHRINKING:?}.",
         script.print()
     ));
     let deadline = Instant::now() + SHRINKING;
@@ -246,8 +248,8 @@ fn no_takeover_is_visible_through_several_computers() {
         "{count} sequences, {played} calls, {tally:?}, seeds from {first}, {:?}",
         start.elapsed()
     );
-    // A test without takeovers would prove nothing. A few sequences may have none by chance: as long as there is a value
-    // that a master cannot return, no computer is ended.
+    // A test without takeovers would prove nothing. A few sequences may have none by chance: while there is a value
+    // that a master cannot return, no computer is stopped.
     if count * takeovers as u64 >= 24 {
         assert!(tally.deaths.happened * 4 >= tally.deaths.asked, "{tally:?}");
         assert!(tally.handovers.happened > 0, "{tally:?}");

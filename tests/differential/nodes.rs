@@ -10,8 +10,8 @@ use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 use crate::support::{FakeMaster, sorted, unordered};
 
 thread_local! {
-    /// Whether a failure was found, and only a shorter script is searched for. Each test has its own thread, and the
-    /// failure of one must not hurry the others.
+    /// Whether a failure was found, so that only a shorter script is searched for. Each test has its own thread, so
+    /// that the failure of one test does not hurry the others.
     pub(crate) static HURRIED: Cell<bool> = const { Cell::new(false) };
 }
 
@@ -36,8 +36,8 @@ impl Node {
         let notes = Arc::clone(&heard);
         let server = FakeMaster::start(move |body| {
             let call = decode_call(body).unwrap();
-            // A question changes nothing in a node. The node proves that it lives, but cannot answer, because its
-            // registrations are random.
+            // A call of the health check changes nothing in a node. The fault proves that the node lives, and reports
+            // no registrations, because those in the master are random.
             let reply = if QUESTIONS.contains(&call.method.as_str()) {
                 let text = "no such method".to_owned();
                 Reply::Fault { code: 1, text }

@@ -1,20 +1,20 @@
-//! What a node may hear.
+//! The callbacks that a node may get.
 //!
-//! Without a crash it is exactly what the model says, in order; through rosrescue, with the present state told once more here
-//! and there (`docs/decisions/0031`). A crash of the master may do this, and nothing else:
+//! Without a crash a node gets exactly the model's callbacks, in order. Through rosrescue the present state may be sent
+//! again now and then (`docs/decisions/0031`). A crash of the master may have these effects, and no others:
 //!
-//! * The callbacks of the one call that was under way may be lost, or come once more: the master
-//!   may have run it before it died, its successor runs it again, and it was never answered twice.
-//! * So may those of unregistrations that are answered while no master is there. Several of them
-//!   are told with the one list that is true in the end.
-//! * While the mirror stands in, what is out of date when it would be sent may be left out.
-//! * A node that misses a list because of that is sent one that is true after it.
-//! * A subscriber may be told once more what it was told: the full list of a topic's publishers, or the value of a
-//!   parameter. Never a partial list, never a value that was not true since the crash before the last one, never a
-//!   `shutdown`, nothing to a node that does not subscribe.
+//! * The callbacks of the call under way may be lost or repeated: the master may have run the call before it died, and
+//!   its successor runs it again. The call is answered once.
+//! * The callbacks of unregistrations that are answered without a master may be lost or repeated too. The final list
+//!   may stand for several of them.
+//! * While the mirror stands in, outdated callbacks may be left out.
+//! * A node that misses a list for this reason gets a later true list.
+//! * A subscriber may get a callback again: the full list of a topic's publishers, or the value of a parameter. It
+//!   never gets a partial list, a value that was not true since the crash before the last one, or a `shutdown`. A node
+//!   that does not subscribe gets nothing.
 //!
-//! What one node is told about one topic or one parameter **never goes back**, whatever is told twice: nothing that was
-//! over before what the node has been told already. It is the order in which the model reached its states.
+//! The callbacks of one node about one topic or parameter **never go back**, even when they are repeated: no callback
+//! has a state that is older than that of an earlier callback. The order is that in which the model reached its states.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
@@ -23,17 +23,17 @@ use rosrescue::xmlrpc::{Call, Value};
 
 use crate::nodes::blank;
 
-/// A callback that the model sends.
+/// A callback of the model.
 #[derive(Clone, Debug)]
 pub(crate) struct Expected {
     pub(crate) call: Call,
-    /// Whether a crash may have lost or repeated it.
+    /// Whether a crash may have lost or repeated this callback.
     pub(crate) risky: bool,
 }
 
 type List = (String, String, Vec<String>);
 
-/// An event in the life of the model.
+/// An event of the model.
 #[derive(Debug)]
 enum Moment {
     /// The model sends this call to the node at this address. No node sees the states inside a multicall.
@@ -72,14 +72,14 @@ pub(crate) struct TrueLists {
 }
 
 impl TrueLists {
-    /// The master crashes in this state, after all callbacks were compared.
+    /// Notes that the master crashes in this state, after all callbacks were compared.
     pub(crate) fn crash(&mut self, model: &Master) {
         self.before.clear();
         self.states_before.clear();
         self.crash_unjudged(model);
     }
 
-    /// The master crashes in this state. Its callbacks are compared later.
+    /// Notes that the master crashes in this state. Its callbacks are compared later.
     pub(crate) fn crash_unjudged(&mut self, model: &Master) {
         self.before.extend(self.since.drain());
         self.states_before.append(&mut self.states_since);
@@ -88,25 +88,25 @@ impl TrueLists {
         self.add(model);
     }
 
-    /// The running call has led to this state.
+    /// Notes that the call under way has led to this state.
     pub(crate) fn answered(&mut self, model: &Master) {
         self.after.clear();
         self.faithful = None;
         self.add(model);
     }
 
-    /// The model sends this call to the node at `api`.
+    /// Notes that the model sends this call to the node at `api`.
     pub(crate) fn send(&mut self, api: &str, call: &Call) {
         let notice = Moment::Notice(api.to_owned(), call.clone());
         self.course.push(notice);
     }
 
-    /// All callbacks up to this state were compared.
+    /// Notes that all callbacks up to this state were compared.
     pub(crate) fn settled(&mut self, model: &Master) {
         self.course = vec![Moment::State(Box::new(model.clone()))];
     }
 
-    /// The first call that tells the node at `api` an older state than an earlier call did.
+    /// The first callback whose state is older than that of an earlier callback to the node at `api`.
     pub(crate) fn goes_back<'c>(&self, api: &str, heard: &'c [Call]) -> Option<&'c Call> {
         let mut reached = BTreeMap::new();
         heard.iter().find(|call| {
@@ -123,7 +123,7 @@ impl TrueLists {
         })
     }
 
-    /// Adds what is true in this state.
+    /// Adds this state, with its lists and values.
     pub(crate) fn add(&mut self, model: &Master) {
         self.states_since.push(model.clone());
         self.course.push(Moment::State(Box::new(model.clone())));
@@ -143,7 +143,7 @@ impl TrueLists {
         }
     }
 
-    /// Whether the call is a list that may be sent to the node at `api` because of a crash.
+    /// Whether a crash allows this callback to the node at `api`.
     pub(crate) fn has(&self, api: &str, call: &Call) -> bool {
         if call.method == "paramUpdate" {
             let mut states = self.states_before.iter().chain(&self.states_since);
@@ -153,8 +153,8 @@ impl TrueLists {
         list.is_some_and(|list| self.before.contains(&list) || self.since.contains(&list))
     }
 
-    /// Whether the node at `api` still has to get what the crash has lost: it subscribes, and has not got a list that
-    /// was true after the running call.
+    /// Whether the node at `api` must still get a replacement for a callback that the crash has lost: it subscribes,
+    /// and has not got a list that was true after the call under way.
     pub(crate) fn owes(&self, api: &str, swallowed: &Call, heard: &[Call]) -> bool {
         let Some((api, topic, _)) = as_list(api, swallowed) else {
             return false;
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_crash_all_is_heard_once_and_in_order() {
+    fn without_a_crash_each_callback_comes_once_and_in_order() {
         let expected = [("a", false), ("b", false), ("a", false)];
         assert!(verdict(&expected, &["a", "b", "a"]));
         for heard in [
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_twice_never_goes_back() {
+    fn repeated_callbacks_never_go_back() {
         let update = |value: i32| {
             let params = vec!["/master".into(), "/k/".into(), value.into()];
             Call::new("paramUpdate", params)
@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_is_true_for_those_who_subscribe_and_in_full() {
+    fn a_true_list_is_complete_and_for_subscribers_only() {
         let mut model = Master::default();
         let mut register = |method: &str, node: &str, api: &str| {
             let params = vec![node.into(), "/t".into(), "a/B".into(), api.into()];
@@ -364,7 +364,7 @@ mod tests {
         assert!(lists.has("http://s", &update(&["http://p1", "http://p2"])));
         assert!(!lists.has("http://s", &update(&["http://p1"])));
         assert!(!lists.has("http://p1", &update(&["http://p1", "http://p2"])));
-        // The node still has to get the lost callback until it hears what is true now.
+        // The node must get a replacement for the lost callback until it gets a list that is true now.
         let late = update(&["http://p1"]);
         lists.answered(&model);
         assert!(lists.owes("http://s", &late, std::slice::from_ref(&late)));

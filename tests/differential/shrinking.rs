@@ -7,7 +7,7 @@ use crate::script::{Script, Step, shrink, simpler};
 use crate::{crashes, direct, takeovers};
 
 #[test]
-fn the_least_that_fails_is_left() {
+fn shrinking_leaves_the_fewest_items_that_fail() {
     let whole: Vec<u32> = (0..200).collect();
     let mut runs = 0;
     let least = shrink(
@@ -33,7 +33,7 @@ fn the_least_that_fails_is_left() {
 }
 
 #[test]
-fn what_is_within_an_item_is_left_out_too() {
+fn shrinking_also_removes_parts_of_items() {
     let shorter = |text: &String| match text.len() {
         0 => Vec::new(),
         length => vec![text[1..].to_owned(), text[..length - 1].to_owned()],
@@ -63,7 +63,7 @@ fn is_found_out(steps: &[Step]) -> bool {
 }
 
 #[test]
-fn a_mistake_of_the_model_is_shown_by_three_calls() {
+fn a_defect_of_the_model_is_shrunk_to_three_calls() {
     let failing = (0..100).map(|seed| direct::script(seed, 200, 5));
     let failing: Vec<Script> = failing
         .filter(|script| is_found_out(&script.steps))
@@ -77,7 +77,7 @@ fn a_mistake_of_the_model_is_shown_by_three_calls() {
 }
 
 #[test]
-fn a_printed_script_is_read_as_it_was() {
+fn a_printed_script_is_parsed_unchanged() {
     for seed in 0..200 {
         for script in [
             direct::script(seed, 50, 5),

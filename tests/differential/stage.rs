@@ -1,4 +1,4 @@
-//! The parts of a run: the model beside the real master, clients, nodes, and the callbacks that they must get.
+//! The parts of a run: the model beside the real master, clients, nodes, and the expected callbacks.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -58,7 +58,7 @@ impl<'n> Stage<'n> {
         with_real_apis(call, &self.apis)
     }
 
-    /// Allows that rosrescue tells a node the present state again, as in `docs/decisions/0031`.
+    /// Allows rosrescue to send a node the present state again, as in `docs/decisions/0031`.
     pub(crate) fn allow_repeats(&mut self) {
         self.repeats.get_or_insert_default().add(&self.model);
     }
@@ -96,17 +96,17 @@ impl<'n> Stage<'n> {
         match words.is_empty() {
             true => Ok(()),
             false => Err(format!(
-                "the mirror that took what the reply {reply:?} says differs: {words:?}"
+                "a mirror that has applied the reply {reply:?} differs: {words:?}"
             )),
         }
     }
 
-    /// Notes the callbacks that the nodes must get.
+    /// Notes the expected callbacks.
     pub(crate) fn note(&mut self, notices: &[Notice], risky: bool) {
         for notice in notices {
             let (to, call) = nodes::as_call(notice);
-            // The mirror leaves out outdated callbacks. rosrescue tells a node to shut down only with evidence that it
-            // is the right one, and these nodes give none.
+            // The mirror leaves out outdated callbacks. rosrescue sends a `shutdown` only with evidence that the
+            // address still belongs to the right node, and these nodes give none.
             let risky = risky || self.away;
             if let Some(repeats) = &mut self.repeats {
                 repeats.send(to, &call);
@@ -159,7 +159,7 @@ impl<'n> Stage<'n> {
             self.call(0, &call)
                 .map_err(|why| format!("settling: {call:?} {why}"))?;
         }
-        // With several computers, a node may be told the list of this topic while it is still empty, too.
+        // With several computers, a node may also get the list of this topic while it is still empty.
         let publishers = Value::from(vec![Value::from(last[1])]);
         let is_last = |call: &Call| {
             call.params
@@ -179,7 +179,7 @@ impl<'n> Stage<'n> {
         Ok(())
     }
 
-    /// Compares the callbacks of a node, and waits until those that a crash has lost were replaced.
+    /// Compares the callbacks of a node, and waits for replacements of those that a crash has lost.
     fn judge(&self, node: &Node, expected: &[Expected], heard: Vec<Call>) -> Result<(), Failure> {
         let mut heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
         let mut expected = expected.to_vec();

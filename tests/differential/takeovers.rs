@@ -1,5 +1,5 @@
-//! Compares the model, which never crashes, with several rosrescues on one etcd. Their leader is killed with everything
-//! that it runs, or hands over.
+//! Compares the model, which never crashes, with several rosrescues on one etcd. Their leader is killed with all its
+//! processes, or hands over.
 //!
 //! Each client calls its own computer, or another one while its own is dead. So calls reach the leader and its
 //! followers.
@@ -21,9 +21,10 @@ use crate::script::{Script, Step};
 use crate::stage::{CLIENTS, Failure, Stage};
 use crate::support::{Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal};
 
-/// On a busy computer a shorter time would pass before etcd answers.
+/// The time to live, in seconds. With a shorter one, a busy computer would lose the lead before etcd answers.
 const TTL: &str = "1.5";
-/// Within how many microseconds after a call was sent its leader may go. The call may be anywhere by then.
+/// Maximum time from sending a call to the end of its leader, in microseconds. The call may have got to any point by
+/// then.
 const IN_FLIGHT_MICROS: u64 = 10_000;
 
 /// A random sequence with this many takeovers.
@@ -50,7 +51,7 @@ enum End {
     Handover,
 }
 
-/// The processes that are killed together.
+/// One computer: the processes that are killed together.
 struct Computer {
     rescue: Rescue,
     uri: String,
@@ -68,10 +69,10 @@ impl Computer {
         let rescue = Setup::core(&scratch, master_port)
             .args(["--cluster", cluster, "--cluster-ttl", TTL])
             .args(["--cluster-name", &format!("pc{index}")])
-            // A busy computer that is cut off for a moment must not answer writes by itself. Changes by other computers
-            // would win over them, which no master does.
+            // A busy computer that is cut off for a moment must not answer writes by itself, because writes of other
+            // computers would win over them. With a single master no write is lost.
             .args(["--alone", "refuse", "--hold", "60"])
-            // Each computer's rosout would be a node of its own.
+            // Each computer would otherwise have its own rosout node.
             .arg("--no-rosout")
             .guarded()
             .spawn();
@@ -98,7 +99,7 @@ impl Computer {
         }
         // A killed process loses its environment before its sockets are closed.
         let port = self.rescue.port();
-        eventually("nobody listens at its port", || {
+        eventually("no process listens at the computer's port", || {
             TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
         });
     }
@@ -111,7 +112,7 @@ impl Computer {
         }
     }
 
-    /// `/status.json`, if it answers.
+    /// The content of `/status.json`. `None` if rosrescue does not answer.
     fn status(&self) -> Option<Json> {
         let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
         self.life?;
@@ -127,7 +128,7 @@ impl Computer {
 
 struct Rig {
     computers: Vec<Computer>,
-    /// The computer of each client, and how often that computer had been started then.
+    /// The computer of each client, and the number of its starts at the time of the connection.
     at: [(usize, u32); CLIENTS],
 }
 
@@ -229,7 +230,7 @@ impl Rig {
         Ok(leader)
     }
 
-    /// Makes another computer the leader. If there was no leader, the same computer may lead again.
+    /// Ends the leadership of the present leader. If there was no leader, the same computer may lead again.
     fn end(&mut self, end: End) -> Result<(), Failure> {
         if end == End::Handover {
             return self.hand_over();
@@ -382,7 +383,7 @@ fn play(
     let mut after = stage.model.clone();
     after.apply(&Request::from(call.clone()));
     if stage.away && !survives(&after) {
-        // Only a running master can answer for what a successor could not get.
+        // Only a running master can return what a successor could not get.
         rig.await_open()?;
     }
     rig.attach(stage)?;
@@ -407,7 +408,7 @@ fn play(
     stage.answered(&call, &reply, true)
 }
 
-/// Compares the state at each computer, and again after the leader's death. Then it is the state of the journal.
+/// Compares the state at each computer, and again after the leader's death, when it comes from the journal.
 fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     let leader = rig.await_all()?;
     rig.attach(stage)?;

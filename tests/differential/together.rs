@@ -2,10 +2,10 @@
 //! rosmaster. Each caller must get the same bytes from both. Calls that queue up travel to the master as one multicall,
 //! and rosrescue encodes the replies.
 //!
-//! Each caller uses names of its own, so that its replies do not depend on other callers. So nothing is called that
-//! several callers share: not `getSystemState`, `getTopicTypes`, `getParamNames` or `getParam('/')`; no topic, service
-//! or parameter of two callers; no caller in the root namespace; and no process id. One service exists from the start,
-//! because a master that never had a service answers differently.
+//! Each caller uses its own names, so that its replies do not depend on other callers. Calls whose answers contain
+//! other callers' names are left out: `getSystemState`, `getTopicTypes`, `getParamNames`, `getParam('/')`, topics,
+//! services or parameters of two callers, callers in the root namespace, and the process id. One service exists from
+//! the start, because a master that never had a service answers differently.
 
 use std::net::TcpListener;
 
@@ -240,7 +240,7 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
     let rescue = Setup::proxy(&scratch, behind.port)
         .args(["--reads", reads])
         .start();
-    // Other tests check the callbacks. A node that does not answer is not taken for dead.
+    // Other tests check the callbacks. rosrescue does not take a node that does not answer for dead.
     let silent = TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let address = silent.local_addr().unwrap().to_string();
     let mut callers: Vec<_> = (0..CALLERS)
@@ -281,7 +281,7 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
     let batches = usize::try_from(counter("write_batches")).unwrap() - alone.len();
     if !unreturnable {
-        // Such values leave the mirror in doubt most of the time.
+        // With such values, the mirror cannot answer most of the time.
         assert_eq!(counter("calls_from_mirror") > 100, reads == "mirror");
     }
     println!(
@@ -325,7 +325,7 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
 }
 
 #[test]
-fn callers_at_the_same_time_get_the_bytes_of_a_bare_rosmaster() {
+fn simultaneous_callers_get_the_bytes_of_a_bare_rosmaster() {
     let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
     for reads in ["mirror", "master"] {
         play(seed, false, reads);

@@ -4,10 +4,10 @@ use rosrescue::xmlrpc::{Call, Reply, Struct, Value, encode_call, encode_reply};
 
 use crate::support::{Rosmaster, Scratch, http_request};
 
-/// At the limit of Python's recursion, rosmaster's behaviour depends on how deep its own calls are, so only a real one
-/// can tell.
+/// At the limit of Python's recursion, rosmaster's behaviour depends on the depth of its own calls, so only a real
+/// master can tell.
 #[test]
-fn what_rosmaster_cannot_return_becomes_its_fault() {
+fn values_that_rosmaster_cannot_return_become_its_fault() {
     let leaves = [
         Value::Int(1),
         Value::Bool(true),

@@ -13,7 +13,7 @@ use crate::support::{
     params, signal, status, unreadable,
 };
 
-/// A wall clock that is wrong by a settable number of seconds.
+/// A wall clock that is wrong by a given number of seconds.
 struct WallClock {
     file: PathBuf,
 }
@@ -61,7 +61,7 @@ impl WallClock {
     }
 }
 
-/// A robot whose rosrescue reads that clock.
+/// A robot whose rosrescue reads a [`WallClock`].
 struct Robot {
     failing: Failing,
     clock: WallClock,
@@ -117,7 +117,7 @@ fn recovery_does_not_depend_on_the_wall_clock() {
         let start = Instant::now();
         robot.clock.jump(jump);
         let dead = robot.kill_master();
-        // These calls are answered without a master or by the new one, whatever the clock does.
+        // The mirror or the new master answers these calls, whatever the clock does.
         client.set_param("/held", 1);
         client.ok("deleteParam", params!["/test", "/held"]);
         robot.await_recovery(dead);
@@ -134,7 +134,7 @@ fn recovery_does_not_depend_on_the_wall_clock() {
                 "{phase} {ms} of {took} s ({jump:+})"
             );
         }
-        // The clock was really wrong.
+        // Checks that the clock was wrong in this run.
         let error = robot.clock_error();
         assert!(
             (error - jump as f64).abs() < took + 1.0,
@@ -170,7 +170,7 @@ fn hold_and_probes_do_not_depend_on_the_wall_clock() {
         jump();
         status(&client)["open"] == true
     }));
-    // A master that hangs does, after three probes of 0.3 s.
+    // A master that hangs counts as hung after three probes of 0.3 s.
     let start = Instant::now();
     crate::support::stop(pid);
     eventually("the hung master is noticed", || {
@@ -180,7 +180,7 @@ fn hold_and_probes_do_not_depend_on_the_wall_clock() {
     let found = start.elapsed();
     assert!(found > Duration::from_millis(700), "{found:?}");
     assert!(found < Duration::from_secs(15), "{found:?}");
-    // A call that only a master understands is held for two seconds, no less and not much more.
+    // A call that only a master understands is held for two seconds, not shorter and not much longer.
     let start = Instant::now();
     let waiting = thread::spawn({
         let client = client.clone();

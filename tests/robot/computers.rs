@@ -38,7 +38,7 @@ impl Document {
     }
 }
 
-/// A script that runs `text` on each of `computers`. The first line is changed for each computer, as the document says.
+/// A script that runs `text` on each of `computers`. Its first line is changed for each computer, as the document says.
 fn on(computers: &[&str], text: &str) -> String {
     let own = COMPUTERS
         .iter()
@@ -55,7 +55,7 @@ fn on(computers: &[&str], text: &str) -> String {
     scripts.collect()
 }
 
-/// Runs `script` in namespaces of its own. They end with the shell and everything that it has started.
+/// Runs `script` in new namespaces, which end with the shell and everything that it has started.
 #[track_caller]
 fn run(script: &str) -> String {
     let scratch = Scratch::new();
@@ -185,7 +185,7 @@ fn rosrescue_can_be_run_and_handed_over_as_documented() {
         three_etcd(&document),
         on(&ALL, &core),
         on(&["head"], &look),
-        // The exit status says whether the next master is there yet.
+        // The exit status depends on whether the next master already answers, which the test does not check.
         on(&["base"], "rosrescue status || true"),
         // On such a computer `check` has further findings.
         on(&["head"], &format!("{} || true", check.trim_end())),

@@ -1,6 +1,5 @@
-//! The commands in the documents work: the blocks of each section are pasted unchanged into a shell, on a
-//! computer of their own (`tests/support/documents.sh`). [`blocks::NOT_RUN`] lists the ones that cannot be
-//! run there.
+//! The commands in the documents work: the blocks of each section are pasted unchanged into a shell, on a simulated
+//! computer (`tests/support/documents.sh`). [`blocks::NOT_RUN`] lists the ones that cannot be run there.
 
 use std::{fmt::Write as _, fs, path::Path, process::Command};
 
@@ -37,8 +36,8 @@ fn run(document: &str) {
     }
 }
 
-/// Runs a script in namespaces of its own: its ports are free, `pkill` finds no other processes, and
-/// everything ends with the shell.
+/// Runs a script in new namespaces: its ports are free, `pkill` finds no other processes, and everything ends with the
+/// shell.
 #[track_caller]
 fn run_section(script: &str) -> String {
     let scratch = Scratch::new();

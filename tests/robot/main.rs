@@ -18,8 +18,8 @@ mod paper {
     mod cases_0_and_1;
 }
 
-/// While there is no master, nodes start, find each other, exchange messages, are displaced and end as if
-/// there were one. The next master is given the result.
+/// While there is no master, nodes start, find each other, exchange messages, are displaced and end as with a master.
+/// The next master gets the result.
 mod outage {
     mod calls;
     mod durability;
@@ -32,7 +32,7 @@ mod outage {
     mod same_name;
 }
 
-/// What a node hears about a topic, a parameter or its own name comes in the order of the state.
+/// Notifications about a topic, a parameter or a name come in the order of the state's changes.
 mod order {
     mod answers;
     mod links;
@@ -56,7 +56,7 @@ mod master {
     mod unreturnable_values;
 }
 
-/// A new master is given the state, and the health check examines the nodes.
+/// A new master gets the state, and the health check examines the nodes.
 mod recovery {
     mod addresses;
     mod health_check;
@@ -96,7 +96,7 @@ mod limits {
     mod writes;
 }
 
-/// Command line options, start and stop.
+/// Options, start and stop.
 mod cli {
     mod addresses;
     mod as_roscore;
@@ -130,7 +130,7 @@ mod commands {
     mod wait;
 }
 
-/// The checkpoint as kept by the whole program.
+/// The checkpoint of the whole program.
 mod checkpoint {
     mod at_the_start;
     mod by_port;

@@ -36,7 +36,7 @@ fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
     of.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Everything that belongs to one writer in the master.
+/// The state of one writer in the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Own {
     params: BTreeMap<String, i32>,
@@ -45,7 +45,7 @@ struct Own {
     offered: BTreeSet<String>,
 }
 
-/// The effect of a call on that.
+/// The effect of a call on a writer's state.
 #[derive(Clone, Debug)]
 enum Step {
     Set(String, i32),
@@ -80,7 +80,7 @@ impl Own {
         }
     }
 
-    /// What the master at `client` holds for writer `index`.
+    /// The state of writer `index` in the master at `client`.
     fn read(client: &Client, index: usize) -> Self {
         let state = State::read(client);
         let (space, node) = (space(index), format!("/soaked_{index}"));
@@ -110,7 +110,7 @@ fn space(index: usize) -> String {
     format!("/soak/w{index}/")
 }
 
-/// Everything that was acknowledged to a writer.
+/// The acknowledged states of a writer.
 #[derive(Debug, Default)]
 struct Past {
     /// The states after each call since the last pause. There is always at least one.
@@ -261,8 +261,8 @@ impl Writer {
         })
     }
 
-    /// Notes, during a pause, that the writer is in `state`. What was not recorded may still be lost, so earlier states
-    /// stay possible.
+    /// Notes, during a pause, that the writer's state is `state`. States that are not recorded may still be lost, so
+    /// earlier states stay possible.
     fn is_in(&self, state: Own, is_recorded: bool) {
         let mut past = lock(&self.past);
         if is_recorded {
@@ -301,7 +301,7 @@ impl Stage<'_> {
         u32::try_from(self.status("pid")?.as_u64()?).ok()
     }
 
-    /// Waits until calls pass to a master, by a worker other than `dead`.
+    /// Waits until calls pass to a master through a worker other than `dead`.
     #[track_caller]
     fn await_service(&self, dead: Option<u32>) {
         let is_so = || {
@@ -386,7 +386,7 @@ impl Stage<'_> {
     fn assert_what_is_owed(&mut self) {
         self.pause();
         self.await_service(None);
-        // A state that was lost differs from what the nodes report.
+        // If a state was lost, the nodes' reports differ from it.
         eventually("all nodes have been asked", || {
             for writer in self.writers {
                 writer.claim(&Own::read(&self.client(), writer.index));
@@ -435,7 +435,7 @@ impl Stage<'_> {
                 self.count("masters killed");
                 if let Some(pid) = self.bare.master_pid() {
                     signal(pid, Signal::KILL);
-                    // Before the worker has noticed, both would die together.
+                    // The worker must notice the death first, or both would die together.
                     let is_other = || self.bare.master_pid().is_some_and(|it| it != pid);
                     let never = holds(3 * PATIENCE, || !is_other());
                     assert!(!never, "no other master: {}", self.rescue.log());

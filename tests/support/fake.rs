@@ -1,4 +1,4 @@
-//! Fakes of both sides: a node that records what it is told, and a master that can answer anything.
+//! Fakes of both sides: a node that records its calls, and a master that can give any answer.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -15,7 +15,7 @@ use super::patience::eventually_some;
 use super::rpc::Client;
 use super::scratch::free_port;
 
-/// A call that a fake node was sent.
+/// A call that a fake node received.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Heard {
     pub(crate) method: String,
@@ -31,7 +31,7 @@ struct Inner {
     released: Condvar,
     publications: Mutex<BTreeMap<String, String>>,
     subscriptions: Mutex<BTreeMap<String, String>>,
-    /// The process id that the node reports. `None` stands for that of the test.
+    /// The process id that the node reports. `None` means the test's process id.
     pid: Mutex<Option<i32>>,
     /// Whether the node reports a different process id each time.
     restless: AtomicBool,
@@ -104,7 +104,7 @@ impl FakeNode {
         *lock(&self.inner.ignored) = Some(method.to_owned());
     }
 
-    /// The parameters of each call of `method`, without the questions that every node is asked.
+    /// The parameters of each call of `method` that the node received, in order.
     pub(crate) fn heard(&self, method: &str) -> Vec<Vec<Value>> {
         let heard = lock(&self.inner.heard);
         heard
@@ -114,7 +114,7 @@ impl FakeNode {
             .collect()
     }
 
-    /// All calls that the node was sent, in order.
+    /// All calls that the node received, in order.
     pub(crate) fn calls(&self) -> Vec<Heard> {
         lock(&self.inner.heard).clone()
     }
@@ -182,7 +182,7 @@ impl FakeNode {
         claim(&self.inner.subscriptions, topic, topic_type);
     }
 
-    /// The node's address for services. No TCPROS server is there.
+    /// The node's address for services. No TCPROS server listens there.
     pub(crate) fn service_api(&self) -> String {
         format!("rosrpc://127.0.0.1:{}", self.server.port)
     }
@@ -233,7 +233,8 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
             break;
         };
         let head = head.to_ascii_lowercase();
-        // Looked at first: a test that sees the call below and then holds means later calls.
+        // The flag is read before the call is recorded: a test that sees the call and then sets the flag means later
+        // calls.
         let is_held = *lock(&inner.holding);
         lock(&inner.heard).push(Heard {
             method: call.method.clone(),

@@ -33,7 +33,7 @@ const LOOK: Duration = Duration::from_millis(250);
 pub(crate) enum Order {
     /// All nodes register in the order of topics, so that those of one topic register at about the same time.
     Same,
-    /// Each node registers in a random order of its own.
+    /// Each node registers in a different random order.
     Shuffled,
 }
 
@@ -44,7 +44,7 @@ pub(crate) struct Plan {
     pub(crate) nodes: usize,
     pub(crate) links: usize,
     pub(crate) order: Order,
-    /// Number of busy processes that run beside them.
+    /// Number of busy processes that run at the same time.
     pub(crate) load: usize,
     /// How long a link may take after the last node was ready, on a computer without other load.
     pub(crate) wait: Duration,
@@ -121,23 +121,23 @@ impl Plan {
 /// The outcome of one start.
 #[derive(Debug)]
 pub(crate) struct Start {
-    /// Number of links in the master's state.
+    /// The number of links in the master's state.
     pub(crate) links: usize,
-    /// The subscribers that are not connected to a publisher, each with what happened.
+    /// The missing links between a subscriber and a publisher, each with the events that led to it.
     pub(crate) never_made: Vec<String>,
     /// Links to nodes that are not publishers, and registrations that the state lacks.
     pub(crate) wrong: Vec<String>,
-    /// Answers whose list was older than one that the node had heard before, each with what happened.
+    /// Answers whose list was older than one that the node had received before, each with the events that led to it.
     pub(crate) overtaken: Vec<String>,
-    /// Updates whose list was older than one before, each with what happened.
+    /// Notifications whose list was older than an earlier one, each with the events that led to it.
     pub(crate) went_back: Vec<String>,
     /// The time until the last node had registered.
     pub(crate) time: Duration,
 }
 
 impl Start {
-    /// Panics unless every link was made. On an overloaded computer a node may read an answer after a
-    /// notification that was sent later; it is then told once more.
+    /// Panics unless every link was made. On an overloaded computer a node may read an answer after a notification that
+    /// was sent later; the notification is then repeated.
     #[track_caller]
     pub(crate) fn assert_whole(&self, plan: &Plan) {
         println!("answers read too late: {}", self.overtaken.len());
@@ -261,7 +261,7 @@ impl Fleet {
         self.wait_for_all("ready").iter().map(parse).collect()
     }
 
-    /// What each node was told. roscpp nodes report nothing.
+    /// The notifications and answers that each node received. roscpp nodes report nothing.
     #[track_caller]
     fn traces(&self, nodes: &[Ready]) -> Traces {
         let begin = nodes

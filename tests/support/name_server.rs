@@ -12,7 +12,7 @@ use std::time::Duration;
 use super::process::behind;
 use super::scratch::Scratch;
 
-/// A name server at a loopback address of its own. Needs root. It ends with the test's process.
+/// A name server at a separate loopback address. Needs root. It ends with the test's process.
 #[derive(Debug)]
 pub(crate) struct NameServer {
     resolv: PathBuf,
@@ -81,7 +81,7 @@ impl NameServer {
         hosts.insert(host.to_owned(), address);
     }
 
-    /// Wraps `command` so that it uses this name server: `unshare` gives it a resolv.conf of its own.
+    /// Wraps `command` so that it uses this name server: `unshare` gives it a separate resolv.conf.
     pub(crate) fn serving(&self, command: &Command) -> Command {
         let mut unshare = Command::new("unshare");
         unshare

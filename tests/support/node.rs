@@ -1,4 +1,4 @@
-//! Real nodes of both client libraries, and what they print (`tests/nodes/lines.py`).
+//! Real nodes of both client libraries, and the lines that they print (`tests/nodes/lines.py`).
 
 use std::ops::{Deref, DerefMut};
 use std::path::Path;

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-/// How long anything may take on two busy cores before a test fails.
+/// The time limit for anything that a test waits for, chosen for two busy cores.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 const STEP: Duration = Duration::from_millis(10);
@@ -36,7 +36,7 @@ pub(crate) fn eventually_some<T>(what: &str, mut look: impl FnMut() -> Option<T>
     }
 }
 
-/// Whether `condition` holds during all of `span`. For what must *not* happen.
+/// Whether `condition` holds during all of `span`. Used for events that must *not* happen.
 pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool {
     let start = Instant::now();
     while start.elapsed() < span {

@@ -84,7 +84,7 @@ pub(crate) struct Process {
     name: String,
     child: Child,
     ended: Option<ExitStatus>,
-    /// The ports that nothing else may get for a while after it has ended.
+    /// The ports that no other process may get for a while after this one has ended.
     ports: Vec<u16>,
     lines: Arc<Mutex<Vec<Line>>>,
     readers: [JoinHandle<()>; 2],
@@ -181,17 +181,17 @@ impl Process {
         status
     }
 
-    /// What it has written to standard output so far, line by line.
+    /// The lines that the process has written to standard output so far.
     pub(crate) fn stdout(&self) -> Vec<String> {
         self.text(Some(Stream::Out))
     }
 
-    /// What it has written to standard error so far, line by line.
+    /// The lines that the process has written to standard error so far.
     pub(crate) fn stderr(&self) -> Vec<String> {
         self.text(Some(Stream::Err))
     }
 
-    /// Everything it has written so far, line by line.
+    /// All lines that the process has written so far.
     pub(crate) fn output(&self) -> Vec<String> {
         self.text(None)
     }
@@ -213,7 +213,7 @@ impl Process {
             let ended = self.exited();
             let found = self.output().into_iter().find(|line| wanted(line));
             if let (None, Some(status)) = (&found, ended) {
-                // Its last output may still be on the way through the pipe.
+                // The process's last output may still be in the pipe.
                 thread::sleep(Duration::from_millis(200));
                 let found = self.output().into_iter().find(|line| wanted(line));
                 assert!(

@@ -81,13 +81,13 @@ impl Setup {
         self
     }
 
-    /// Runs it by another command, which `wrap` makes from the original one.
+    /// Replaces the command by the one that `wrap` makes from it.
     pub(crate) fn wrapped(mut self, wrap: impl FnOnce(&Command) -> Command) -> Self {
         self.command = wrap(&self.command);
         self
     }
 
-    /// Runs it with its guardian, as users do. The process that is started is then the guardian.
+    /// Runs rosrescue with its guardian, as users do. The started process is then the guardian.
     pub(crate) fn guarded(mut self) -> Self {
         self.command.env_remove(NO_GUARDIAN).env_remove(TUNABLES.0);
         self
@@ -137,7 +137,7 @@ impl Setup {
     }
 }
 
-/// A running rosrescue. It is killed on drop; what it has started ends with the scratch folder.
+/// A running rosrescue. It is killed on drop; the processes that it has started end with the scratch folder.
 #[derive(Debug)]
 pub(crate) struct Rescue {
     process: Process,
@@ -157,7 +157,7 @@ impl Rescue {
         Client::new(self.setup.port)
     }
 
-    /// Waits until it has printed its address and reports that it protects a living master.
+    /// Waits until rosrescue has printed its address and reports that it protects a living master.
     #[track_caller]
     pub(crate) fn wait_serving(&mut self) {
         self.wait_line("its address", |line| {
@@ -168,7 +168,7 @@ impl Rescue {
         });
     }
 
-    /// Starts it again after it has ended, with the same arguments and without waiting.
+    /// Starts rosrescue again after it has ended, with the same arguments and without waiting.
     #[track_caller]
     pub(crate) fn start_again(&mut self) {
         assert!(
@@ -179,8 +179,8 @@ impl Rescue {
         self.process = Process::start("rosrescue, again", &mut self.setup.command);
     }
 
-    /// Starts it again without waiting, as after a reboot of its computer. `boot_id` is a file with the boot
-    /// id of the new boot.
+    /// Starts rosrescue again without waiting, as after a reboot of its computer. `boot_id` is a file with the id of
+    /// the new boot.
     #[track_caller]
     pub(crate) fn start_after_reboot(&mut self, boot_id: &Path) {
         self.setup.in_boot(boot_id);

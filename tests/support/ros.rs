@@ -154,14 +154,14 @@ impl Tool {
         }
     }
 
-    /// Its output. Panics unless it has ended with `status`.
+    /// The tool's standard output. Panics unless the tool has ended with `status`.
     #[track_caller]
     pub(crate) fn ended(self, status: i32) -> String {
         assert_eq!(self.status.code(), Some(status), "{self:?}");
         self.stdout
     }
 
-    /// Its output as JSON. Panics unless it has ended with `status`.
+    /// The tool's standard output as JSON. Panics unless the tool has ended with `status`.
     #[track_caller]
     pub(crate) fn json(self, status: i32) -> serde_json::Value {
         serde_json::from_str(&self.ended(status)).expect("JSON")

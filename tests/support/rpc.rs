@@ -30,8 +30,8 @@ pub(crate) fn request(first: &str, headers: &[&str], body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// A request in UTF-16 without a byte order mark that sets `key` to `value`. rosmaster understands it and rosrescue does
-/// not.
+/// A request in UTF-16 without a byte order mark that sets `key` to `value`. rosmaster understands it and rosrescue
+/// does not.
 pub(crate) fn unreadable(key: &str, value: i32) -> Vec<u8> {
     let params = vec!["/test".into(), key.into(), value.into()];
     let call = String::from_utf8(encode_call("setParam", params)).unwrap();

@@ -61,8 +61,8 @@ impl Scratch {
         self.path("log")
     }
 
-    /// Prepares `command`: everything that ROS writes goes to this folder, the token is set, and its address needs no
-    /// name server. Of the caller's ROS environment only the place of installation is kept.
+    /// Prepares `command`: ROS writes all files to this folder, the token is set, and no name server is needed for the
+    /// node's address. Of the caller's ROS environment only the place of installation is kept.
     pub(crate) fn prepare(&self, command: &mut Command) {
         for (key, _) in std::env::vars_os() {
             let name = key.to_string_lossy();
@@ -181,13 +181,13 @@ pub(crate) fn free_port() -> u16 {
 /// The first of the ports that the kernel chooses by itself.
 pub(crate) const FIRST_OF_KERNEL: u16 = 32_768;
 
-/// Makes `port` refuse connections until 200 other ports have been held: nothing gets it by chance.
+/// Makes `port` refuse connections until 200 other ports have been held, so that no other process gets it by chance.
 pub(crate) fn hold_port(port: u16) {
     static HELD: Mutex<VecDeque<TcpSocket>> = Mutex::new(VecDeque::new());
     let Ok(socket) = TcpSocket::new_v4() else {
         return;
     };
-    // Closed connections of the dead process must not prevent it.
+    // Closed connections of the dead process must not prevent the bind.
     let address = (Ipv4Addr::UNSPECIFIED, port).into();
     if socket.set_reuseaddr(true).is_ok() && socket.bind(address).is_ok() {
         let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);

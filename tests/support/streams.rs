@@ -25,7 +25,7 @@ pub(crate) struct Streams {
     talkers: [Node; 2],
     listeners: [Node; 2],
     topic: String,
-    /// What the nodes report about their links when all are connected.
+    /// The links that the nodes report when all are connected.
     links: Vec<Value>,
 }
 
@@ -69,7 +69,7 @@ impl Streams {
         }
     }
 
-    /// What each node reports about its links for the topic, including their numbers and ports.
+    /// The links that each node reports for the topic, including their numbers and ports.
     fn links(&self, robot: &Robot) -> Vec<Value> {
         let topic = Value::String(format!("/{}", self.topic));
         let of = |name: &String| {

@@ -1,4 +1,4 @@
-//! Asks a bare master and one behind rosrescue the same.
+//! Sends the same requests to a bare master and to one behind rosrescue.
 
 use rosrescue::xmlrpc::{Reply, Value};
 
@@ -72,9 +72,8 @@ impl Twins {
     }
 }
 
-/// The part of an answer that must be the same: everything but dates and names of programs. rosmaster says
-/// HTTP/1.1 even to HTTP/1.0 clients; a separate test covers what matters to these, the end of the
-/// connection.
+/// The part of an answer that must be the same: everything except dates and program names. rosmaster says HTTP/1.1 even
+/// to HTTP/1.0 clients; a separate test covers the end of the connection, which matters to these clients.
 fn essence(response: &Response) -> (String, Option<String>, Option<String>, String) {
     let header = |name| response.header(name).map(str::to_owned);
     (

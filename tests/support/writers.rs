@@ -1,5 +1,5 @@
-//! Writes that cause notifications: writers that each have a parameter that only grows and a publisher that
-//! comes and goes, and nodes that are notified of all of these.
+//! Writes that cause notifications, and the nodes that receive these. Each writer has a parameter that only grows and a
+//! publisher that comes and goes.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,7 +18,7 @@ pub(crate) const SUBSCRIBERS: usize = 4;
 /// How long a node takes to answer.
 const ANSWER: Duration = Duration::from_millis(1);
 
-/// Everything that a subscriber was told about each parameter and each topic, in order.
+/// All notifications of a subscriber, by parameter and by topic, in order.
 #[derive(Debug, Default)]
 pub(crate) struct Told {
     pub(crate) values: BTreeMap<String, Vec<i32>>,
@@ -107,7 +107,7 @@ fn answer(told: &Mutex<Told>, body: &[u8]) -> Vec<u8> {
         }
     }
     thread::sleep(ANSWER);
-    // rosrescue leaves a node alone that does not report what it subscribes to.
+    // rosrescue does not check a node that does not report its subscriptions.
     let (code, value) = match call.method.as_str() {
         "getPid" => (1, i32::try_from(std::process::id()).unwrap()),
         "getSubscriptions" | "getPublications" => (0, 0),

@@ -14,7 +14,7 @@ pub(crate) fn quoted(text: &str) -> impl Iterator<Item = &str> {
 }
 
 #[test]
-fn what_is_not_run_is_tested_by_something_that_exists() {
+fn commands_that_are_not_run_name_an_existing_test() {
     for (word, reason) in NOT_RUN {
         let files: Vec<_> = quoted(reason).collect();
         assert!(!files.is_empty(), "{word}: {reason}");

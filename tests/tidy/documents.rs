@@ -4,7 +4,7 @@ use std::{collections::BTreeSet, fs, path::Path, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
-/// Maximum number of bytes of documents: people read no more. The last entry is all of `docs` without the decisions and
+/// Maximum number of bytes of documents: people read no more. The last entry is all of `docs` except the decisions and
 /// the help.
 const BYTES_MOST: [(&str, usize); 3] = [
     ("README.md", 8 << 10),
@@ -131,7 +131,7 @@ fn sentences_are_short() {
     }
 }
 
-/// `packaging/build-book.sh` adds the decisions.
+/// `packaging/build-book.sh` adds the decisions to the book.
 #[test]
 fn every_document_is_in_the_table_of_contents() {
     let contents = read("docs/SUMMARY.md");
@@ -149,7 +149,7 @@ fn every_document_is_in_the_table_of_contents() {
     }
 }
 
-/// `tests/robot/documents.rs` compares its lines with those of a new one.
+/// `tests/robot/documents.rs` compares the lines of the recording with those of a new one.
 #[test]
 fn the_recording_is_small_and_needs_nothing_else() {
     let picture = read("docs/rescue.svg");
@@ -239,7 +239,7 @@ fn anchors(text: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn links_in_documents_lead_somewhere() {
+fn links_in_documents_are_not_broken() {
     let mut links = 0;
     for document in documents() {
         let text = read(&document);

@@ -66,7 +66,7 @@ fn beginning(message: &str) -> &str {
 }
 
 #[test]
-fn the_document_has_every_line_that_may_ask_for_something() {
+fn the_document_has_every_warning_and_error_of_the_log() {
     let document = read("docs/operations.md");
     let (_, table) = document
         .split_once("\n### Lines that ask for something\n")

@@ -1,4 +1,4 @@
-//! Checks what no compiler checks: documents match the program, modules import downward only, files stay small.
+//! Checks that no compiler makes: documents match the program, modules import downward only, files stay small.
 
 #![allow(
     clippy::unwrap_used,

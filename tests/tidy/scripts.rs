@@ -1,10 +1,10 @@
-//! What several scripts share.
+//! Checks code that several scripts share.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
-/// An apt-get that finds a lock taken when it is called for the first time.
+/// An apt-get that finds a lock taken at its first call.
 const APT_GET: &str = r#"#!/bin/sh
 if [ ! -e "$0.called" ]; then
     : >"$0.called"

@@ -1,4 +1,4 @@
-//! Checks that types have names of their own, few fields and one place, and that the map has every crate and folder.
+//! Checks that types have unique names, few fields and one place, and that the map has every crate and folder.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -10,7 +10,7 @@ use super::{code, read, root, sources};
 /// Highest percentage of visible types that share their name with another one.
 const SHARED_PERCENT_MOST: usize = 5;
 const FIELDS_MOST: usize = 20;
-/// Types with too many fields, and how many they have. No other type may be added, and none may grow.
+/// Types with too many fields, and their numbers of fields. No other type may be added, and none may grow.
 const LARGE: [(&str, usize); 7] = [
     // Options of the command line and the configuration made from them: each option is a field.
     ("CommonArgs", 23),
@@ -24,7 +24,7 @@ const LARGE: [(&str, usize); 7] = [
     ("Member", 22),
 ];
 const IMPL_FILES_MOST: usize = 3;
-/// Types with `impl` blocks in too many files, and in how many.
+/// Types with `impl` blocks in too many files, and the numbers of files.
 const SPREAD: [(&str, usize); 3] = [
     // One file for each part of the Master API, and for each subject of `check`.
     ("Findings", 4),

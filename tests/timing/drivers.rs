@@ -25,7 +25,8 @@ const PASS: f64 = 300.0;
 /// driver that had to wait once for its read and once for its write would take at least 200, and one that had to wait
 /// until the master counts as hung at least 1,600.
 const PASS_HUNG: f64 = 190.0;
-/// Pause between two hangs, so that rosrescue stands in equally soon each time: after five within a minute it waits longer.
+/// Pause between two hangs, so that rosrescue stands in equally soon each time: after five within a minute it waits
+/// longer.
 const BETWEEN_HANGS: Duration = Duration::from_secs(13);
 /// How many times longer a pass may take than the longest one of an undisturbed driver.
 const NOISE: f64 = 3.0;
@@ -152,7 +153,7 @@ fn no_driver_stalls_while_the_master_dies_again_and_again(mode: Mode) {
         let end = Instant::now() + Duration::from_secs(seconds);
         while Instant::now() < end {
             let next = Instant::now() + PAUSE;
-            // A core makes pauses of its own in a crash loop.
+            // A core also pauses by itself in a crash loop.
             if robot.bare().master_pid().is_some() {
                 robot.kill_master();
                 robot.revive_master();

@@ -1,11 +1,11 @@
-//! While there is no master, subscribers that cannot be told or do not answer delay no other node.
+//! Without a master, subscribers that cannot be notified or do not answer delay no other node.
 
 use std::time::{Duration, Instant};
 
 use crate::support::{Client, FakeNode, Mode, Netns, Robot, eventually, eventually_some, params};
 
-/// Maximum time until every reachable node has been told, on a busy computer. It would take longer if nodes
-/// waited for each other.
+/// Maximum time until every reachable node has been notified, on a busy computer. It would take longer if nodes waited
+/// for each other.
 const SOON: Duration = Duration::from_secs(4);
 /// Number of unreachable nodes: more than rosrescue notifies at the same time.
 const UNREACHABLE: u16 = 100;
@@ -17,20 +17,20 @@ fn robot_without_master() -> (Robot, Client) {
     (robot, client)
 }
 
-/// How long it takes until `subscriber` knows `publisher`, which registers now.
+/// The time from the registration of `publisher` until `subscriber` knows it.
 #[track_caller]
 fn time_to_hear(client: &Client, publisher: &FakeNode, subscriber: &FakeNode) -> Duration {
     let start = Instant::now();
     publisher.publish(client, "/chatter", "std_msgs/String");
-    eventually_some("the subscriber hears of the publisher", || {
+    eventually_some("the subscriber knows the publisher", || {
         let updates = subscriber.updates("/chatter");
         let knows = updates.iter().any(|list| list.contains(&publisher.api));
         knows.then(|| start.elapsed())
     })
 }
 
-/// The computer of these nodes has vanished, which has not been noticed yet, so each attempt runs into its
-/// time limit.
+/// The computer of the unreachable nodes vanishes without notice, so each attempt to notify them lasts until its time
+/// limit.
 #[test]
 fn unreachable_subscribers_delay_no_other_node() {
     let _alone = crate::alone();
@@ -49,7 +49,7 @@ fn unreachable_subscribers_delay_no_other_node() {
     let [first, second] = ["/first", "/second"].map(FakeNode::start);
     let times = [&first, &second].map(|publisher| time_to_hear(&client, publisher, &living));
     println!(
-        "with {UNREACHABLE} unreachable nodes beside it, the subscriber was told after {times:?}"
+        "with {UNREACHABLE} unreachable nodes, the living subscriber was notified after {times:?}"
     );
     assert!(times.iter().all(|time| *time < SOON), "{times:?}");
 }
@@ -68,9 +68,9 @@ fn a_subscriber_that_does_not_answer_delays_no_other_node() {
     let times = [&first, &second].map(|publisher| time_to_hear(&client, publisher, &living));
     assert!(times.iter().all(|time| *time < SOON), "{times:?}");
     silent.release();
-    // As soon as it answers again, it is told everything.
+    // As soon as the silent subscriber answers again, it gets the latest list of publishers.
     let both = [first.api.clone(), second.api.clone()];
-    eventually("the silent subscriber is told at last", || {
+    eventually("the silent subscriber is notified at last", || {
         silent
             .updates("/chatter")
             .last()

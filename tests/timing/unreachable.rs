@@ -1,4 +1,4 @@
-//! Nodes that cannot be reached, because packets to them vanish, delay no other node.
+//! Nodes that cannot be reached, because packets to them are dropped, delay no other node.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use crate::support::{
     in_both_modes, names, params, status,
 };
 
-/// Number of unreachable nodes, and of others.
+/// Number of unreachable nodes and of living fake nodes.
 const UNREACHABLE: u8 = 20;
 const LIVING: usize = 18;
 /// Maximum time until a living subscriber knows a new publisher.
@@ -34,13 +34,13 @@ impl Living {
         Self { fakes, real }
     }
 
-    /// How long it takes until each of them hears of a publisher that registers now.
+    /// The time from the registration of `publisher` until each of these nodes knows it.
     #[track_caller]
     fn hear_of(&self, publisher: &FakeNode, client: &Client) -> Vec<Duration> {
         let start = Instant::now();
         publisher.publish(client, "/chatter", "std_msgs/String");
         let mut heard = vec![None; LIVING + 2];
-        eventually("every living subscriber hears of a publisher", || {
+        eventually("every living subscriber knows the publisher", || {
             for (i, heard) in heard.iter_mut().enumerate() {
                 if heard.is_none() {
                     let updates = match i.checked_sub(LIVING) {
@@ -109,7 +109,7 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
     let before = robot.settled_state();
     let with = [(); 3].map(|()| crash(&mut robot));
 
-    // Measured at once, when it is not yet known which nodes are unreachable, and again later.
+    // The times are measured at once, when rosrescue does not know yet which nodes are unreachable, and again later.
     let mut publishers: Vec<FakeNode> = Vec::new();
     let mut tell = |count: usize| {
         let mut times = Vec::new();
@@ -141,7 +141,7 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
         least(with) < least(without) * 2.0 + 500.0,
         "{with:?} {without:?}"
     );
-    // The living nodes also hear of parameters, and no node was unregistered or disturbed.
+    // The living nodes are also notified of parameters, and no node was unregistered or disturbed.
     let state = robot.state();
     assert!(gone().all(|(_, name)| state.knows(&name)));
     assert_eq!(

@@ -213,7 +213,7 @@ fn a_previous_generation_of_a_later_history_adds_nothing() {
     }
     store.begin(&checkpoint(5)).unwrap();
     drop(store);
-    // An old and damaged copy, beside the previous generation of a later history.
+    // The checkpoint is an old and damaged copy. The previous generation belongs to a later history.
     copy[200] ^= 4;
     fs::write(&path, copy).unwrap();
     let (mut store, loaded) = Store::open(&path).unwrap();

@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{Struct, Value};
 
-/// Texts that some YAML readers take for something else.
+/// Texts that some YAML readers read as something else.
 #[rustfmt::skip]
 const TEXTS: &[&str] = &[
     "", " ", "  both  ", "no", "No", "on", "OFF", "y", "yes", "true", "null", "~", "Null", "1:30",

@@ -11,7 +11,7 @@ use super::{file_with, in_array, in_struct, nested};
 
 const PYTHON: &str = "/usr/bin/python3";
 
-/// Prints what PyYAML reads, with types, in a notation for comparison.
+/// Prints the values that PyYAML reads, with types, in a notation for comparison.
 const DESCRIBE: &str = r#"
 import base64, datetime, struct, sys, yaml
 
@@ -120,7 +120,7 @@ fn assert_python_agrees(values: &[Value]) {
 
 #[test]
 fn python_reads_every_kind_of_value_alike() {
-    // `shown` can convert integers of at most 40 digits. The longest ones have a test of their own.
+    // `shown` can convert integers of at most 40 digits. A separate test has the longest ones.
     let values: Vec<Value> = catalogue()
         .into_iter()
         .filter(|value| !matches!(value, Value::BigInt(digits) if digits.len() == 4_000))

@@ -31,7 +31,7 @@ fn rosrescue_serves_calls_without_a_writable_checkpoint() {
         client.set_param("/kept", 1);
         let dead = client.master_pid().expect("the master's process id");
         crate::support::signal(dead, Signal::KILL);
-        eventually("another master is there", || {
+        eventually("another master answers", || {
             client.master_pid().is_some_and(|pid| pid != dead)
         });
         assert_eq!(client.param("/kept"), Some(1.into()));
@@ -112,7 +112,7 @@ fn the_whole_records_of_a_damaged_checkpoint_are_restored_and_the_damage_is_repo
     rescue.kill();
     let checkpoint = rescue.checkpoint();
     let mut bytes = fs::read(&checkpoint).unwrap();
-    // The last record is incomplete, so as far as the file can tell it was never acknowledged.
+    // The last record is incomplete. According to the file it was never acknowledged.
     let end = bytes
         .iter()
         .rposition(|&byte| byte == b'{')

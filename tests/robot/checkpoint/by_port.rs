@@ -1,4 +1,4 @@
-//! The default checkpoint, of which there is one per port.
+//! The default checkpoint. There is one per port.
 
 use std::fs;
 use std::path::Path;

@@ -33,7 +33,7 @@ fn goes_on_without(rescue: &mut Rescue) {
     client.set_param("/last", -1);
     let dead = client.master_pid().unwrap();
     signal(dead, Signal::KILL);
-    eventually("another master is there", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| pid != dead)
     });
     assert_eq!(client.param("/last"), Some((-1).into()));

@@ -92,7 +92,7 @@ fn on_a_hung_disk_reads_continue_and_writes_wait_for_a_limited_time() {
     node.publish(&client, "/topic", "std_msgs/String");
     let dead = client.master_pid().unwrap();
     signal(dead, Signal::KILL);
-    eventually("another master is there", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| pid != dead) && status(&client)["open"] == true
     });
     assert_eq!(client.param("/during"), Some(2.into()));
@@ -155,7 +155,7 @@ fn rosrescue_can_be_stopped_on_a_hung_disk_and_reports_it() {
     assert_eq!(rescue.client().param("/before"), Some(1.into()));
 }
 
-/// The first generation of the checkpoint cannot be written.
+/// rosrescue cannot write the first generation of the checkpoint.
 #[test]
 fn rosrescue_serves_calls_when_it_starts_on_a_hung_disk() {
     let scratch = Scratch::new();
@@ -191,7 +191,7 @@ fn a_master_that_was_started_on_a_hung_disk_is_used_after_a_death_of_rosrescue()
     client.set_param("/during", 1);
     let dead = client.master_pid().unwrap();
     signal(dead, Signal::KILL);
-    eventually("another master is there", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| pid != dead) && status(&client)["open"] == true
     });
     let master = client.master_pid();

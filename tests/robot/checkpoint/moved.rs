@@ -18,7 +18,7 @@ const SAID: Duration = Duration::from_secs(10);
 fn robot(scratch: &Scratch) -> Rescue {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();
-    // rosrescue checks the file often, even if it rarely syncs.
+    // rosrescue checks the file often, even if it syncs rarely.
     Setup::core(scratch, free_port())
         .args(["--sync-interval", "30000"])
         .at_checkpoint(folder.join("chkpt.yaml"))
@@ -44,14 +44,20 @@ fn second(scratch: &Scratch, checkpoint: PathBuf) -> Setup {
     Setup::core(scratch, free_port()).at_checkpoint(checkpoint)
 }
 
-/// Does `deed` while no calls come. Tries to start a second rosrescue at once and again when all is well. Then kills
-/// everything.
+/// Runs `deed` while no calls come, and waits until rosrescue is protected again. Checks that a second rosrescue is
+/// refused then, and that nothing is lost when rosrescue and the master are killed.
 fn assert_survives(rescue: &mut Rescue, deed: impl FnOnce(&Path), second: impl Fn() -> Setup) {
     rescue.client().set_param("/before", 1);
     deed(&rescue.checkpoint());
     let start = Instant::now();
-    eventually("rosrescue reports it", || said(rescue, "unprotected: ") > 0);
-    assert!(start.elapsed() < SAID, "said after {:?}", start.elapsed());
+    eventually("rosrescue reports that it is unprotected", || {
+        said(rescue, "unprotected: ") > 0
+    });
+    assert!(
+        start.elapsed() < SAID,
+        "reported after {:?}",
+        start.elapsed()
+    );
     rescue.client().set_param("/between", 2);
     eventually("rosrescue is protected again", || {
         said(rescue, "protected again") > 0 && status(&rescue.client())["unprotected"].is_null()

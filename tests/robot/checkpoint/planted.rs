@@ -1,5 +1,5 @@
-//! Files that other users have planted beside the checkpoint, and a disk that hangs: no call is delayed, and
-//! no file elsewhere is changed.
+//! Files that other users have planted next to the checkpoint, and a disk that hangs: no call is delayed, and no file
+//! elsewhere is changed.
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -11,7 +11,7 @@ use crate::support::{
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::Signal;
 
-/// The files that rosrescue opens beside a checkpoint.
+/// The files that rosrescue opens next to a checkpoint.
 const FILES: [&str; 4] = [
     ".rosmaster-output.log",
     ".rosmaster-logging.conf",
@@ -79,7 +79,7 @@ fn planted_pipes_delay_no_call() {
     assert_rescued(&mut rescue);
 }
 
-/// Python would execute parts of it.
+/// Python would execute parts of a planted log configuration.
 #[test]
 fn rosmasters_log_configuration_is_not_a_file_that_others_could_plant() {
     let scratch = Scratch::new();

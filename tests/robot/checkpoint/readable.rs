@@ -42,7 +42,8 @@ fn pyyaml_reads_the_same_parameters_as_the_master_has() {
     client.set_param("/big", vec!["x".repeat(10_000); 20]);
     client.ok("deleteParam", params!["/test", "/kinds/one"]);
     assert_eq!(compared(&checkpoint, &bare.uri()), "same");
-    // Far more calls than any journal keeps. The file stays whole while it is replaced.
+    // The test makes far more calls than a journal keeps, so the file is replaced several times. It must be complete
+    // all the time.
     for i in 0..3000 {
         client.set_param(&format!("/many/p{}", i % 50), i);
         if i % 500 == 0 {
@@ -60,7 +61,7 @@ fn pyyaml_reads_the_same_parameters_as_the_master_has() {
         0o600
     );
 
-    // Now the closing snapshot.
+    // The last snapshot is written at a clean stop.
     assert_eq!(rescue.terminate().code(), Some(0));
     assert_eq!(compared(&checkpoint, &bare.uri()), "same");
 }

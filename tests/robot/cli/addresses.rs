@@ -48,9 +48,9 @@ fn core_is_reached_at_every_address_and_its_master_at_loopback_only() {
     }
 }
 
-/// `core` interprets ROS's variables for the computer's own address as ROS does.
+/// `core` reads the variables for the computer's own address in the same way as ROS.
 #[test]
-fn core_is_reached_at_loopback_only_where_ros_says_so() {
+fn core_listens_at_loopback_only_if_ros_variables_say_so() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let said = [("ROS_IP", "127.0.0.1"), ("ROS_HOSTNAME", "localhost")];

@@ -7,7 +7,7 @@ use crate::support::{
     Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, in_both_modes, request,
 };
 
-/// Standard error is a file here. Like a socket of journald, it is recognised by device and inode.
+/// Standard error is a file in this test. rosrescue recognises it by device and inode, as it does a socket of journald.
 #[test]
 fn log_lines_have_priorities_only_for_journald() {
     let scratch = Scratch::new();
@@ -52,7 +52,7 @@ fn log_lines_have_priorities_only_for_journald() {
 }
 
 #[test]
-fn what_comes_by_the_hundred_is_logged_ten_times() {
+fn repeated_log_lines_are_limited_to_ten() {
     let robot = Robot::start_with(Mode::Core, &[]);
     let client = robot.client();
     let foreign = request("POST / HTTP/1.1", &["Origin: http://elsewhere"], b"x");

@@ -100,7 +100,7 @@ fn proxy_ignores_variables_of_core() {
             .env("ROSRESCUE_PORT", "bad")
     };
     setup().start();
-    // Its own variables are still checked.
+    // `proxy` still checks the variables that are meant for it.
     let said = refused(&scratch, setup().env("ROSRESCUE_HOLD", "bad"), 2);
     assert!(said.contains("--hold"), "{said}");
     for arguments in [&[][..], &["core"], &["--no-rosout"]] {
@@ -185,19 +185,19 @@ fn an_address_that_cannot_be_served_is_named() {
 
 /// The kernel closes the sockets of a killed rosrescue a moment after its end.
 #[test]
-fn a_port_that_becomes_free_soon_is_waited_for() {
+fn rosrescue_waits_for_a_port_that_becomes_free_soon() {
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
     let taken = TcpListener::bind(("0.0.0.0", setup.port)).unwrap();
     let mut rescue = setup.spawn();
-    // Otherwise it would end at once.
+    // A rosrescue that does not wait for the port would end within this time.
     holds(Duration::from_millis(300), || rescue.exited().is_none());
     drop(taken);
     rescue.wait_serving();
 }
 
 #[test]
-fn a_master_that_is_none_or_rosrescue_itself_is_refused() {
+fn a_master_address_that_is_invalid_or_rosrescues_own_is_refused() {
     let scratch = Scratch::new();
     let port = free_port().to_string();
     let mut cases = Vec::new();
@@ -302,9 +302,9 @@ fn no_rosmaster_installed() {
     }
 }
 
-/// rosout is an ordinary client: it must find the master at the announced address.
+/// rosout is an ordinary client, so it must find the master at the printed address.
 #[test]
-fn an_address_to_serve_is_the_one_that_is_said() {
+fn the_printed_address_is_the_one_that_is_served() {
     let scratch = Scratch::new();
     let port = free_port();
     let said = format!("http://127.0.0.7:{port}/");
@@ -370,7 +370,7 @@ fn a_rosmaster_that_is_gone_for_a_while_is_started_when_it_is_back() {
 }
 
 #[test]
-fn a_master_that_is_not_there_is_waited_for() {
+fn rosrescue_waits_for_a_master_that_is_not_running_yet() {
     let scratch = Scratch::new();
     let port = free_port();
     let mut rescue = Setup::proxy(&scratch, port).spawn();

@@ -1,5 +1,5 @@
-//! How rosrescue stops, and what it keeps running until then. Signals stop it cleanly whatever hangs. Nothing is left
-//! behind, and no call gets a false answer.
+//! How rosrescue stops, and what it keeps running until then. Signals stop it cleanly even if another process hangs.
+//! Nothing is left behind, and no call gets a false answer.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -86,7 +86,7 @@ fn a_second_signal_ends_at_once() {
         // A rosout that stops slowly must not give rosrescue time to replace the hung master.
         let mut robot = Robot::start_with(Mode::Core, &["--probe-count", "1000"]);
         let master = robot.master_pid();
-        // A clean stop has to wait for this one.
+        // A clean stop must wait for the hung master.
         crate::support::stop(master);
         robot.rescue.signal(Signal::TERM);
         // The first signal has been handled. Two pending signals may be merged into one.
@@ -102,7 +102,7 @@ fn a_second_signal_ends_at_once() {
     }
 }
 
-/// Runs its arguments in a terminal of its own, closes the terminal once calls pass, and exits with their status.
+/// Runs its arguments in a new terminal, closes the terminal once calls pass, and exits with their status.
 const IN_A_TERMINAL: &str = r#"
 import os, pty, sys
 pid, terminal = pty.fork()
@@ -168,7 +168,7 @@ fn a_core_keeps_rosout_alive() {
     eventually("another rosout runs", || {
         rosout(&robot).is_some_and(|pid| pid != old)
     });
-    eventually("it is registered", || {
+    eventually("the new rosout is registered", || {
         let now = robot.settled_state();
         now.publishers == before.publishers
             && now.subscribers == before.subscribers
@@ -176,10 +176,10 @@ fn a_core_keeps_rosout_alive() {
     });
 }
 
-/// A rosout that ends at once, for example without its libraries, is started after growing pauses. The log has its last
-/// output.
+/// A rosout that ends at once, for example because its libraries are missing, is started again after growing pauses.
+/// The log has its last output.
 #[test]
-fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
+fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
     let scratch = Scratch::new();
     let folder = scratch.path("bin");
     fs::create_dir(&folder).unwrap();
@@ -200,7 +200,7 @@ fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
         lines.filter(|line| line.contains("started rosout")).count()
     };
     let (first, start) = (starts(&rescue), Instant::now());
-    eventually("it is started three times more", || {
+    eventually("rosout is started three more times", || {
         starts(&rescue) >= first + 3
     });
     // The pauses are 1, 2 and 4 seconds.

@@ -140,7 +140,7 @@ fn get_uri_returns_the_address_of_rosrescue() {
         !format!("{response:?}").contains(&twins.behind.uri()),
         "{response:?}"
     );
-    // What is wrong with a call is for the master to say.
+    // The master reports errors in the parameters of a call.
     twins.same_call("getUri", params![]);
     twins.same_call("getUri", params!["/c", 1]);
 }

@@ -49,7 +49,7 @@ fn bytes_that_are_not_http_are_refused_and_other_clients_served() {
     for bytes in &cases {
         let mut wire = client.connect().unwrap();
         wire.set_patience(PATIENCE);
-        // It may be refused before it has been read completely.
+        // rosrescue may refuse a request before it has read all of it.
         let _ = wire.send(bytes);
         let _ = wire.finish();
         if let Ok(response) = wire.response() {
@@ -102,7 +102,7 @@ fn malicious_xml_is_refused_and_other_clients_are_served() {
     for body in bodies {
         let mut wire = client.connect().unwrap();
         let _ = wire.send(&http_request(body.as_bytes()));
-        // The master's own answer, whatever it is, or the end of the connection.
+        // The client gets the master's own answer, whatever it is, or the connection ends.
         let _ = wire.response();
         assert_eq!(client.param("/kept"), Some(1.into()), "{:.60}", body);
     }
@@ -176,8 +176,8 @@ fn a_body_that_is_only_announced_takes_no_memory_from_others() {
     }
 }
 
-/// There is room for four bodies of the largest size. When there are more, and each one has been half sent,
-/// they must not wait for each other forever.
+/// Memory has room for four bodies of the largest size. When more bodies have each been half sent, they must not wait
+/// for each other forever.
 #[test]
 fn more_large_bodies_than_fit_into_memory_are_accepted_in_turn() {
     let robot = Robot::start_with(Mode::Proxy, &["--max-body", "1"]);
@@ -199,7 +199,7 @@ fn more_large_bodies_than_fit_into_memory_are_accepted_in_turn() {
                 let mut wire = client.connect().unwrap();
                 let (first, second) = request.split_at(request.len() / 2);
                 wire.send(first).unwrap();
-                // By now each of them has sent one half.
+                // Each client has sent one half of its body by now.
                 halves.wait();
                 wire.send(second).unwrap();
                 assert_eq!(wire.response().unwrap().code, 200);
@@ -406,7 +406,7 @@ fn no_other_computer_can_shut_the_master_down() {
     }
     assert_eq!(elsewhere.param("/far"), Some(1.into()));
     assert_eq!(here.master_pid(), Some(master));
-    // From its own computer it may have any form.
+    // A call from the same computer may have any form.
     here.exchange(&requests[8]).unwrap();
     eventually(
         "the master has been shut down, and there is another",

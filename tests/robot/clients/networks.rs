@@ -1,4 +1,4 @@
-//! `--allow` and `--allow-write`: who may make calls, and who may change anything, over IPv4 and IPv6.
+//! `--allow` and `--allow-write` decide which hosts may make calls and which may change anything, over IPv4 and IPv6.
 
 use std::process::Command;
 
@@ -31,7 +31,7 @@ const NOTHING: &str = "403 403 403 403 403 403 403";
 const READS: &str = "200 200 403 200 403 403 403";
 const ALL: &str = "200 200 200 200 200 200 200";
 
-/// The statuses that `host` of the other computer gets.
+/// The statuses of the answers to the requests from `far`, an address of the other computer.
 #[track_caller]
 fn asked(scratch: &Scratch, net: &Netns, near: &str, port: u16, far: &str) -> String {
     let mut ask = Command::new("/usr/bin/python3");
@@ -61,7 +61,7 @@ fn allow_and_allow_write_decide_who_may_call_and_who_may_change() {
         ])
         .start();
     let port = rescue.port();
-    // This computer, under each of its addresses.
+    // All requests from this computer are allowed, under each of its addresses.
     for host in [
         "127.0.0.1",
         "[::1]",
@@ -79,7 +79,7 @@ fn allow_and_allow_write_decide_who_may_call_and_who_may_change() {
         assert_eq!(found, expected, "{}", net.far6(host));
     }
     assert_eq!(rescue.client().param("/there"), Some(1.into()));
-    // One request of those who may change is refused by another rule.
+    // One of the requests from hosts that may change anything is refused by another rule.
     let refused = 2 * 7 + 3 * 4 + 2;
     assert_eq!(
         status(&rescue.client())["counters"]["requests_refused"],
@@ -119,7 +119,7 @@ fn refused_nodes_continue_as_soon_as_they_are_allowed() {
     let mut rescue = core("192.0.2.0/24");
     let nodes = [Library::Rospy, Library::Roscpp].map(|library| {
         let mut command = library.command(&scratch, port, "talker");
-        // Another node of the same name would shut it down.
+        // A second node of the same name would shut the first one down.
         command.arg(format!("__name:={library:?}"));
         command.env("ROS_MASTER_URI", Client::at(&net.near(), port).uri());
         command.env("ROS_IP", net.far(2));

@@ -10,7 +10,7 @@ const WRITERS: usize = 6;
 const READERS: usize = 4;
 const ROUNDS: i32 = 300;
 
-/// This holds for any connection and any size of the answer.
+/// This holds whichever connection makes the read, and for small and large answers.
 fn a_read_returns_every_acknowledged_write(mode: Mode) {
     let robot = Robot::start_with(mode, &["--reads", "mirror"]);
     for bytes in [10, 200_000] {
@@ -69,7 +69,7 @@ fn a_core_answers_reads_while_its_master_hangs() {
     let before = robot.counter("calls_from_mirror");
     crate::support::stop(robot.master_pid());
     assert_eq!(client.param("/gain"), Some(7.into()));
-    // rosout may read as well.
+    // rosout may make some of the reads.
     assert!(robot.counter("calls_from_mirror") > before);
 }
 

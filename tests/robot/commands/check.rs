@@ -41,7 +41,7 @@ impl Found {
             .collect()
     }
 
-    /// Asserts that this is the only problem, with these words.
+    /// Asserts that the only problem is about `subject` and contains `words`.
     #[track_caller]
     fn assert_problem(&self, subject: &str, words: &str) {
         let problems = self.of("problem");
@@ -101,7 +101,7 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let found = Found::by(&mut check(&scratch, port));
     let who = format!("rosmaster (process {}, port {port})", master.pid());
     found.assert_problem("port", &who);
-    // In front of that master there is no problem. In front of itself there is one.
+    // With this rosmaster as `--master` the check finds no problem. With rosrescue as `--master` it finds one.
     let uri = format!("http://127.0.0.1:{port}");
     let free = free_port();
     let found = Found::by(check(&scratch, free).args(["--master", &uri]));
@@ -153,7 +153,7 @@ fn a_launch_file_that_names_another_master_is_found() {
     fs::create_dir_all(launch.parent().unwrap()).unwrap();
     let port = free_port();
     let env = |uri: &str| format!("<env name=\"ROS_MASTER_URI\" value=\"{uri}\"/>\n");
-    // The first one is another form of the robot's own address.
+    // The first `env` names the robot's own master in another form.
     let own = env(&format!("http://localhost:{port}/"));
     let text = format!(
         "<launch>\n{own}{}</launch>\n",
@@ -187,7 +187,7 @@ fn a_node_of_another_master_is_found() {
 }
 
 #[test]
-fn something_else_at_the_port() {
+fn another_program_at_the_port_is_found() {
     let scratch = Scratch::new();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -204,7 +204,7 @@ fn something_else_at_the_port() {
 }
 
 #[test]
-fn traps_in_the_environment() {
+fn wrong_environment_variables_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     for (key, value, subject, words) in [
@@ -289,7 +289,7 @@ fn traps_in_the_environment() {
 }
 
 #[test]
-fn no_rosmaster_no_descriptors_and_no_permission() {
+fn missing_rosmaster_descriptors_and_permissions_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     let found = Found::by(check(&scratch, port).env("PATH", "/nowhere"));
@@ -306,7 +306,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
     few.args(["-c", r#"ulimit -n 100; exec "$0" "$@""#]);
     let found = Found::by(&mut behind(few, &check(&scratch, port)));
     found.assert_problem("descriptors", "100 open files");
-    // A user who may not write there.
+    // A user who may not write to the checkpoint's folder.
     let mut nobody = Command::new("setpriv");
     nobody.args([
         "--reuid",
@@ -340,7 +340,7 @@ fn open_to_all(folder: &std::path::Path) {
 
 /// On Debian the computer's own name resolves to 127.0.1.1. A roscore also starts at boot.
 #[test]
-fn the_hosts_file_and_the_units_of_this_computer() {
+fn problems_in_the_hosts_file_and_units_are_found() {
     let scratch = Scratch::new();
     let port = free_port();
     let hosts = scratch.path("hosts");

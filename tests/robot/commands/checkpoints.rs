@@ -59,7 +59,7 @@ fn a_checkpoint_is_inspected_beside_the_running_rosrescue() {
 }
 
 #[test]
-fn what_differs_is_said_in_words() {
+fn diff_describes_differences_in_words() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let client = robot.client();
     client.set_param("/a", tree! { "b" => 1, "gone" => "x" });
@@ -232,9 +232,9 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
     assert_eq!(run(&["params", &torn]).ended(0), "\"one\": 1\n\"two\": 2");
 }
 
-/// Names come from the network.
+/// Names come from the network and may contain control characters.
 #[test]
-fn no_name_commands_the_terminal() {
+fn control_characters_in_names_are_not_printed() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     robot.client().set_param("/red\u{9b}31m", 1);
     let path = robot.rescue.checkpoint();

@@ -47,7 +47,7 @@ fn assert_passed(verdict: &Value) {
     }
 }
 
-/// Asserts that the drill failed, with these words.
+/// Asserts that the drill failed and that a failure contains `words`.
 #[track_caller]
 fn assert_failed(verdict: &Value, words: &str) {
     assert_eq!(verdict["passed"], false, "{verdict:#}");
@@ -118,7 +118,7 @@ fn a_master_is_killed_and_nobody_notices() {
 }
 
 #[test]
-fn the_worker_and_both_at_once() {
+fn a_drill_kills_the_worker_or_both_at_once() {
     let scratch = Scratch::new();
     let rescue = Setup::core(&scratch, free_port()).guarded().start();
     let mut talker = Node::start(
@@ -165,7 +165,7 @@ fn a_master_that_hangs_is_left_alive_by_a_proxy() {
 }
 
 #[test]
-fn only_watching() {
+fn a_drill_without_kills_only_watches() {
     let robot = Robot::start(Mode::Core);
     let _nodes = talkers(&robot);
     let master = robot.master_pid();
@@ -208,7 +208,7 @@ fn it_fails_when_the_master_is_not_restarted() {
 }
 
 #[test]
-fn it_fails_when_the_state_is_not_the_same_but_not_for_what_nodes_change() {
+fn it_fails_when_the_state_differs_except_for_changes_by_nodes() {
     let robot = Robot::start(Mode::Core);
     let client = robot.client();
     client.set_param("/robot/wheels", 4);
@@ -261,7 +261,7 @@ fn an_interrupted_drill_leaves_nothing_behind() {
 }
 
 #[test]
-fn nothing_is_killed_without_consent_or_understanding() {
+fn nothing_is_killed_without_consent_or_with_wrong_options() {
     let robot = Robot::start(Mode::Core);
     let refused = |options: &[&str], status, words: &str| {
         let mut drill = drill(&robot.scratch, robot.port(), options);
@@ -286,7 +286,7 @@ fn nothing_is_killed_without_consent_or_understanding() {
 
 /// At a terminal the drill asks first.
 #[test]
-fn a_person_is_asked() {
+fn a_user_at_a_terminal_is_asked_first() {
     let robot = Robot::start(Mode::Core);
     let master = robot.master_pid();
     let ask = |answer: &str| {

@@ -17,11 +17,12 @@ struct Story {
     status: Json,
     /// The answer to the request.
     answer: Reply,
-    /// The leader and its term after so many status requests since the handover request. Until then there is none.
+    /// The leader and its term after this many status requests since the handover request. There is no leader before
+    /// that.
     next: Option<(usize, &'static str, u64)>,
 }
 
-/// Serves `story` at a port of its own until the end of the test program.
+/// Serves `story` at a free port until the end of the test program.
 fn tell(story: Story) -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -185,7 +186,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
 }
 
 #[test]
-fn one_computer_hands_over_to_nobody() {
+fn a_single_computer_cannot_hand_over() {
     let robot = Robot::start(Mode::Core);
     let alone = Tool::rosrescue(&robot.scratch, robot.port(), &["handover"]);
     assert!(alone.stderr.contains("runs without --cluster"), "{alone:?}");

@@ -40,7 +40,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     // A user with another home folder, as a service has, gets the same answer.
     let elsewhere = Tool::rosrescue(&Scratch::new(), robot.port(), &["history", "--json"]);
     assert_eq!(elsewhere.json(0)["kept"].as_array().unwrap().len(), 6);
-    // By name, and by number.
+    // Checkpoints can be given by name and by number.
     let run = |robot: &Robot, arguments: &[&str]| {
         Tool::rosrescue(&robot.scratch, robot.port(), arguments).ended(0)
     };
@@ -97,7 +97,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
 }
 
 #[test]
-fn a_history_of_no_space_is_the_last_session() {
+fn a_history_without_space_keeps_only_the_last_session() {
     let options = ["--no-rosout", "--restore", "never", "--history", "0"];
     let mut robot = Robot::start_with(Mode::Core, &options);
     for session in 1..=2 {
@@ -114,7 +114,7 @@ fn a_history_of_no_space_is_the_last_session() {
 fn a_rescue_that_would_not_fit_is_not_kept() {
     let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--history", "1"]);
     robot.client().set_param("/large", "x".repeat(2 << 20));
-    // The next generation has it in its snapshot.
+    // The next generation has the large parameter in its snapshot.
     assert!(robot.rescue.terminate().success());
     robot.rescue.start_again();
     robot.rescue.wait_serving();

@@ -21,8 +21,8 @@ fn a_link_that_was_broken_is_found_and_named() {
         let words = [&["check", "--live"], more].concat();
         Tool::rosrescue(&robot.scratch, robot.port(), &words)
     };
-    // Four connections of /chatter, and those of /rosout.
-    eventually("all links are there", || {
+    // There are four connections of /chatter, and those of /rosout.
+    eventually("all links are made", || {
         let checked = check(&[]);
         checked.exit() == 0 && checked.stdout.ends_with("No problems found.")
     });
@@ -52,7 +52,7 @@ fn a_link_that_was_broken_is_found_and_named() {
         "{checked}"
     );
     tell(vec![api("/talker_py"), api("/talker_cpp")]);
-    eventually("the link is there again", || check(&[]).exit() == 0);
+    eventually("the link is made again", || check(&[]).exit() == 0);
 
     // A node without an answer is not reported as a missing connection.
     stop(nodes[0].pid());

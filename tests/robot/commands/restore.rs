@@ -40,7 +40,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
         assert!(text.lines().any(|found| found == line), "{line}\n{text}");
     }
     assert_eq!(client.param("/gains/p"), Some(3.0.into()));
-    // Without a terminal it cannot ask.
+    // `restore` asks before it changes anything. Without a terminal it cannot.
     let refused = run(&robot, &["restore", "session-1"]);
     assert!(refused.stderr.contains("--yes"), "{refused:?}");
     refused.ended(2);
@@ -54,13 +54,13 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert_eq!(client.param("/wifi/password"), Some("geheim".into()));
     assert_eq!(client.param("/extra"), Some(true.into()));
     assert_eq!(client.param("/run_id"), run_id);
-    eventually("the watcher is told", || {
+    eventually("the watcher is notified", || {
         let heard = watcher.heard("paramUpdate");
         heard
             .iter()
             .any(|update| update[1..] == params!["/gains/i/", 2])
     });
-    // The real master has the value as well.
+    // The real master also has the value.
     assert_eq!(robot.bare().param("/gains/i"), Some(Value::from(2)));
 
     let json = run(

@@ -129,7 +129,7 @@ fn a_newer_rosrescue_is_reported_as_newer() {
     );
 }
 
-/// There was never a master. Nodes wait, and the status says so.
+/// There has never been a master, so nodes wait. The status says so.
 #[test]
 fn it_says_that_nodes_wait_for_a_first_master() {
     let scratch = Scratch::new();

@@ -97,7 +97,7 @@ fn without_a_terminal_it_prints_blocks_or_json_lines() {
 }
 
 #[test]
-fn a_rosrescue_that_goes_away_is_waited_for() {
+fn it_waits_for_a_rosrescue_that_goes_away() {
     let mut robot = Robot::start(Mode::Proxy);
     let port = robot.port();
     let mut top = Process::start(
@@ -106,7 +106,7 @@ fn a_rosrescue_that_goes_away_is_waited_for() {
     );
     eventually("a first line", || !top.stdout().is_empty());
     robot.rescue.kill();
-    top.wait_line("that nobody is there", |line| {
+    top.wait_line("that no rosrescue answers", |line| {
         line.contains("no rosrescue at ")
     });
     let before = top.stdout().len();

@@ -7,7 +7,7 @@ use crate::support::{
 };
 
 #[test]
-fn it_waits_for_what_is_not_there_yet() {
+fn it_waits_until_its_conditions_hold() {
     let scratch = Scratch::new();
     let (master_port, rescue) = {
         let port = free_port();
@@ -63,7 +63,7 @@ fn it_ends_in_time_and_says_what_is_missing() {
 
 /// While the mirror stands in, calls are answered although there is no master.
 #[test]
-fn answers_are_not_a_master() {
+fn an_answer_of_the_mirror_does_not_count_as_a_master() {
     let mut robot = Robot::start(Mode::Proxy);
     robot.take_master_away();
     let exit = |what: &str| {

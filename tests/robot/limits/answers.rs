@@ -36,7 +36,7 @@ fn large_answers_that_are_not_read_take_limited_memory_and_delay_no_other(mode: 
     };
     let start = Instant::now();
     let wires: Vec<Wire> = (0..CLIENTS).map(ask).collect();
-    // Beside them: a small call, and the same large answer for a client that reads it.
+    // During this load, other clients make a small call and read a large answer.
     let read = || {
         let start = Instant::now();
         assert_eq!(client.param("/small"), Some(1.into()));

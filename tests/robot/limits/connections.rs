@@ -94,7 +94,7 @@ print(master.setParam('/c', '/x', 2))
     assert_eq!(robot.bare().param("/x"), Some(2.into()));
 }
 
-/// With the default limit of connections.
+/// This uses the default limit of connections.
 #[test]
 fn two_thousand_idle_connections_take_little_memory() {
     let robot = Robot::start(Mode::Proxy);
@@ -142,7 +142,7 @@ fn with_few_file_descriptors_calls_are_served_and_recorded_beside_idle_connectio
         // The master dies in the meantime.
         let dead = client.master_pid().unwrap();
         signal(dead, Signal::KILL);
-        eventually("another master is there", || {
+        eventually("another master answers", || {
             client.master_pid().is_some_and(|pid| pid != dead)
                 && client.ask("setParam", params!["/c", "/y", 2]).is_some()
         });
@@ -199,9 +199,12 @@ fn without_free_connections_or_file_descriptors_rosrescue_waits_without_busy_loo
             .filter(|line| line.contains("cannot accept"))
             .count()
     };
-    eventually("the log reports it", || says() > 0);
+    eventually(
+        "the log reports that connections cannot be accepted",
+        || says() > 0,
+    );
     assert_calm(&rescue, Duration::from_secs(2));
-    assert!(says() <= 2, "it must be logged once per address");
+    assert!(says() <= 2, "the error must be logged once per address");
     limit(Some(1000));
     client.set_param("/x", 3);
     drop(wires);

@@ -9,7 +9,7 @@ const PARAMS: usize = 2_000;
 /// Maximum memory use at any time, in KiB.
 const LIMIT: u64 = 64 << 10;
 
-/// One server that answers for all nodes: they count as alive, but do not say what they publish.
+/// A server that answers for all nodes: they count as alive, but report no publications.
 fn nodes_server() -> FakeMaster {
     FakeMaster::start(|body| {
         let call = decode_call(body).expect("a call");
@@ -43,7 +43,7 @@ fn a_thousand_nodes_take_less_than_64_mib_through_three_recoveries() {
     let mut robot = Robot::start(Mode::Core);
     let client = robot.client();
     register(&client, server.port());
-    // The maximum so far.
+    // The maximum memory use so far.
     let peak = |robot: &Robot| robot.rescue.kib("VmHWM");
     let mut peaks = vec![peak(&robot)];
     for _ in 0..3 {
@@ -56,7 +56,7 @@ fn a_thousand_nodes_take_less_than_64_mib_through_three_recoveries() {
         let (report, state) = (&status["last_recovery"], &status["state"]);
         assert_eq!(report["outcome"], "injected");
         assert_eq!(report["removed"].as_array().map(Vec::len), Some(0));
-        // rosout is one more node, with one of each.
+        // rosout is one more node, with one publisher and one subscriber.
         for (what, count) in [("nodes", NODES), ("publishers", 2 * NODES)] {
             assert_eq!(state[what].as_u64(), Some(count as u64 + 1), "{what}");
         }

@@ -54,7 +54,7 @@ impl Host {
         connections.iter().filter(|at| **at >= start).count()
     }
 
-    /// Registers `count` names, each with an address of its own. They use the ports in turn.
+    /// Registers `count` names, each with a different address. The ports are used in turn.
     fn register(&self, client: &Client, count: usize) {
         let call = |(name, port): (usize, &u16)| {
             let api = format!("http://127.0.0.1:{port}/{name}/");
@@ -77,8 +77,8 @@ impl Drop for Host {
     }
 }
 
-/// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the number of
-/// connections before that, and for each of `windows` the number within so many seconds after the recovery.
+/// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the number of connections
+/// before that, and for each of `windows` the number within that many seconds after the recovery.
 fn connections<const N: usize>(
     robot: &mut Robot,
     host: &Host,

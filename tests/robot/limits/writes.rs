@@ -23,7 +23,7 @@ fn results(client: &Client, calls: impl IntoIterator<Item = Call>) -> Vec<Value>
     }
 }
 
-/// How long each `setParam` takes while `load` runs, and how long `load` takes.
+/// The times that each `setParam` takes while `load` runs, and the time that `load` takes.
 fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, Duration) {
     thread::scope(|scope| {
         let start = Instant::now();
@@ -156,7 +156,10 @@ fn other_writes_are_not_delayed_by_calls_that_only_the_master_understands() {
             }
         });
     });
-    println!("{} writes in {time:?}, {alone:?} each alone", waits.len());
+    println!(
+        "{} writes in {time:?}; without load {alone:?} each",
+        waits.len()
+    );
     let possible = time.as_secs_f64() / alone.as_secs_f64();
     assert!(waits.len() as f64 > possible / 16.0, "{possible} alone");
     for number in 0..CALLS {

@@ -73,7 +73,7 @@ fn a_master_that_other_computers_can_reach_is_reported() {
         command.env_remove("ROS_IP");
     });
     let rescue = Setup::proxy(&scratch, master.port).start();
-    eventually("the status reports it", || {
+    eventually("the status reports the open master", || {
         status(&rescue.client())["master_is_open"] == true
     });
     let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(0);

@@ -61,7 +61,7 @@ impl Robot {
         }
     }
 
-    /// Makes masters die for the reasons in `lines`, starting with the next one, which starts now.
+    /// Makes masters die for the reasons in `lines`, beginning with the next one, and kills the present one.
     fn fail_with(&self, lines: &str) {
         self.failures.set(lines);
         self.kill_master();
@@ -113,8 +113,8 @@ impl Robot {
         heard()
     }
 
-    /// Panics if a master has called a node after it had `heard` so many calls, or if rosrescue has told a
-    /// node anything but the present state, which has not changed.
+    /// Panics if a master has called a node after its first `heard` calls, or if rosrescue has sent a node anything but
+    /// the present state, which has not changed.
     #[track_caller]
     fn assert_no_node_disturbed(&self, heard: &[usize]) {
         for (node, heard) in self.nodes.iter().zip(heard) {
@@ -133,7 +133,7 @@ impl Robot {
     }
 }
 
-/// Whether the call is a question of the health check.
+/// Whether the call belongs to the health check.
 fn is_question(call: &Heard) -> bool {
     ["getPid", "getPublications", "getSubscriptions"].contains(&call.method.as_str())
 }
@@ -198,8 +198,8 @@ fn calls_are_answered_while_every_master_dies_after_two_seconds() {
         assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
         thread::sleep(Duration::from_millis(20));
     }
-    // Only calls that just a master understands are affected: during the longer pauses they are held for as
-    // long as they should be, and never answered wrongly.
+    // Only calls that the mirror does not understand are affected: during the longer pauses they are held until their
+    // time limit, and never answered wrongly.
     eventually("a held call ends after its time limit", || {
         let start = Instant::now();
         let given_back = client.exchange(&unreadable("/late", 0)).is_err();
@@ -233,7 +233,7 @@ fn a_master_that_hangs_during_the_injection_is_replaced() {
     robot.await_state(&robot.before, "after a hang");
 }
 
-/// This record kills every master that gets it. No node notices, until a client removes it.
+/// One record kills every master that gets it. No node notices this, and it ends when a client removes the record.
 #[test]
 fn a_record_that_kills_masters_causes_no_outage() {
     for name in ["/robot/arm/gain", "/topic0"] {

@@ -33,7 +33,7 @@ fn an_unexpected_refusal_by_the_master_corrects_the_mirror() {
     let client = robot.client();
     client.set_param("/a", 1);
     client.set_param("/b", 2);
-    // Deleted directly at the master: one parameter that the client will ask for, and another one.
+    // Two parameters are deleted directly at the master: one that the client then deletes too, and another one.
     for key in ["/a", "/b"] {
         robot.bare().ok("deleteParam", params!["/x", key]);
     }
@@ -126,7 +126,7 @@ fn a_node_that_bypassed_the_proxy_is_known_once_a_client_lists_the_nodes() {
     wanted.assert_same(&State::read(&client), "without a master");
 }
 
-/// A write is answered as done if the master did it, even though the connection ended before the reply.
+/// A write is answered as done if the master ran it, even if the connection ended before the reply.
 #[test]
 fn a_write_whose_reply_was_lost_is_answered_as_done() {
     let scratch = Scratch::new();
@@ -168,7 +168,7 @@ fn a_write_whose_reply_was_lost_is_answered_as_done() {
     state.assert_same(&State::read(&client), "through rosrescue");
 }
 
-/// The recovery counts as successful nevertheless, and nodes that died during the outage are unregistered.
+/// The recovery counts as successful although a reply was lost, and nodes that died during the outage are unregistered.
 #[test]
 fn an_injection_whose_reply_was_lost_counts_as_a_recovery() {
     let scratch = Scratch::new();

@@ -22,7 +22,7 @@ const PROBES: [&str; 6] = [
     "--probe-count",
     "2",
 ];
-/// Those three seconds, and more for a busy computer. TCP's own limits are longer.
+/// The time limit of three seconds, with a reserve for a busy computer. TCP's own limits are longer.
 const SILENCE: Duration = Duration::from_secs(10);
 const SOON: Duration = Duration::from_secs(4);
 
@@ -91,7 +91,7 @@ fn the_mirror_stands_in_while_the_link_is_cut_and_writes_pass_as_soon_as_it_is_b
     }
 }
 
-/// All existing connections are dead, and new ones work.
+/// All existing connections die without notice; new connections work.
 #[test]
 fn a_change_of_our_own_address_causes_one_short_delay() {
     let net = Netns::new();
@@ -124,7 +124,7 @@ fn a_change_of_our_own_address_causes_one_short_delay() {
     }
 }
 
-/// The master's name is looked up for each connection. If that fails, the last known address must do.
+/// rosrescue looks the master's name up for each connection. If that fails, it uses the last known address.
 #[test]
 fn a_failing_name_server_does_not_disconnect_the_master() {
     let net = Netns::new();
@@ -145,7 +145,7 @@ fn a_failing_name_server_does_not_disconnect_the_master() {
         is_open(&client)
     };
     assert!(holds(Duration::from_secs(5), all_is_well));
-    // Nor does it prevent a recovery at the same address.
+    // A failing name server does not prevent a recovery at the same address either.
     master.kill();
     let (_master, far) = rosmaster(&scratch, &net, port);
     eventually("the master is restored", || {

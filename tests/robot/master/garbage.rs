@@ -1,6 +1,5 @@
-//! A master that answers garbage. If the answer is HTTP, the client gets the master's own bytes. A master
-//! whose answer is not HTTP, or is incomplete, counts as away: the mirror answers, and the next working
-//! master is given those writes.
+//! A master that answers garbage. If the answer is HTTP, the client gets the master's own bytes. A master whose answer
+//! is not HTTP, or is incomplete, counts as away: the mirror answers, and the next working master gets those writes.
 
 use std::fs;
 use std::sync::{Arc, Mutex};
@@ -11,7 +10,7 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
-/// A real master, except that calls which mention a certain word get a given answer.
+/// A real master behind a fake that gives a fixed answer to calls with a certain word.
 struct Garbled {
     // Fields are dropped in this order.
     rescue: Rescue,
@@ -22,7 +21,8 @@ struct Garbled {
 }
 
 impl Garbled {
-    /// Starts a master that gives `answer` to calls which mention `/garbled`. `reads` says whether the mirror or the master answers reads.
+    /// Starts a master that gives `answer` to calls with `/garbled`. `reads` says whether the mirror or the master
+    /// answers reads.
     fn start(answer: Vec<u8>, reads: &str) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);
@@ -41,8 +41,8 @@ impl Garbled {
         });
         let rescue = Setup::proxy(&scratch, fake.port())
             .args(["--hold", "2", "--probe-interval", "100", "--reads", reads])
-            // Writes and probes may take long on a busy computer. The mirror must not answer them then, because this
-            // master could never be given its answers.
+            // Writes and probes may take long on a busy computer. The mirror must not answer meanwhile, because this
+            // master could never get those writes.
             .args(["--probe-timeout", "30000", "--stand-in-after", "30000"])
             .start();
         Self {
@@ -59,7 +59,7 @@ impl Garbled {
         *self.answer.lock().unwrap() = (word, answer.to_vec());
     }
 
-    /// Checks that other calls are served, and that nothing is recorded as a success which was none.
+    /// Checks that other calls are served, and that no failed call was recorded as a success.
     fn assert_sound(&self, case: &str, round: i32) {
         let client = self.rescue.client();
         eventually("other calls pass", || {
@@ -125,7 +125,7 @@ fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
                 </param></params></methodResponse>";
     let number = "<methodResponse><params><param><value><int>1</int></value></param></params>\
                   </methodResponse>";
-    // What the master answers, and the status and body that the client must get.
+    // The master's answers, each with the status and body that the client must get.
     let cases = [
         whole("200 OK", b""),
         whole("200 OK", b"not xml"),
@@ -149,7 +149,7 @@ fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
             }
             let case = format!("case {number}, {method}");
             let request = http_request(&encode_call(method, params.clone()));
-            // Behind a late master the mirror answers a write that changes nothing as soon as a read.
+            // If the master is late, the mirror may answer a read, or a write that changes nothing.
             let response = eventually_some(&case, || {
                 let response = client.exchange(&request).expect(&case);
                 (response.code == code && response.body == body).then_some(response)
@@ -173,8 +173,8 @@ fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
     assert_eq!(status(&client)["state"]["params"], 1);
 }
 
-/// It is also not forgotten when other calls pass in the meantime. Until it succeeds, the master answers
-/// reads itself.
+/// The repetition is not forgotten when other calls pass in the meantime. Until it succeeds, the master answers reads
+/// itself.
 #[test]
 fn reading_the_masters_state_is_repeated_until_it_succeeds() {
     let garbled = Garbled::start(Vec::new(), "mirror");
@@ -197,8 +197,7 @@ fn reading_the_masters_state_is_repeated_until_it_succeeds() {
     });
 }
 
-/// Each answer is byte for byte that of a healthy master, and is true as soon as this master is healthy
-/// again.
+/// Each answer has exactly the bytes of a healthy master, and is true as soon as this master is healthy again.
 #[test]
 fn a_master_whose_answers_are_not_http_counts_as_away() {
     let broken = |head: &str, body: &str| format!("{head}\r\n\r\n{body}").into_bytes();
@@ -251,7 +250,7 @@ fn a_master_whose_answers_are_not_http_counts_as_away() {
     garbled.rescue.assert_no_panic();
 }
 
-/// As from a master that is out of memory.
+/// A master that is out of memory behaves like this.
 #[test]
 fn a_master_that_answers_only_faults_for_a_while_counts_as_away() {
     let garbled = Garbled::start(Vec::new(), "master");

@@ -106,7 +106,7 @@ fn the_state_survives_deaths_and_a_hang_of_such_a_master(mode: Mode) {
     robot.await_recovery(dead);
     robot.await_state(&wanted, "after the master's death");
 
-    // The worker alone dies: the same master stays in use.
+    // Only the worker dies, so the same master stays in use.
     let pid = robot.master_pid();
     robot.rescue.kill();
     robot.rescue.start_again();
@@ -116,7 +116,7 @@ fn the_state_survives_deaths_and_a_hang_of_such_a_master(mode: Mode) {
     client.set_param("/gain", 3);
     let wanted = robot.state();
 
-    // Both die.
+    // The worker and the master die.
     robot.rescue.kill();
     robot.kill_master();
     robot.rescue.start_again();

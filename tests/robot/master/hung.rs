@@ -1,6 +1,5 @@
-//! A master that hangs, and one that is only slow. Probes find the hung one; the mirror stands in, `core`
-//! replaces it, `proxy` waits for it, and if it continues it is given everything that was written in the
-//! meantime. The slow one is left alone.
+//! A master that hangs, and one that is only slow. Probes find the hung one; the mirror stands in, `core` replaces it,
+//! and `proxy` waits for it. If it continues, it gets all writes that it missed. The slow one is left alone.
 
 use std::fs;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -25,7 +24,7 @@ const PROBES: [&str; 8] = [
     "2",
 ];
 
-/// The values of a parameter that a node was told, in order, and whether rosrescue told it.
+/// The values of a parameter in a node's notifications, in order, each with whether it came from rosrescue.
 fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
     let calls = node.calls().into_iter();
     let updates = calls.filter(|call| call.method == "paramUpdate");
@@ -38,8 +37,8 @@ fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
         .collect()
 }
 
-/// The gate shuts, the mirror answers and nodes are notified. When the same master continues, it is given
-/// everything that it missed, and it notifies no node of that.
+/// The gate shuts, the mirror answers and rosrescue notifies nodes. When the same master continues, it gets all writes
+/// that it missed, and does not notify nodes of them.
 #[test]
 fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     // Three seconds pass before the master counts as hung.
@@ -96,20 +95,20 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
         "except for the running calls",
     );
     let both = [node.api.clone(), coming.api.clone()];
-    eventually("the subscriber is told of the new publisher", || {
+    eventually("the subscriber knows the new publisher", || {
         watcher
             .updates("/topic")
             .last()
             .is_some_and(|it| *it == both)
     });
-    // The node need not be told outdated values.
-    eventually("the node is told of the last value", || {
+    // The node need not get outdated values.
+    eventually("the node gets the last value", || {
         told(&node, "/standing").last() == Some(&(3, true))
     });
     let heard = told(&node, "/standing");
     assert!(heard.is_sorted(), "{heard:?}");
-    // When the master counts as hung. Until then the master itself may tell the node.
-    eventually("the node is told of what was under way", || {
+    // This value comes when the master counts as hung. Until then the master itself may notify the node.
+    eventually("the node gets the value that was under way", || {
         told(&node, "/flying").contains(&(1, true))
     });
 
@@ -119,7 +118,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     assert_eq!(robot.counter("masters_restored"), injections + 1);
     after.assert_same(&robot.state(), "in the master that continues");
     after.assert_same(&State::read(&client), "through rosrescue");
-    // The node is never told an older value, and never a part of the publishers.
+    // The node never gets an older value or an incomplete list of publishers.
     assert!(holds(Duration::from_secs(1), || {
         let standing = told(&node, "/standing");
         standing.starts_with(&heard) && standing[heard.len()..].iter().all(|(value, _)| *value == 3)
@@ -133,7 +132,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     );
     // The master notifies the subscribers of its parameters as before.
     client.set_param("/standing", 4);
-    eventually("the node is told by the master", || {
+    eventually("the master notifies the node", || {
         told(&node, "/standing").contains(&(4, false))
     });
     for node in [&node, &watcher, &coming] {
@@ -198,18 +197,18 @@ fn ten_hangs_under_writes_lose_nothing() {
         (writers.map(|it| it.join().unwrap()), shut)
     });
     assert_eq!(robot.master_pid(), pid, "the same master stays in use");
-    // Once after each hang that was noticed, however often the gate was shut for other reasons.
+    // The master was restored once after each hang that was noticed, however often the gate was shut for other reasons.
     assert!(robot.counter("masters_restored") >= injections + shut);
     for (key, written) in keys.into_iter().zip(written) {
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
-        // rosrescue leaves out outdated values. The last value may come from it before the master tells the
-        // value before that; then it is told again.
-        eventually("the last value that the node is told is the newest", || {
+        // rosrescue leaves out outdated values. The last value may come from rosrescue before the master sends the
+        // value before that; then it is sent again.
+        eventually("the node's last value is the newest", || {
             told(&watcher, key)
                 .last()
                 .is_some_and(|(value, _)| *value == written)
         });
-        // The master tells each value once and in order.
+        // The master sends each value once and in order.
         let told = told(&watcher, key);
         let by_master: Vec<_> = told.iter().filter(|(_, ours)| !ours).collect();
         assert!(by_master.is_sorted_by(|a, b| a.0 < b.0), "{key}: {told:?}");
@@ -219,8 +218,8 @@ fn ten_hangs_under_writes_lose_nothing() {
     assert_eq!(watcher.heard("shutdown"), Vec::<Vec<Value>>::new());
 }
 
-/// The call is under way in the master when that hangs, and the mirror answers it. If the hung master dies of
-/// it, the next one does not know the node either.
+/// The call is under way in the master when the master hangs, and the mirror answers the call. If the hung master dies,
+/// the next one does not know the node either.
 #[test]
 fn an_unregistration_under_way_in_a_hung_master_is_not_forgotten() {
     let mut robot = Robot::start_with(Mode::Proxy, &PROBES);
@@ -241,7 +240,7 @@ fn an_unregistration_under_way_in_a_hung_master_is_not_forgotten() {
     after.assert_same(&State::read(&client), "through rosrescue");
 }
 
-/// `core` notices, decides, kills and replaces. The streams of its nodes continue.
+/// `core` detects a hung master, kills it and starts another one. The streams of its nodes continue.
 #[test]
 fn a_core_replaces_a_hung_master_under_its_nodes() {
     let robot = Robot::start_with(Mode::Core, &PROBES);
@@ -282,7 +281,8 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
     talker.assert_no_link_lost();
 }
 
-/// Two seconds per call are no reason to end a master that has three, but twenty seconds are.
+/// A master that takes two seconds per call, with a time limit of three, is left alone. One that takes twenty seconds
+/// is replaced.
 #[test]
 fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
     let program = format!("{NODES}/slow_rosmaster.py");

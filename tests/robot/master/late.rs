@@ -1,5 +1,5 @@
-//! A master that does not answer for a while. Writers do not wait until it counts as hung, it is given the
-//! writes that it missed, and it is ended only if its process shows that it hangs.
+//! A master that does not answer for a while. Writers do not wait until it counts as hung, it gets the writes that it
+//! missed, and it is killed only if its process shows that it hangs.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
@@ -16,7 +16,7 @@ use rustix::process::Signal;
 /// With these options a master never counts as hung within a test.
 const NO_VERDICT: [&str; 4] = ["--stand-in-after", "100", "--probe-count", "1000"];
 
-/// The values of a parameter that a node was told, in order, and whether rosrescue told it.
+/// The values in a node's notifications, in order, each with whether it came from rosrescue.
 fn told(node: &FakeNode) -> Vec<(i32, bool)> {
     let calls = node.calls().into_iter();
     let updates = calls.filter(|call| call.method == "paramUpdate");
@@ -124,7 +124,7 @@ fn a_master_that_was_only_late_is_not_injected() {
     }
 }
 
-/// The master gets five percent of the processor time that it wants.
+/// The master gets five percent of the processor time that it needs.
 #[test]
 fn a_starved_master_is_not_killed() {
     let probes = [
@@ -175,7 +175,7 @@ fn a_starved_master_is_not_killed() {
     assert!(!alive(pid));
 }
 
-/// The master is busy for longer than it may take to listen.
+/// The master uses the processor for longer than `--start-limit` before it listens.
 #[test]
 fn a_master_that_starts_slowly_is_started_only_once() {
     let scratch = Scratch::new();

@@ -1,5 +1,5 @@
 //! A master that behaves like rosmaster 1.14.3 and earlier: it also notifies the node that has set a parameter itself.
-//! While it is away, rosrescue does the same.
+//! While there is no master, rosrescue does the same.
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
 use rosrescue::xmlrpc::Value;
@@ -21,7 +21,7 @@ fn a_node_that_sets_a_parameter_is_notified_as_by_the_old_master(mode: Mode) {
             values.any(|call| call.params[2] == Value::Int(value))
         };
         let is_told = |value| match is_old {
-            true => eventually("the node is told", || told(value)),
+            true => eventually("the node is notified", || told(value)),
             false => assert!(holds(Duration::from_millis(300), || !told(value))),
         };
         set(1);

@@ -1,5 +1,5 @@
-//! A master whose dictionaries have no order, as on Python 2. A different order is no divergence, and answers
-//! that show it are the master's own. While it is away, the mirror refuses what Python 2 refuses.
+//! A master whose dictionaries have no order, as on Python 2. A different order is no divergence, and answers in which
+//! the order is visible come from the master. While it is away, the mirror refuses the calls that Python 2 refuses.
 
 use std::time::Duration;
 

@@ -1,6 +1,5 @@
-//! The same master comes back, or an older one: after rosrescue was killed and started again, after a hang or
-//! a cut link, or after an address has moved. Everything that was acknowledged is then in the master and in
-//! the mirror.
+//! The same master comes back, or an older one: after rosrescue was killed and started again, after a hang or a cut
+//! link, or after an address has moved. The master and the mirror then have everything that was acknowledged.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -96,8 +95,7 @@ fn a_topic_type_changed_during_a_hang_is_given_to_the_master_afterwards() {
     });
 }
 
-/// A call of the killed rosrescue is still running in the master when the next rosrescue is given a newer
-/// value.
+/// A call of the killed rosrescue still runs in the master when the next rosrescue gets a newer value.
 #[test]
 fn a_newer_value_wins_over_a_long_call_of_a_killed_rosrescue() {
     const KEYS: i32 = 60_000;
@@ -136,8 +134,8 @@ fn a_newer_value_wins_over_a_long_call_of_a_killed_rosrescue() {
     }
 }
 
-/// One address with two masters in turn: the first one, an empty second one that is given the state and then
-/// changes, and the first one again with its old state.
+/// One address has two masters in turn: the first one, an empty second one that gets the state and then changes, and
+/// the first one again with its old state.
 #[test]
 fn the_old_state_of_a_superseded_master_is_not_adopted() {
     let scratch = Scratch::new();
@@ -173,7 +171,7 @@ fn the_old_state_of_a_superseded_master_is_not_adopted() {
     }
     for node in [&staying, &coming] {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
-        // Whatever the lists are, none lacks the publisher that stays.
+        // Each list contains the publisher that stays.
         let updates = node.updates("/topic");
         assert!(
             updates.iter().all(|uris| uris.contains(&staying.api)),
@@ -182,8 +180,8 @@ fn the_old_state_of_a_superseded_master_is_not_adopted() {
     }
 }
 
-/// Writes by others while rosrescue could not reach the master are kept, unless rosrescue has acknowledged
-/// something newer.
+/// Writes by others while rosrescue could not reach the master are kept, unless rosrescue has acknowledged a newer
+/// write.
 #[test]
 fn writes_that_bypassed_rosrescue_are_found_and_kept() {
     let scratch = Scratch::new();
@@ -223,7 +221,7 @@ fn writes_that_bypassed_rosrescue_are_found_and_kept() {
     assert_eq!(past_us.heard("shutdown"), Vec::<Vec<Value>>::new());
 }
 
-/// Number of rounds of the random test. `ROSRESCUE_RETURNS` asks for more.
+/// Number of rounds of the random test. `ROSRESCUE_RETURNS` changes it.
 fn rounds() -> u64 {
     let given = std::env::var("ROSRESCUE_RETURNS").ok();
     given.map_or(12, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
@@ -248,7 +246,7 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
     let rescue = Setup::proxy(&scratch, master.port).args(PROBES).start();
     let (client, bare, model) = (rescue.client(), master.client(), model.client());
     let nodes: Vec<_> = (0..4).map(|n| FakeNode::start(&format!("/n{n}"))).collect();
-    // If the nodes answered, their reports would count for more than the registrations made here.
+    // The nodes must not answer, because their reports would count for more than the registrations made here.
     nodes.iter().for_each(FakeNode::hold);
     let mut write = || {
         let node = &nodes[roll(nodes.len())];

@@ -1,4 +1,4 @@
-//! Another program takes the port of our rosmaster before that can listen. That program receives no call, and
+//! Another program takes the port of rosrescue's rosmaster before that can listen. The program receives no call, and
 //! rosmaster is started at another port at once.
 
 use std::fs;
@@ -81,7 +81,7 @@ fn another_program_at_the_port_of_our_master_receives_no_call() {
         client.master_pid().is_some_and(|pid| pid != dead)
             && crate::support::status(&client)["open"] == true
     });
-    // It must not wait for the 30 s that a rosmaster has for its start.
+    // rosrescue must not wait for the 30 s that a rosmaster has for its start.
     for took in [at_start, start.elapsed()] {
         assert!(took < Duration::from_secs(25), "{took:?}");
     }

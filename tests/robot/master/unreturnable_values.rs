@@ -1,5 +1,5 @@
-//! Values that a master accepts and that break its answers, or that XML changes on the way: rosrescue serves
-//! such a master, and knows everything else that it holds.
+//! Values that a master accepts and that break its answers, or that XML changes on the way. rosrescue serves such a
+//! master, and knows the rest of its state.
 
 use crate::support::{
     FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, http_request, params, tree,
@@ -39,8 +39,8 @@ fn broken_date() -> Value {
     Value::DateTime("a<b & ]]>".to_owned())
 }
 
-/// A value nested as deep as rosmaster can return it together with the whole tree, which is how it is read
-/// back, survives the death of the master. A deeper one is left out and named.
+/// A value of the largest depth that rosmaster can return together with the whole tree, which is how the state is read,
+/// survives the death of the master. A deeper value is left out and named.
 #[test]
 fn a_value_nested_as_deep_as_rosmaster_can_return_survives_its_death() {
     let in_array = |value| Value::Array(vec![value]);
@@ -103,8 +103,8 @@ fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
     });
 }
 
-/// While the master holds a value that it cannot return, none of its parameters can be read. rosrescue keeps
-/// those that it knows, and reports it.
+/// While the master holds a value that it cannot return, its parameters cannot be read. rosrescue keeps those that it
+/// knows, and reports this.
 #[test]
 fn parameters_that_the_master_cannot_return_are_kept_as_known() {
     let scratch = Scratch::new();
@@ -136,7 +136,7 @@ fn parameters_that_the_master_cannot_return_are_kept_as_known() {
     });
 }
 
-/// rosmaster accepts them, rosrescue cannot decode them, and no client can read them.
+/// rosmaster accepts unreadable parameters, rosrescue cannot decode them, and no client can read them.
 #[test]
 fn deleting_an_unreadable_parameter_causes_no_divergence() {
     let robot = Robot::start(Mode::Proxy);

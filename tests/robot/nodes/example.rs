@@ -1,5 +1,5 @@
-//! The example robot (`examples/robot`) lives through ten deaths of its master and three of rosrescue's
-//! worker, and none of its nodes notices.
+//! The nodes of the example robot (`examples/robot`) do not notice ten deaths of the master and three of rosrescue's
+//! worker.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -169,7 +169,7 @@ impl Example {
         state
     }
 
-    /// The process id of each node, by name.
+    /// The process ids of the nodes, by name.
     fn processes(&self) -> BTreeMap<String, u32> {
         let nodes = self.state().nodes.into_iter().map(|(name, api)| {
             let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
@@ -194,7 +194,7 @@ impl Example {
         self.witness.said("drive")
     }
 
-    /// How often the mission has set a parameter.
+    /// The number of times that the mission has set a parameter.
     fn arrivals(&self) -> usize {
         let drives = self.drives();
         let arrivals = drives.iter().filter(|drive| drive.starts_with("at "));
@@ -223,7 +223,7 @@ fn the_nodes_of_a_realistic_robot_do_not_notice_deaths_of_master_and_worker() {
     for (round, deaths) in DEATHS.into_iter().enumerate() {
         for death in 0..deaths {
             if death == 0 {
-                // A goal that is under way when the master dies.
+                // The master dies while the robot drives to a goal.
                 eventually("the robot drives", || {
                     robot
                         .drives()

@@ -12,7 +12,7 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// A small robot for the tools to look at.
+/// A small robot, which the tools examine.
 struct Cast {
     _talker: Node,
     _listener: Node,
@@ -42,7 +42,7 @@ impl Cast {
     }
 }
 
-/// Runs every tool once, in order. Returns its status and output.
+/// Runs each tool once, in order. Returns the status and output of each.
 fn session(scratch: &Scratch, port: u16) -> Vec<String> {
     let yaml = scratch.path("load.yaml");
     fs::write(
@@ -87,7 +87,7 @@ fn session(scratch: &Scratch, port: u16) -> Vec<String> {
     said
 }
 
-/// The text without everything that differs from run to run: ports, process ids, times, message numbers.
+/// The text without parts that differ from run to run: ports, process ids, times, message numbers.
 fn normalised(text: &str, scratch: &Scratch) -> String {
     let text = text.replace(scratch.path("").to_str().unwrap(), "SCRATCH/");
     let mut out = String::new();
@@ -144,7 +144,7 @@ fn tools_print_the_same_as_with_a_bare_master() {
     }
 }
 
-/// `rosnode cleanup` asks a question, so it runs with an answer on its input.
+/// `rosnode cleanup` asks before it removes nodes, so it gets an answer on its standard input.
 #[test]
 fn rosnode_cleanup_removes_a_dead_node_permanently() {
     let mut robot = Robot::start(Mode::Proxy);

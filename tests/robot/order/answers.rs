@@ -1,5 +1,5 @@
-//! A node has the answer to its own call before it is notified of anything later. These tests send raw
-//! requests: a call that changes something and a call that asks for it, within 2 ms of each other.
+//! A node gets the answer to its own call before any later notification. These tests send raw requests: a call that
+//! changes something and a call that asks for it, within 2 ms of each other.
 
 use std::collections::BTreeMap;
 use std::io::{self, BufReader, Write};
@@ -18,7 +18,7 @@ use crate::support::{
     read_request,
 };
 
-/// Maximum time between the two calls, in microseconds. One of these is chosen.
+/// Possible times between the two calls, in microseconds.
 const APART: [u64; 4] = [50, 200, 500, 2_000];
 /// How long each kind of pair is tried. Each pair takes some 5 to 20 ms.
 const TIME: Duration = Duration::from_millis(1_200);
@@ -28,7 +28,7 @@ const TYPE: &str = "std_msgs/String";
 /// `MSG_PEEK | MSG_DONTWAIT` of Linux: looks at what has arrived without waiting.
 const LOOK: i32 = 0x02 | 0x40;
 
-/// The subject about which one node asks and which another node changes.
+/// The subject that one node asks about and another node changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Subject {
     /// `registerSubscriber`, while a publisher registers.
@@ -120,7 +120,7 @@ fn no_notification_overtakes_an_answer(master: &Client) {
     );
 }
 
-/// Everything that has arrived at the node that asks.
+/// Everything that the asking node has received.
 #[derive(Debug, Default)]
 struct Inbox {
     /// The subject about which an answer is expected, and the connection of that answer. `None` after it has
@@ -175,7 +175,7 @@ fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
             // This must be read first, because the answer may arrive at any moment.
             let (early, at) = (held.is_early(), Instant::now());
             let call = xmlrpc::decode_call(&body).unwrap();
-            // While there is no master, a displaced node is asked which node it is.
+            // While there is no master, rosrescue asks a displaced node for its topics.
             let answer = match call.method.as_str() {
                 "getPublications" => Value::Array(Vec::new()),
                 "getSubscriptions" => {
@@ -209,10 +209,10 @@ fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
     });
 }
 
-/// A node has asked and was answered. The answer does not show the other node's change yet.
+/// An answer to a node that does not show the other node's change yet.
 struct Asked {
     subject: String,
-    /// When the answer arrived.
+    /// The time at which the answer arrived.
     arrived: Instant,
     text: String,
 }
@@ -301,7 +301,7 @@ impl Pair {
             }
             wire.send(request).unwrap();
         }
-        // The answer has arrived. It is read only after the inbox knows that.
+        // The answer has arrived. It is read only after the inbox knows this.
         self.asks.stream().peek(&mut [0]).unwrap();
         let arrived = Instant::now();
         lock(&self.inbox).waits = None;
@@ -314,7 +314,7 @@ impl Pair {
                 let node = params!["/test", asker];
                 self.master.ask("lookupNode", node) == Some(other.into())
             }
-            // If the answer already shows the change, there is nothing new to hear.
+            // If the answer already shows the change, no notification is expected.
             _ => answer != last,
         };
         let asked = is_news.then(|| Asked {
@@ -325,7 +325,8 @@ impl Pair {
                 arrived - begin
             ),
         });
-        // While there is no master, a displaced node is not told if by then another node is at its address.
+        // While there is no master, a displaced node is not told to shut down if another node is at its address by
+        // then.
         match (subject, &asked) {
             (Subject::Namesake, Some(asked)) => self.await_heard(asked),
             (Subject::Namesake, None) => {
@@ -343,7 +344,7 @@ impl Pair {
         });
     }
 
-    /// How long after each answer its node was notified of the change. `Err` if the notification came first.
+    /// The time from each answer to the notification of the change. `Err` if the notification came first.
     fn judge(&self, asked: Vec<Asked>) -> Vec<Result<Duration, String>> {
         let judge = |asked: Asked| {
             self.await_heard(&asked);

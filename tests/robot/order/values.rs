@@ -56,7 +56,7 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
             let (key, topic) = (key(writer), topic(writer));
             let value = master.param(&key).and_then(|value| value.as_int());
             eventually(
-                &format!("subscriber {number} hears the last value of {key}"),
+                &format!("subscriber {number} gets the last value of {key}"),
                 || {
                     let told = subscriber.told();
                     told.values
@@ -66,7 +66,7 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
                 },
             );
             eventually(
-                &format!("subscriber {number} hears the last publishers of {topic}"),
+                &format!("subscriber {number} gets the last publishers of {topic}"),
                 || {
                     // No process listens at the addresses of the writers, so a rescue's health check
                     // unregisters them, possibly while the state is read.
@@ -87,7 +87,7 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
         }
     }
     println!(
-        "{calls} calls, {told} values told, {} went back",
+        "{calls} calls, {told} notifications of values, {} went back",
         back.len()
     );
     assert!(

@@ -20,7 +20,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     let dead = robot.master_pid();
     robot.kill_master();
 
-    // roslaunch waits five seconds for getPid, and then starts a master of its own on this port.
+    // roslaunch waits five seconds for getPid, and then starts another master on this port.
     let start = Instant::now();
     assert_eq!(client.master_pid(), Some(dead));
     assert_eq!(
@@ -40,7 +40,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
         start.elapsed()
     );
 
-    // Calls that change something do not wait either.
+    // Calls that change the state do not wait either.
     let watcher = FakeNode::start("/watcher");
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     watcher.watch_param(&client, "/last");
@@ -54,12 +54,12 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
         "{:?}",
         setting.elapsed()
     );
-    eventually("the subscriber is told every value", || {
+    eventually("the subscriber gets every value", || {
         told(&watcher, "/last") == [0, 1, 2, 3, 4]
     });
     let coming = FakeNode::start("/coming");
     coming.publish(&client, "/topic", "std_msgs/String");
-    eventually("the subscriber is told of the publisher", || {
+    eventually("the subscriber knows the publisher", || {
         watcher.updates("/topic") == [[coming.api.as_str()]]
     });
     assert!(!robot.is_open(), "a master was there during the outage");
@@ -71,19 +71,19 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
     assert_eq!(robot.bare().param("/last"), Some(Value::Int(4)));
     assert!(
         !state.knows("/fake"),
-        "what was unregistered in the gap is back:\n{state}"
+        "a node that was unregistered during the outage is back:\n{state}"
     );
     before.assert_same(&state, "in the next master");
 }
 
-/// The values of a parameter that a node was told, in order.
+/// The values of a parameter in a node's notifications, in order.
 fn told(node: &FakeNode, key: &str) -> Vec<i32> {
     let updates = node.heard("paramUpdate").into_iter();
     let of_key = updates.filter(|update| update[1].as_str() == Some(&format!("{key}/")));
     of_key.map(|update| update[2].as_int().unwrap()).collect()
 }
 
-/// A request in UTF-16, for which only a master knows the answer.
+/// The call is a request in UTF-16, which only a master understands.
 #[test]
 fn an_undecodable_call_is_held_for_a_limited_time_and_never_answered_wrongly() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);
@@ -98,7 +98,7 @@ fn an_undecodable_call_is_held_for_a_limited_time_and_never_answered_wrongly() {
     assert!(error.to_string().contains("closed after []"), "{error}");
     assert!(
         waited >= Duration::from_millis(1400),
-        "it was held only {waited:?}"
+        "the call was held only for {waited:?}"
     );
     robot.revive_master();
     robot.await_gate();

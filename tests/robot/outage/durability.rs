@@ -1,5 +1,5 @@
-//! What an answer promises: the write was done once and is as safe as `--sync` says, even if rosrescue or the
-//! mirror had to find out first what was done.
+//! An answered write was done once and is as safe as `--sync` says, even if rosrescue or the mirror had to find out
+//! first which writes the master has run.
 
 use std::fs;
 use std::thread::{self, JoinHandle};
@@ -12,7 +12,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 
-/// Runs `work` while no sync of `disk` finishes, and checks that it ends only after that.
+/// Runs `work` while no sync of `disk` finishes, and checks that `work` ends only after the sync.
 #[track_caller]
 fn held_up<T: Send + 'static>(disk: &FailingDisk, work: impl FnOnce() -> T + Send + 'static) -> T {
     disk.begin(Trouble::HangsOnSync);
@@ -69,7 +69,7 @@ fn a_write_during_an_outage_is_on_the_disk_before_its_answer() {
     eventually("the gate is shut", || status(&client)["open"] == false);
     let leaving = client.clone();
     held_up(&disk, move || node.unpublish(&leaving, "/topic"));
-    // A write that changes nothing is no safer than the write that made it so.
+    // The answer to a write that changes nothing also waits until the write before it is on the disk.
     held_up(&disk, move || {
         let first = thread::spawn({
             let client = client.clone();
@@ -106,7 +106,7 @@ fn the_effect_of_an_undecodable_call_is_on_the_disk_before_its_answer() {
     }
 }
 
-/// Without a checkpoint file, clients do not wait for it.
+/// If there is no checkpoint file, clients do not wait for it.
 #[test]
 fn an_undecodable_call_is_answered_without_a_checkpoint() {
     let scratch = Scratch::new();
@@ -149,8 +149,7 @@ fn undecodable_calls_share_the_read_of_the_master_that_shows_their_effect() {
     assert_eq!(master.client().param("/second"), Some(1.into()));
 }
 
-/// Nothing is left in the master, not even a topic type or a parameter, that would distinguish it from an
-/// empty one.
+/// The master has nothing left that would distinguish it from an empty one, not even a topic type or a parameter.
 #[test]
 fn an_unregistration_during_a_hang_reaches_a_master_that_holds_nothing_else() {
     let probes = ["--probe-interval", "100", "--probe-timeout", "300"];

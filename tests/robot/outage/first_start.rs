@@ -55,11 +55,11 @@ fn a_core_answers_at_once_and_gives_its_master_all_writes_later() {
         assert_eq!(state.publishers_of("/chatter"), ["/early"]);
         assert_eq!(state.subscribers_of("/chatter"), ["/early_too"]);
         assert_eq!(bare.param("/early/gain"), Some(1.5.into()));
-        // The master also has the parameter subscription, which cannot be read from it.
+        // The master also has the parameter subscription, which rosrescue cannot read from a master.
         client.set_param("/early/gain", 2.5);
-        eventually("the parameter's subscriber is told", || {
-            // Told twice if another node had not answered yet, because rosrescue then notifies beside the
-            // master.
+        eventually("the parameter's subscriber is notified", || {
+            // The node gets the value twice if another node had not answered yet, because then rosrescue notifies nodes
+            // too.
             let heard = publisher.heard("paramUpdate");
             heard.last().is_some_and(|update| update[2] == 2.5.into())
         });
@@ -68,7 +68,7 @@ fn a_core_answers_at_once_and_gives_its_master_all_writes_later() {
     }
 }
 
-/// The checkpoint is of a session that continues.
+/// The checkpoint belongs to a session that continues.
 #[test]
 fn a_core_answers_from_its_checkpoint_before_its_master_has_started() {
     let mut robot = Robot::start_for_outages(Mode::Core);

@@ -28,7 +28,7 @@ fn registered(masters: [&Client; 2]) -> (FakeNode, Calls) {
     let (name, api, service) = (node.name.as_str(), node.api.as_str(), node.service_api());
     let service = service.as_str();
     let calls = vec![
-        // The node is notified of this one itself.
+        // The node itself is notified of this unregistration.
         ("unregisterPublisher", params![name, "/topic", api]),
         ("unregisterService", params![name, "/service_a", service]),
         ("unregisterService", params![name, "/service_b", service]),
@@ -53,7 +53,7 @@ fn leave(client: &Client, bare: &Client, calls: Calls, pause: Duration) {
         assert_eq!(client.status(method, params).unwrap(), expected, "{method}");
         let is_last = i + 1 == count;
         let stays = || is_last || knows(client);
-        assert!(holds(pause, stays), "it was removed after {method}");
+        assert!(holds(pause, stays), "the node was removed after {method}");
     }
     assert!(!knows(client));
 }

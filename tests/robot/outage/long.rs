@@ -1,4 +1,4 @@
-//! The whole life of rospy and roscpp nodes while there is no master. It stays away for at least
+//! The whole life of rospy and roscpp nodes while there is no master. The master stays away for at least
 //! `ROSRESCUE_AWAY_SECONDS`.
 
 use std::time::{Duration, Instant};
@@ -100,7 +100,7 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     mirror.assert_same(&robot.state(), "in the new master");
     before.assert_whole(&robot);
     during.assert_whole(&robot);
-    // A health check, and anything that a new master might tell nodes wrongly, happens within seconds.
+    // A health check, or wrong notifications by a new master, would happen within seconds.
     assert!(holds(Duration::from_secs(5), || witness
         .heard("shutdown")
         .is_empty()));
@@ -154,7 +154,7 @@ fn end(robot: &Robot) {
         for node in ["listener", "server", "param_user"] {
             let name = format!("leaving_{node}_{suffix}");
             let remap = format!("__name:={name}");
-            // None of them may have a topic or service in common with a node that stays.
+            // The nodes that end must have no topic or service in common with a node that stays.
             let arguments = ["/leaving", &remap, "chatter:=/leaving", "who:=/leaving"];
             let arguments = match node {
                 "param_user" => &arguments[..],

@@ -1,5 +1,4 @@
-//! Many clients that call at the moment at which an outage begins: each gets the right answers, at once and
-//! in order.
+//! Many clients call when an outage begins. Each gets the right answers, at once and in order.
 
 use std::io;
 use std::sync::{Arc, Barrier};
@@ -47,7 +46,7 @@ fn calls_of(client: i32, api: &str) -> Vec<(&'static str, Vec<Value>)> {
 /// Code and value of each answer.
 type Answers = io::Result<Vec<(i32, Value)>>;
 
-/// Starts a client with a connection of its own, which makes its calls when all clients are ready.
+/// Starts a client with its own connection. It makes its calls when all clients are ready.
 fn start(
     client: &Client,
     calls: Vec<(&'static str, Vec<Value>)>,

@@ -1,5 +1,5 @@
-//! What real nodes and tools experience while there is no master: those that read, those that start and end
-//! in the meantime, and those that register and set everything there is.
+//! Real nodes and tools while there is no master: nodes that read, nodes that start and end in the meantime, and nodes
+//! that register and set everything that is possible.
 
 use std::time::{Duration, Instant};
 
@@ -164,7 +164,7 @@ fn after_types(state: &State, robot: &Robot) -> State {
     }
 }
 
-/// Ends a node, which must not have to wait for the master.
+/// Ends a node. It must not wait for the master.
 fn end(node: &mut Node, signal: Signal) {
     let start = Instant::now();
     node.signal(signal);

@@ -1,5 +1,5 @@
-//! Notifications while there is no master: nodes are told the same as by a master.
-//! `tests/timing/notifications.rs` tests how soon.
+//! While there is no master, nodes get the same notifications as with a master. `tests/timing/notifications.rs` tests
+//! how soon.
 
 use std::time::Duration;
 
@@ -31,8 +31,8 @@ fn a_subscriber_is_told_the_publishers_whenever_they_change() {
         apis.collect::<Vec<_>>()
     });
     for node in [&subscriber, &late] {
-        // The master may have told the first subscriber about the first publisher before, or rosrescue may
-        // have repeated what the master may have owed.
+        // The master may have notified the first subscriber of the first publisher before, or rosrescue may have
+        // repeated notifications that the master may not have sent.
         eventually("every list has arrived", || {
             node.updates("/chatter").ends_with(&wanted)
         });
@@ -44,7 +44,7 @@ fn a_subscriber_is_told_the_publishers_whenever_they_change() {
     );
     robot.revive_master();
     robot.await_recovery(dead);
-    // Anything that is repeated later is the present list.
+    // A notification that is repeated later has the present list.
     assert!(holds(Duration::from_secs(2), || {
         let repeated = late.updates("/chatter").split_off(wanted.len());
         repeated.iter().all(Vec::is_empty)
@@ -65,7 +65,7 @@ fn a_subscriber_of_a_parameter_is_told_values_in_order_and_the_last_one() {
     }
     client.set_param("/gains", tree! { "p" => -1, "d" => "no" });
     client.ok("deleteParam", params!["/test", "/gains/p"]);
-    // The updates that show each state in turn. The present state is told if too many updates had to wait.
+    // The updates of each state, in turn. If too many updates had to wait, only the present state is sent.
     let update = |key: &str, value: Value| params!["/master", key, value];
     let values = (0..VALUES).map(|value| (Value::Int(value), tree! { "p" => value }));
     let changed = (Value::Int(-1), tree! { "p" => -1, "d" => "no" });
@@ -75,13 +75,13 @@ fn a_subscriber_of_a_parameter_is_told_values_in_order_and_the_last_one() {
         .map(|(p, gains)| [update("/gains/p/", p), update("/gains/", gains)])
         .collect();
     let last = states.len() - 1;
-    // The second one is told of the last two states by two updates, and perhaps twice.
+    // The second node gets two updates for the last two states, and perhaps each twice.
     for (node, twice) in [(exact, last), (above, last - 1)] {
-        eventually("the last value is told", || {
+        eventually("the last value arrives", || {
             let heard = node.heard("paramUpdate");
             heard.last().is_some_and(|it| states[last].contains(it))
         });
-        // A value may be left out when a newer one is there.
+        // A value may be left out if there is a newer one.
         let mut at = 0;
         for heard in node.heard("paramUpdate") {
             let found = states.iter().position(|updates| updates.contains(&heard));

@@ -1,4 +1,4 @@
-//! Two nodes of the same name, and a master that dies before it has told the first one to shut down.
+//! Two nodes of the same name, and a master that dies before it has told the first node to shut down.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ fn a_displaced_node_ends_although_the_master_died_before_telling_it(mode: Mode) 
     a_displaced_node_ends(Robot::start(mode));
 }
 
-/// With a master that certainly told no node.
+/// The master of this test never notifies a node.
 fn a_displaced_node_ends_although_the_master_never_tells_nodes(mode: Mode) {
     a_displaced_node_ends(Robot::start_under(mode, "silent_rosmaster.py", &[]));
 }
@@ -55,7 +55,7 @@ fn a_displaced_node_ends(mut robot: Robot) {
         first.exited().is_some() || second.exited().is_some()
     });
     robot.await_recovery(master);
-    // A node that logs something before it is told takes its name back by calling subscribeParam, with any
+    // A node that logs a message before it is told to shut down takes its name back by calling subscribeParam, with any
     // master.
     let taken_back = first.exited().is_none();
     assert!(
@@ -72,7 +72,7 @@ fn a_displaced_node_ends(mut robot: Robot) {
     assert_eq!(port_of(&robot.bare(), "/twin") == port, taken_back);
 }
 
-/// The port of a displaced node belongs to another node by the time at which it would be told.
+/// The port of a displaced node already belongs to another node when the shutdown would be sent.
 #[test]
 fn a_node_that_now_has_the_port_of_a_displaced_node_is_not_shut_down() {
     for (mode, is_registered) in [(Mode::Core, false), (Mode::Proxy, true)] {
@@ -92,7 +92,7 @@ fn a_node_that_now_has_the_port_of_a_displaced_node_is_not_shut_down() {
     }
 }
 
-/// Like the test above, when rosrescue itself tells nodes because there is no master.
+/// Like the test above, but rosrescue itself notifies nodes because there is no master.
 #[test]
 fn a_node_that_now_has_the_port_is_not_shut_down_during_an_outage_either() {
     for is_registered in [false, true] {
@@ -136,12 +136,12 @@ in_both_modes!(
     a_displaced_node_is_told_by_the_next_worker_if_the_master_lives,
 );
 
-/// The master had told no node, and the worker died together with it.
+/// The master has not told the node to shut down, and the worker dies together with the master.
 fn a_displaced_node_is_told_by_the_next_worker_if_master_and_worker_died(mode: Mode) {
     displaced_before_the_worker_dies(mode, true);
 }
 
-/// The worker may die before the master has told the node, and the master lives on.
+/// The worker may die before the master has told the node to shut down. The master lives on.
 fn a_displaced_node_is_told_by_the_next_worker_if_the_master_lives(mode: Mode) {
     displaced_before_the_worker_dies(mode, false);
 }
@@ -196,7 +196,7 @@ fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
     }
 }
 
-/// The node is told exactly once, in the words of a master.
+/// The node is told to shut down exactly once, with the text that a master uses.
 #[test]
 fn a_node_displaced_during_an_outage_is_told_exactly_once() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);

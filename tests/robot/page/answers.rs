@@ -113,7 +113,7 @@ fn no_answer_holds_a_hidden_value() {
 }
 
 #[test]
-fn a_pattern_that_is_none_is_refused_in_a_sentence() {
+fn an_invalid_pattern_is_refused_with_one_sentence() {
     let scratch = Scratch::new();
     for command in ["core", "proxy"] {
         let mut rescue = Setup::bare(&scratch, [command, "--hide-values", "a(b"])
@@ -153,7 +153,7 @@ fn a_hundred_thousand_parameters_are_sent_in_parts_and_delay_no_other_request() 
 }
 
 #[test]
-fn a_few_may_listen_and_hear_of_every_change() {
+fn a_limited_number_of_listeners_gets_every_change() {
     let mut robot = Robot::start(Mode::Core);
     let mut listeners: Vec<_> = (0..16).map(|_| listen(robot.port())).collect();
     for (_, head) in &listeners {

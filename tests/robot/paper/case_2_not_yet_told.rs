@@ -1,5 +1,5 @@
-//! The paper's case 2 at every point: the master dies after it has changed its state, before or while it
-//! notifies the subscribers. rosrescue then tells all of them the full list, once or twice.
+//! The paper's case 2 at every point: the master dies after it has changed its state, before or while it notifies the
+//! subscribers. rosrescue then sends the full list to all of them, once or twice.
 
 use std::ops::RangeInclusive;
 use std::thread;
@@ -19,7 +19,7 @@ enum Change {
     Unregistration,
 }
 
-/// The subscribers: four fake nodes and a real node of each library, which makes six callbacks.
+/// The subscribers: four fake nodes and a real node of each library, so there are six callbacks.
 struct Audience {
     fakes: Vec<FakeNode>,
     real: [Node; 2],
@@ -38,7 +38,7 @@ impl Audience {
         Self { fakes, real }
     }
 
-    /// Whether the last list that each of them was told is `all`.
+    /// Whether the last list that each subscriber got is `all`.
     fn knows(&self, all: &[String]) -> bool {
         let fakes = self.fakes.iter().map(|fake| fake.updates(TOPIC));
         let real = self.real.iter().map(|node| node.updates(TOPIC));
@@ -60,8 +60,8 @@ fn lists(calls: &[Heard]) -> Vec<(Vec<&str>, bool)> {
     lists.collect()
 }
 
-/// Makes the master die at each of `points`: 0 is before any callback, N is when the Nth callback is about to
-/// be sent. `workers` is the number of its threads for callbacks.
+/// Makes the master die at each of `points`: 0 is before any callback, N is when the Nth callback is about to be sent.
+/// `workers` is the number of the master's threads for callbacks.
 fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeInclusive<usize>) {
     let mut robot = Robot::start_under(mode, "fragile_master.py", &["-w", workers]);
     let client = robot.client();
@@ -130,7 +130,7 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
             check_ms = report["health_check_ms"].as_f64();
             report["master_pid"] != dead && check_ms.is_some()
         });
-        // Everything that a fake node was sent because of this change.
+        // All calls that a fake node got because of this change.
         for (fake, heard) in audience.fakes.iter().zip(heard) {
             let calls = &fake.calls()[heard..];
             let mut lists = lists(calls);
@@ -146,19 +146,19 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
                 "{lists:?}, not {now:?}"
             );
             let ours = lists.iter().filter(|(_, ours)| *ours).count();
-            // One list may come from the master that died, and one from the next master if the call was sent
-            // again because its reply was lost. No master tells a node twice.
+            // One list may come from the master that died, and one from the next master if the call was sent again
+            // because its reply was lost. A master sends each list once.
             assert!(lists.len() - ours <= 2, "{lists:?}");
             assert!(ours >= 1, "{lists:?}");
-            // A node that has not answered 300 ms after the change may hold up the master, so rosrescue tells
-            // the nodes again. Whatever the dead master may have sent at the same time is repeated too.
+            // A node that has not answered 300 ms after the change may delay the master, so rosrescue notifies the
+            // nodes again. Lists that the dead master may have sent at the same time are repeated too.
             if check_ms.is_some_and(|ms| ms < 250.0) {
                 assert!(ours <= 2, "point {point}: {lists:?}");
                 once += 1;
             }
         }
     }
-    println!("{once} fake nodes were told without a repeat");
+    println!("{once} fake nodes were notified without a repeat");
     let nodes = audience.fakes.iter().chain(&there).chain(&gone);
     for node in nodes {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
@@ -176,13 +176,13 @@ fn subscribers_hear_of_a_new_publisher_although_the_master_dies(mode: Mode) {
     at_every_callback(mode, Change::Registration, "3");
 }
 
-/// As in the paper.
+/// This is the change in the paper.
 fn subscribers_hear_that_a_publisher_left_although_the_master_dies(mode: Mode) {
     at_every_callback(mode, Change::Unregistration, "3");
 }
 
 #[test]
-fn the_same_with_more_threads_than_callbacks() {
+fn the_master_may_die_with_more_threads_than_callbacks() {
     at_every_callback(Mode::Core, Change::Registration, "16");
     at_every_callback(Mode::Core, Change::Unregistration, "16");
 }

@@ -1,6 +1,6 @@
-//! The paper's case 3: rosrescue, the master or both are killed again and again at random moments under a
-//! stream of calls, also while the checkpoint is written. Afterwards everything acknowledged is there,
-//! nothing deleted comes back, and a pair of rospy or roscpp nodes notices nothing.
+//! The paper's case 3: rosrescue, the master or both are killed again and again at random moments during a stream of
+//! calls, also while the checkpoint is written. Afterwards everything that was acknowledged is there, nothing that was
+//! deleted comes back, and a pair of rospy or roscpp nodes notices nothing.
 //!
 //! `ROSRESCUE_TEST_SECONDS` sets how long each test runs (10 by default).
 
@@ -72,7 +72,7 @@ fn nothing_acknowledged_is_lost(library: Library, mode: Mode) {
     }
 }
 
-/// Kills one of them or both at a random moment within the next 60 ms. Returns which.
+/// Kills rosrescue, the master or both at a random moment within the next 60 ms. Returns a description.
 fn kill(robot: &mut Robot, master: u32, dice: &mut Dice) -> &'static str {
     thread::sleep(Duration::from_micros(dice.below(60_000)));
     let gap = Duration::from_micros(dice.below(5_000));
@@ -100,7 +100,7 @@ fn kill(robot: &mut Robot, master: u32, dice: &mut Dice) -> &'static str {
     }
 }
 
-/// Everything that has been acknowledged.
+/// All acknowledged registrations and parameters.
 #[derive(Clone, Debug, Default)]
 struct Ledger {
     params: Struct,
@@ -152,7 +152,7 @@ fn assert_ledger(ledger: &Ledger, state: &State, when: &str) {
     assert_eq!(of_node(&state.services), services, "services {when}");
 }
 
-/// A small random number generator (xorshift). It only has to make the moments differ.
+/// A small random number generator (xorshift) for the moments of kills.
 struct Dice(u64);
 
 impl Dice {
@@ -194,7 +194,7 @@ impl Writer {
                 self.ledger.params.shift_remove(&key);
             }
             1 => {
-                // So large that it is written in several pieces.
+                // The value is so large that it is written in several pieces.
                 let value = Value::String(format!("{count} {}", "x".repeat(200_000)));
                 self.insist("setParam", params![name, "/ledger/ballast", value.clone()]);
                 self.ledger.params.insert("ballast".to_owned(), value);

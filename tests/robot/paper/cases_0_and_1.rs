@@ -81,7 +81,7 @@ fn case_1_nodes_die_in_the_outage(library: Library, mode: Mode) {
     nodes_end_in_the_outage(library, mode, Signal::KILL);
 }
 
-/// The same nodes end cleanly. No master hears their unregistrations, and they do not repeat them.
+/// The same nodes end cleanly. No master gets their unregistrations, and the nodes do not repeat them.
 fn case_1_nodes_leave_in_the_outage(library: Library, mode: Mode) {
     nodes_end_in_the_outage(library, mode, Signal::INT);
 }
@@ -132,7 +132,7 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
             let parts = ["health_check_ms=", "removed=["];
             line.contains("the rescue is complete") && parts.iter().all(|part| line.contains(part))
         });
-        // On a busy computer one of them may be found a little later.
+        // On a busy computer the health check may find one of the nodes a little later.
         for name in ["/gone_listener", "/gone_server", "/gone_talker"] {
             rescue.wait_line("the log names the node that was unregistered", |line| {
                 let removed = line.split("removed=[").nth(1);
@@ -141,7 +141,7 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
         }
     }
     eventually(
-        "the subscribers are told that only one publisher is left",
+        "the subscribers know that only one publisher is left",
         || {
             observer
                 .updates("/chatter")

@@ -40,7 +40,7 @@ fn nodes_at_a_lost_address_are_reported_and_told_again_when_it_is_back() {
         assert!(action.contains(&near.to_string()), "{action}");
         net.return_near();
         let at = Instant::now();
-        eventually("the node is told again", || {
+        eventually("the node is notified again", || {
             node.updates("/topic").len() > before
         });
         slowest[1] = slowest[1].max(at.elapsed());
@@ -49,7 +49,7 @@ fn nodes_at_a_lost_address_are_reported_and_told_again_when_it_is_back() {
         });
     }
     println!(
-        "{rounds} rounds: reported after {:?}, told again after {:?} at most",
+        "{rounds} rounds: reported after {:?}, notified again after {:?} at most",
         slowest[0], slowest[1]
     );
     assert!(page(&client, "/metrics").contains("\nrosrescue_lost_addresses 0\n"));

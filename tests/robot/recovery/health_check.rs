@@ -1,5 +1,5 @@
-//! Which nodes are unregistered after an outage, and which are kept: nodes that died, nodes whose port
-//! another node has, and nodes that do not answer.
+//! The health check after an outage decides which nodes are unregistered and which are kept: nodes that died, nodes
+//! whose port another node has, and nodes that do not answer.
 
 use std::fs;
 use std::thread;
@@ -11,8 +11,7 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// Waits for the report of a recovery whose health check has finished, and checks what every report must
-/// have.
+/// Waits for the report of a recovery whose health check has finished, and checks the fields of every report.
 #[track_caller]
 fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) {
     let mut last = serde_json::Value::Null;
@@ -56,7 +55,7 @@ fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mod
     drop(dead);
     robot.crash_master();
     robot.await_state(&after, "after the dead node was unregistered");
-    eventually("the subscriber is told", || {
+    eventually("the subscriber is notified", || {
         subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
     });
     report(&robot, "the removed node", |report| {
@@ -67,7 +66,7 @@ fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mod
     }
 }
 
-/// Both nodes were asked for their process ids soon after they had registered.
+/// rosrescue asked both nodes for their process ids soon after they had registered.
 #[test]
 fn another_process_at_the_port_counts_as_another_node() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -98,7 +97,7 @@ fn another_process_at_the_port_counts_as_another_node() {
     assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
 }
 
-/// Some client libraries make up process ids.
+/// Some client libraries report invented process ids.
 #[test]
 fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -141,7 +140,7 @@ fn a_node_that_cannot_list_its_topics_keeps_its_registrations() {
     assert_kept(&mut robot, &before);
 }
 
-/// The old node has never been asked for its process id.
+/// rosrescue has never asked the old node for its process id.
 #[test]
 fn different_topics_at_the_port_count_as_another_node() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -187,7 +186,7 @@ fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again() {
         names(&report["unreachable"]) == ["/silent"]
     });
     before.assert_same(&robot.state(), "while the node is unreachable");
-    // The master has tried to tell the node of this, or is still trying.
+    // The master has tried to notify the node of this, or is still trying.
     let late = FakeNode::start("/late");
     late.publish(&client, "/topic", "std_msgs/String");
     client.set_param("/gain", 2);
@@ -221,7 +220,7 @@ fn an_unreachable_node_that_dies_is_unregistered() {
     });
 }
 
-/// This happens without an outage.
+/// No outage is needed for this.
 #[test]
 fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
     let robot = Robot::start_with(Mode::Core, &["--reap-dead-nodes", "0.5"]);
@@ -237,7 +236,7 @@ fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
     }));
     talker.kill();
     robot.await_state(&after, "after the standing health check");
-    eventually("the listener is told", || {
+    eventually("the listener is notified", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });
 

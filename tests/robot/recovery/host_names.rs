@@ -12,7 +12,7 @@ use crate::support::{
 /// Maximum time until a living subscriber knows a new publisher. Waiting for one lookup would take 5 s.
 const SOON: Duration = Duration::from_millis(4_500);
 
-/// A `rosrescue core` that uses only the name server `server`, as does its master.
+/// A `rosrescue core` that uses only the name server `server`, also for its master.
 fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
     let setup = Setup::core(scratch, master_port);
     setup.wrapped(|own| server.serving(own)).start()
@@ -48,7 +48,7 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
         );
     }
     let living = FakeNode::start("/living");
-    // Under a name that the computer knows without a name server.
+    // This node is registered under a name that the computer knows without a name server.
     let api = format!("http://localhost:{}/", living.port());
     living.claim_subscription("/chatter", Some("std_msgs/String"));
     client.ok(
@@ -61,11 +61,11 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
     let publisher = FakeNode::start("/publisher");
     publisher.publish(&client, "/chatter", "std_msgs/String");
     let registered = start.elapsed();
-    eventually("the living subscriber is told", || {
+    eventually("the living subscriber is notified", || {
         living.updates("/chatter").last() == Some(&vec![publisher.api.clone()])
     });
     let told = start.elapsed() - registered;
-    println!("registration {registered:?}, told {told:?} later");
+    println!("registration {registered:?}, notified {told:?} later");
     assert!(registered < SOON, "{registered:?}");
     assert!(told < SOON, "{told:?}");
     // While the lookups are under way, calls pass, and new publishers register.
@@ -80,7 +80,7 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
     let second = FakeNode::start("/second");
     let start = Instant::now();
     second.publish(&client, "/chatter", "std_msgs/String");
-    eventually("the living subscriber is told of the second", || {
+    eventually("the living subscriber knows the second publisher", || {
         living
             .updates("/chatter")
             .last()
@@ -126,7 +126,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     );
     let start = Instant::now();
     let all = vec![publisher.api.clone()];
-    eventually("the living subscriber is told", || {
+    eventually("the living subscriber is notified", || {
         living.updates("/chatter").last() == Some(&all)
     });
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
@@ -139,7 +139,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     let state = State::read(&Client::new(port));
     assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
 
-    // When a name begins to exist, its node is told everything.
+    // When a name begins to exist, its node gets all pending notifications.
     let found = &unresolvable[0];
     assert!(found.calls().is_empty(), "{:?}", found.calls());
     server.set("nobody0.test", Ipv4Addr::LOCALHOST);
@@ -187,7 +187,7 @@ fn a_node_is_found_again_when_its_host_name_gets_another_address() {
     assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
     assert_eq!(names(&recovered["unreachable"]), Vec::<String>::new());
     let all = vec![publisher.api.clone()];
-    eventually("the node is told at the new address", || {
+    eventually("the node is notified at the new address", || {
         second.updates("/chatter").last() == Some(&all)
     });
     let asked = second.calls().into_iter().any(|call| call.from_rosrescue);
@@ -203,7 +203,7 @@ fn a_node_is_found_again_when_its_host_name_gets_another_address() {
     eventually("the node is reachable again", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
-    eventually("the node is told everything at the new address", || {
+    eventually("the node gets all notifications at the new address", || {
         third.updates("/chatter").last() == Some(&all)
     });
     assert!(kept());

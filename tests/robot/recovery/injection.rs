@@ -1,5 +1,5 @@
-//! The new master dies at every single call of the injection, alone or among more deaths. The one that
-//! finally lives has the exact state, whatever happened before, and no node notices.
+//! The new master dies at every single call of the injection, once or several times in a row. The master that finally
+//! lives has the exact state, whatever happened before, and no node notices.
 
 use std::collections::BTreeMap;
 use std::thread;
@@ -95,7 +95,7 @@ fn proxied_with_state() -> (Proxied, State, Nodes) {
     (proxied, before, nodes)
 }
 
-/// The nodes, the last lists that a living master told them, and the lists that they may be told.
+/// The nodes, the number of calls that each had received from a living master, and the notifications that they may get.
 struct Nodes {
     all: Vec<FakeNode>,
     heard: Vec<usize>,
@@ -105,7 +105,7 @@ struct Nodes {
 }
 
 impl Nodes {
-    /// Waits until the master has told the nodes everything.
+    /// Waits until the master has notified the nodes of everything.
     fn new(all: Vec<FakeNode>, state: &State) -> Self {
         let api = |name: &String| {
             let found = state.nodes.iter().find(|(node, _)| node == name);
@@ -135,9 +135,8 @@ impl Nodes {
         }
     }
 
-    /// G6: no node is told to shut down, no master calls a node at all, and rosrescue tells only complete and
-    /// present lists. This is checked for a while, because idle threads of a master look only every 100 ms
-    /// whether there is anything to tell.
+    /// G6: no node is told to shut down, no master calls a node, and rosrescue sends only complete and present lists.
+    /// This is checked for a while, because idle threads of a master look only every 100 ms for pending notifications.
     #[track_caller]
     fn assert_no_node_disturbed(&self) {
         self.look();
@@ -270,7 +269,7 @@ fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
         for node in &all {
             node.publish(&client, "/topic", "a/B");
             node.offer(&client, &format!("{}/service", node.name));
-            // The second publisher is news for the first subscriber, and every recovery repeats it.
+            // Each recovery notifies the first subscriber of the second publisher again.
             node.subscribe(&client, "/topic", "a/B");
             node.watch_param(&client, "/p0");
         }

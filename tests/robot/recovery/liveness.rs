@@ -65,7 +65,7 @@ fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
         (&node("/lost")["health"], &node("/lost")["checked_at"]),
         (&"unchecked".into(), &serde_json::Value::Null)
     );
-    // Each node was asked at most once, for its process id when it was new.
+    // rosrescue asked each node at most once, for its process id when it was new.
     assert!(fakes[0].calls().len() <= 1, "{:?}", fakes[0].calls());
 
     let _again = robot.node(Library::Roscpp, "talker", &[]);
@@ -74,7 +74,7 @@ fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
     });
 }
 
-/// Even a node that was never there.
+/// This also holds for a node that never existed.
 #[test]
 fn a_node_whose_port_has_no_listener_is_reported_as_dead() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
@@ -85,7 +85,7 @@ fn a_node_whose_port_has_no_listener_is_reported_as_dead() {
         names(&robot.status().unwrap_or_default()["dead_nodes"]) == ["/dead"]
     });
     let said = |line: &String| line.contains("a registered node is dead") && line.contains("/dead");
-    eventually("the log reports it", || {
+    eventually("the log reports the dead node", || {
         robot.rescue.output().iter().any(said)
     });
 }

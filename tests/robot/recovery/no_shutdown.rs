@@ -1,5 +1,5 @@
-//! No node is ever told to shut down that would live on with a master that never dies: neither a node that
-//! came back under its name at another address, nor a node that now has the old address.
+//! No node is told to shut down if it would live on with a master that never dies: neither a node that came back under
+//! its name at another address, nor a node that now has the old address.
 
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::time::{Duration, Instant};
@@ -31,8 +31,8 @@ fn assert_not_shut_down(node: &FakeNode, round: usize) {
     );
 }
 
-/// A node that is told of a parameter by the master. The threads of the master send notifications in order,
-/// so anything before has been sent or is being sent by then.
+/// A node that the master notifies of a parameter. The threads of the master send notifications in order, so anything
+/// earlier has been sent or is being sent by then.
 struct Witness(FakeNode);
 
 impl Witness {
@@ -54,7 +54,7 @@ impl Witness {
     }
 }
 
-/// Checks for a while that no node is shut down: the master makes its calls beside everything else.
+/// Checks for a while that no node is shut down, because the master makes its calls in other threads.
 #[track_caller]
 fn assert_none_shut_down(nodes: &[FakeNode]) {
     let spared = |node: &FakeNode| node.heard("shutdown").is_empty();
@@ -64,7 +64,7 @@ fn assert_none_shut_down(nodes: &[FakeNode]) {
     assert!(all, "told to shut down: {names:?}");
 }
 
-/// Gives the node a process id of its own, and makes some registrations.
+/// Gives the node a new process id, and makes some registrations.
 fn claim(node: &FakeNode, client: &Client) {
     static PIDS: AtomicI32 = AtomicI32::new(1_000_000);
     node.claim_pid(PIDS.fetch_add(1, Ordering::Relaxed));
@@ -104,7 +104,7 @@ fn a_node_restarted_during_an_outage_is_not_shut_down(mode: Mode) {
     for round in 0..rounds(mode, 15) {
         // The previous round may have had a late effect.
         assert_not_shut_down(&node, round);
-        // The old node is dead or still there. If it is there, it is told to shut down as usual.
+        // The old node is dead, or still runs and is told to shut down as usual.
         let old = (round % 2 == 1).then_some(node);
         node = outage(&mut robot, |client| {
             let new = FakeNode::start("/phoenix");
@@ -134,9 +134,9 @@ fn api_of(robot: &Robot, node: &str) -> Option<String> {
     api.as_str().map(str::to_owned)
 }
 
-/// During one outage a node dies and comes back at another port, and its old port goes to another node, in
-/// either order. The sender of a shutdown to the node at the old port must notice that it is another one. If
-/// the port was taken first, even a master that never dies shuts down its new owner; rosrescue must not.
+/// During one outage a node dies and comes back at another port, and its old port goes to another node, in either
+/// order. rosrescue must notice that the node at the old port is another one, and not shut it down. If the port was
+/// taken first, even a master that never dies shuts down its new owner.
 #[test]
 fn a_node_that_has_the_old_port_of_a_moved_node_is_not_shut_down() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -197,7 +197,7 @@ fn a_node_that_has_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
         assert_not_shut_down(&node, round);
         witness.hear(&client);
         assert!(robot.state().knows(&heir), "round {round}");
-        // Two nodes at the same port are distinguished by their process ids, for which they are asked now.
+        // Two nodes at the same port are distinguished by their process ids, which rosrescue asks for now.
         eventually("the health check has finished", || {
             let report = status(&client)["last_recovery"].clone();
             report["health_check_ms"].is_number()

@@ -1,4 +1,4 @@
-//! Dead nodes without an outage: what `--reap` reports or unregisters, and that no innocent node is shut down.
+//! Dead nodes without an outage: `--reap` reports or unregisters them, and no innocent node is shut down.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use crate::support::{
 /// Longer than a master needs to tell a node to shut down.
 const A_WHILE: Duration = Duration::from_secs(2);
 
-/// What the page shows of a node. `None` if it is unknown.
+/// The node as the page shows it. `None` if it is unknown.
 fn shown(robot: &Robot, node: &str) -> Option<Json> {
     let state = page(&robot.client(), "/state.json");
     let state: Json = serde_json::from_str(state.rsplit("\r\n").next()?).ok()?;
@@ -21,7 +21,7 @@ fn shown(robot: &Robot, node: &str) -> Option<Json> {
     nodes.find(|of| of["name"] == node).cloned()
 }
 
-/// Waits until the kernel would prove the end of these nodes.
+/// Waits until rosrescue watches these nodes' processes through the kernel.
 fn await_watched(robot: &Robot, nodes: &[(&str, u32)]) {
     for (node, pid) in nodes {
         eventually("the kernel watches the node's process", || {
@@ -84,7 +84,7 @@ fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one(mode: Mode) {
         &["unregistered /talker: its process", "nobody listens"]
     ));
     assert_eq!(robot.counter("dead_nodes_reaped"), 1);
-    // A node that is stopped does not answer, and lives.
+    // A node that is stopped does not answer, but lives.
     assert!(holds(A_WHILE, || robot.state().knows("/listener")));
     listener.signal(Signal::CONT);
     let state = robot.settled_state();
@@ -92,7 +92,7 @@ fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one(mode: Mode) {
     assert!(shown(&robot, "/talker").is_some_and(|of| !of["removed_at"].is_null()));
 }
 
-/// A node that is gone, although the kernel does not prove that. Its port is then `innocent`'s.
+/// Makes a dead node whose end the kernel does not prove. Another node, `/innocent`, then gets its port.
 fn with_taken_port(robot: &Robot) -> FakeNode {
     let client = robot.client();
     let ghost = FakeNode::start_at("/killed", free_port());
@@ -148,7 +148,7 @@ fn by_default_a_shutdown_of_the_wrong_node_is_reported() {
     eventually("the master shuts down the wrong node", || {
         innocent.heard("shutdown").len() == 1
     });
-    eventually("the log reports it", || {
+    eventually("the log reports the shutdown", || {
         has_logged(
             &robot,
             &[
@@ -162,7 +162,7 @@ fn by_default_a_shutdown_of_the_wrong_node_is_reported() {
     assert_eq!(robot.counter("shutdowns_misdirected"), 1);
 }
 
-/// Two programs under one name that are started again whenever they are shut down (ros_comm issue 2018).
+/// The two programs are started again whenever they are shut down (ros_comm issue 2018).
 #[test]
 fn two_programs_that_take_a_name_from_each_other_are_reported() {
     let robot = Robot::start_with(Mode::Core, &["--reap", "local"]);
@@ -178,7 +178,7 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
         });
         if let Some(last) = last.replace(program) {
             // This is an ordinary displacement, as with a bare master.
-            eventually("the displaced program is told", || {
+            eventually("the displaced program is told to shut down", || {
                 last.heard("shutdown").len() == 1
             });
         }
@@ -204,9 +204,9 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
     assert!(metrics.contains("\nrosrescue_feuds 1\n"), "{metrics}");
 }
 
-/// A node that dies and is started again displaces only its ghost.
+/// A node that dies and is started again displaces only its own old registration.
 #[test]
-fn a_node_that_is_started_again_and_again_is_no_feud() {
+fn a_node_that_restarts_repeatedly_is_not_reported_as_two_programs() {
     let robot = Robot::start_with(Mode::Core, &[]);
     for _ in 0..4 {
         let node = robot.node(Library::Rospy, "talker", &[]);
@@ -221,7 +221,7 @@ fn a_node_that_is_started_again_and_again_is_no_feud() {
 
 /// Many small nodes are killed, stopped, replaced and started again, some at the ports of dead ones.
 #[test]
-fn of_a_crowd_no_living_node_is_unregistered_and_no_innocent_one_shut_down() {
+fn in_a_crowd_no_living_node_is_unregistered_or_wrongly_shut_down() {
     let variable = |name: &str, other: u64| match std::env::var(name) {
         Ok(value) => value.parse().unwrap(),
         Err(_) => other,

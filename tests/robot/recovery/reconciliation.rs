@@ -1,6 +1,5 @@
-//! After an outage the registrations are what living nodes report, and all subscribers have been told of
-//! every change. `paper/case_2_not_yet_told.rs` has a master that dies at every point while it notifies
-//! nodes.
+//! After an outage the registrations are those that living nodes report, and all subscribers have been notified of
+//! every change. `paper/case_2_not_yet_told.rs` has a master that dies at every point while it notifies nodes.
 
 use std::path::Path;
 use std::time::Duration;
@@ -11,7 +10,7 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::{Reply, Value};
 
-/// The master dies before it has told any node, and rosrescue dies with it.
+/// The master dies before it has notified any node, and rosrescue dies with it.
 #[test]
 fn subscribers_hear_of_a_change_although_master_and_rosrescue_die() {
     let program = Path::new(NODES).join("fragile_master.py");
@@ -54,12 +53,13 @@ fn subscribers_hear_of_a_change_although_master_and_rosrescue_die() {
                 told.all(|told| told.last().is_some_and(|told| told[2] == point.into()))
             },
         );
-        // If rosrescue was faster, the master is still alive.
+        // If rosrescue was faster, the master still lives.
         let _ = std::fs::remove_file(&file);
     }
 }
 
-/// The same for parameters: nodes that have cached one are told of a change that the dead master still owed.
+/// The same for parameters: nodes that cache a parameter are notified of a change that the dead master had not sent
+/// yet.
 #[test]
 fn subscribers_hear_of_a_parameter_although_the_master_dies_at_any_callback() {
     let program = Path::new(NODES).join("fragile_master.py");
@@ -105,8 +105,8 @@ fn subscribers_hear_of_a_parameter_although_the_master_dies_at_any_callback() {
     }
 }
 
-/// One registration that the master has lost, and one whose end it has not heard of. A roscpp node cannot
-/// report which master it has, so nothing is added for it.
+/// The master has lost one registration, and has not received one unregistration. A roscpp node cannot report its
+/// master, so nothing is added for it.
 #[test]
 fn registrations_are_corrected_by_what_living_nodes_report() {
     for library in [Library::Rospy, Library::Roscpp] {
@@ -127,7 +127,7 @@ fn registrations_are_corrected_by_what_living_nodes_report() {
             api.as_str().unwrap().to_owned()
         };
         let (talks, listens) = (api("/talker"), api("/listener"));
-        // In this order, because a listener that is told of no publisher rightly drops its link.
+        // The order matters: a listener that gets an empty list of publishers rightly drops its link.
         client.ok(
             "unregisterSubscriber",
             params!["/listener", "/chatter", listens.as_str()],

@@ -50,7 +50,7 @@ fn started_again(master: &Client) -> FakeNode {
 }
 
 fn options() -> [&'static str; 2] {
-    // The health check itself would come much too late.
+    // The regular health check would come much too late.
     ["--reap-dead-nodes", "3600"]
 }
 
@@ -75,7 +75,7 @@ fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     let port = dead_node(&client, &heir);
     let mut innocent = innocent(&robot.scratch, robot.port(), port);
-    // The dead node was unregistered before the new one was registered, and subscribers have heard of both.
+    // The dead node was unregistered before the new one was registered, and subscribers were notified of both.
     let state = robot.settled_state();
     assert!(!state.knows("/killed"), "{state}");
     assert_eq!(client.ask("lookupNode", params!["/test", "/killed"]), None);

@@ -1,5 +1,5 @@
-//! Two robots whose masters are synchronised, as by multimaster_fkie (`tests/nodes/master_sync.py`). A rescue
-//! of one robot connects nothing that the filters of the synchronisation keep apart.
+//! Two robots whose masters are synchronised, as by multimaster_fkie (`tests/nodes/master_sync.py`). A rescue of one
+//! robot makes no connection that the filters of the synchronisation prevent.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use crate::support::{
     Library, Mode, NODES, Node, Process, Robot, State, eventually, names, ros_command, status,
 };
 
-/// Topics that each robot keeps to itself, most of all its drive commands.
+/// Topics that the synchronisation does not share, most importantly the drive commands.
 const IGNORED: [&str; 2] = ["/cmd_vel", "/rosout"];
 const RESCUES: usize = 20;
 /// Minimum number of rescues, however slow the computer is.

@@ -1,4 +1,4 @@
-//! Nodes that could not be reached are told everything as soon as they can be reached.
+//! Nodes that could not be reached get all pending notifications as soon as they can be reached.
 //! `tests/timing/unreachable.rs` tests which nodes they delay.
 
 use std::time::Duration;
@@ -41,7 +41,7 @@ fn a_node_that_can_be_reached_again_is_told_everything() {
         let updates = node.updates("/chatter");
         updates.last() == Some(&vec![publisher.api.clone()])
     };
-    // Longer than the rosmaster in this test keeps trying.
+    // The wait is longer than the rosmaster in this test keeps trying.
     assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
     for host in [2, 3] {
         net.mend(host);
@@ -52,7 +52,7 @@ fn a_node_that_can_be_reached_again_is_told_everything() {
     });
 }
 
-/// A node of rosnodejs does so; it answers all other calls.
+/// Nodes of rosnodejs do not answer `paramUpdate`, but answer all other calls.
 #[test]
 fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
@@ -66,7 +66,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     let mut publishers = Vec::new();
     for value in 1..=3 {
         client.set_param("/gain", value);
-        eventually("the node is told of the parameter", || {
+        eventually("the node is notified of the parameter", || {
             let told = node.heard("paramUpdate");
             told.iter().any(|told| told[2] == value.into())
         });
@@ -78,7 +78,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
             names(&status(&client)["unreachable"]).is_empty()
                 && node.updates("/topic").last() != Some(&all)
         });
-        assert!(!reachable, "the node was not told of publisher {value}");
+        assert!(!reachable, "the node was not notified of publisher {value}");
         let unreachable = names(&status(&client)["unreachable"]);
         assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
     }

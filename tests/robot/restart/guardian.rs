@@ -68,7 +68,7 @@ fn core(scratch: &Scratch) -> Rescue {
     eventually("roscore's parameters are set", || {
         client.param("/rosdistro").is_some() && client.param("/rosversion").is_some()
     });
-    // It subscribes as its last step, and makes no further calls to the master.
+    // rosout subscribes as its last step, and makes no further calls to the master.
     eventually("rosout is running", || {
         State::try_read(&client).is_ok_and(|state| !state.subscribers_of("/rosout").is_empty())
     });
@@ -200,12 +200,12 @@ fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
         .unwrap()
         .parse()
         .unwrap();
-    // Mostly parts that the linker left to be relocated, which are larger in a debug build.
+    // Most of this memory is relocations by the linker, which are larger in a debug build.
     assert!(kib < 3072, "the guardian uses {kib} KiB");
 }
 
-/// A `rosrescue core` that has lost its rosmaster program and its worker, so that no new worker gets far
-/// enough to serve calls. Returned together with the program's path as soon as the guardian pauses.
+/// A `rosrescue core` that has lost its rosmaster program and its worker, so that new workers end before they serve
+/// calls. Returned as soon as the guardian pauses, with the path of the missing program.
 #[track_caller]
 fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
     let program = scratch.path("rosmaster");
@@ -226,7 +226,7 @@ fn workers_that_fail_before_serving_are_restarted_after_a_pause() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
     symlink("/usr/bin/rosmaster", program).unwrap();
-    // A call during the pause waits for its end.
+    // A call during the pause waits until the pause is over.
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     assert_eq!(rescue.terminate().code(), Some(0));
 }
@@ -262,7 +262,7 @@ fn stopping_during_a_pause_ends_everything() {
     assert_eq!(scratch.survivors(), vec![]);
 }
 
-/// As with Ctrl-Z in a terminal: the guardian exists but does not start a worker.
+/// A guardian that was stopped with Ctrl-Z exists but does not start a worker.
 #[test]
 fn a_guardian_stopped_by_ctrl_z_does_not_count_as_one() {
     let scratch = Scratch::new();
@@ -309,7 +309,7 @@ fn a_clean_stop_ends_everything() {
         &[Signal::TERM][..],
         &[Signal::INT],
         &[Signal::HUP],
-        // As with killall, which signals both processes.
+        // killall signals both processes.
         &[Signal::TERM, Signal::TERM],
     ] {
         let scratch = Scratch::new();
@@ -326,7 +326,7 @@ fn a_clean_stop_ends_everything() {
     }
 }
 
-/// However far the next worker has got, it ends what the dead one left behind.
+/// The next worker may have got to any point. It ends the processes that the dead one left behind.
 #[test]
 fn stopping_right_after_a_death_of_the_worker_ends_everything() {
     for lines in [1, 2] {
@@ -346,7 +346,7 @@ fn stopping_right_after_a_death_of_the_worker_ends_everything() {
     }
 }
 
-/// The worker is killed before it has done what the signal asks for.
+/// The worker is killed before it has carried out the signal's request.
 #[test]
 fn stopping_while_the_worker_dies_ends_everything() {
     let scratch = Scratch::new();
@@ -378,7 +378,7 @@ fn a_second_signal_ends_guardian_and_worker_at_once() {
     assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
 }
 
-/// As with Ctrl-\ in a terminal: the worker must not keep running unnoticed.
+/// Ctrl-\ in a terminal sends SIGQUIT. The worker must not keep running unnoticed.
 #[test]
 fn sigquit_ends_guardian_and_worker() {
     let scratch = Scratch::new();
@@ -424,7 +424,7 @@ fn a_worker_survives_its_guardian_and_reports_it() {
     let client = rescue.client();
     let worker = worker(&scratch);
     rescue.kill();
-    eventually("the status reports it", || {
+    eventually("the log reports the missing guardian", || {
         let lines = rescue.stderr().into_iter();
         let warned = lines.filter(|line| line.contains("unguarded")).count();
         warned == 1
@@ -496,7 +496,7 @@ fn a_guardian_works_as_the_first_process_of_a_container() {
     eventually("no zombie is left", || {
         !Path::new(&format!("/proc/{master}")).exists()
     });
-    eventually("another master is there", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| Some(pid) != named)
     });
     assert_eq!(client.param("/kept"), Some("yes".into()));
@@ -547,7 +547,7 @@ fn rosrescue_and_the_master_run_before_the_nodes() {
     signal(dead, Signal::KILL);
     worker_after(&scratch, dead);
     let client = rescue.client();
-    eventually("there is another master", || {
+    eventually("another master answers", || {
         client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
     });
     assert_eq!(values(), allowed, "after the death of worker and master");

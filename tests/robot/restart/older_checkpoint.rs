@@ -51,7 +51,7 @@ impl Nodes {
     }
 }
 
-/// Waits until calls pass to the same master, and checks that it still holds `wanted`.
+/// Waits until calls pass to the same master, and checks that the master still has the state `wanted`.
 #[track_caller]
 fn assert_goes_on(rescue: &Rescue, bare: &Client, pid: u32, wanted: &State, nodes: &Nodes) {
     let client = rescue.client();
@@ -78,8 +78,8 @@ fn is_unprotected(rescue: &Rescue) -> bool {
     !status(&rescue.client())["unprotected"].is_null()
 }
 
-/// The disk fills up while `rescue` serves the master at `bare`, and the robot changes. rosrescue ends by
-/// `end` while the disk is full and is started again, and once more when there is room.
+/// The disk fills up while `rescue` serves the master at `bare`, and the robot changes. rosrescue ends by `end` while
+/// the disk is full and is started again, and a second time when the disk has room.
 fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn(&mut Rescue)) {
     let client = rescue.client();
     let mut nodes = Nodes::begin(&client);
@@ -210,7 +210,7 @@ fn a_master_keeps_its_state_after_a_power_cut_of_rosrescues_computer() {
     }
 }
 
-/// Since the copy was made the master has died, and the next master was given the state in the next session.
+/// Since the copy was made the master has died, and the next master got the state in the next session.
 #[test]
 fn a_checkpoint_of_an_earlier_session_does_not_replace_the_masters_state() {
     let scratch = Scratch::new();
@@ -261,7 +261,7 @@ fn writes_answered_before_the_master_is_examined_are_kept() {
     crate::support::stop(master.pid());
     rescue.start_again();
     eventually("rosrescue answers", || client.param("/back").is_some());
-    // The mirror of the older checkpoint does not know it.
+    // The mirror of the older checkpoint does not have this parameter.
     client
         .call("deleteParam", params!["/node", "/going"])
         .unwrap();

@@ -31,7 +31,7 @@ fn cut_power(robot: &mut Robot) {
     eventually("the master is dead", || !alive(master));
 }
 
-/// Files beside the checkpoint that contain `text`.
+/// The files next to the checkpoint that contain `text`.
 fn kept(robot: &Robot, text: &str) -> Vec<String> {
     let checkpoint = robot.rescue.checkpoint();
     let is_old = |path: &Path| path != checkpoint && path.to_string_lossy().contains("chkpt");
@@ -68,13 +68,13 @@ fn after_a_reboot_without_living_nodes_a_new_session_begins(mode: Mode) {
     assert_eq!(client.param("/use_sim_time"), None, "{mode:?}");
     assert!(!robot.settled_state().knows("/talker"), "{mode:?}");
     let names = kept(&robot, "use_sim_time");
-    // So is the previous generation, if it had the parameter too. The log has what was recorded.
+    // The previous generation is kept too, if it had the parameter. The log has all records.
     let (old, others): (Vec<_>, Vec<_>) = names.iter().partition(|name| name.contains(".session-"));
     assert!(
         !old.is_empty() && others.iter().all(|name| name.contains(".log-")),
         "the old file is not kept: {names:?}"
     );
-    // The new session is a full one: a crash now restores it.
+    // The new session is protected: a crash now restores it.
     client.set_param("/today", 1);
     robot.crash_master();
     assert_eq!(robot.client().param("/today"), Some(1.into()));

@@ -13,10 +13,10 @@ use crate::support::{
 use command_fds::{CommandFdExt, FdMapping};
 use rustix::process::Signal;
 
-/// Runs `command` like a unit's process that is given `socket` as file descriptor 3.
+/// Runs `command` like a unit's process that gets `socket` as file descriptor 3.
 fn activated(command: &Command, socket: OwnedFd) -> Command {
     let mut shell = Command::new("sh");
-    // The process id is that of the shell, which then becomes the program.
+    // `LISTEN_PID` is the process id of the shell, which then becomes the program.
     shell.args(["-c", r#"LISTEN_PID=$$ exec "$0" "$@""#]);
     let mut command = behind(shell, command);
     let mapping = FdMapping {
@@ -134,7 +134,7 @@ fn the_worker_of_a_guardian_notifies_systemd() {
     assert_eq!(rescue.wait().code(), Some(0));
 }
 
-/// The notification socket is full. On one core rosrescue has only one thread for all calls.
+/// The test fills the notification socket. On one core rosrescue has only one thread for all calls.
 #[test]
 fn a_systemd_that_reads_no_notifications_delays_no_call() {
     let scratch = Scratch::new();

@@ -1,5 +1,5 @@
-//! Restarts of rosrescue itself. It adopts a living master, fills an empty one, restores from the file what still
-//! applies, and takes over a system that ran without it.
+//! Restarts of rosrescue itself. It adopts a living master, fills an empty one, restores the parts of the checkpoint
+//! that still apply, and takes over a system that ran without it.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -47,11 +47,11 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
         "the living master was injected"
     );
 
-    // It can restore everything that it adopted. It knows parameter subscriptions from the checkpoint.
+    // rosrescue can restore everything that it adopted. It knows parameter subscriptions from the checkpoint.
     robot.crash_master();
     before.assert_same(&robot.state(), "after the master's crash that followed");
     client.set_param("/watched", 2);
-    eventually("the parameter's subscriber is told", || {
+    eventually("the parameter's subscriber is notified", || {
         node.heard("paramUpdate")
             .last()
             .is_some_and(|call| call[2] == Value::Int(2))
@@ -161,7 +161,10 @@ fn a_system_that_ran_without_rosrescue_is_taken_over() {
     });
 
     let rescue = Setup::proxy(&scratch, master.port).start();
-    before.assert_same(&State::read(&rescue.client()), "after it was taken over");
+    before.assert_same(
+        &State::read(&rescue.client()),
+        "after rosrescue took over the system",
+    );
     let dead = master.pid();
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
@@ -177,8 +180,8 @@ fn a_system_that_ran_without_rosrescue_is_taken_over() {
     talker.assert_no_link_lost();
 }
 
-/// A parameter that rosmaster cannot return makes all parameters unreadable. They are unknown until it is
-/// gone, and rosrescue reports that.
+/// A parameter that rosmaster cannot return makes all parameters unreadable. They are unknown until it is deleted, and
+/// rosrescue reports this.
 #[test]
 fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     let scratch = Scratch::new();
@@ -209,7 +212,7 @@ fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     assert_eq!(client.param("/gain"), None);
 }
 
-/// `rosrescue core` whose rosmaster uses a port of its own choice.
+/// `rosrescue core` whose rosmaster uses any free port.
 fn core(scratch: &Scratch) -> Rescue {
     let port = free_port();
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
@@ -244,7 +247,7 @@ fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     (rescue, port)
 }
 
-/// Starts a server on the port where the master was. `what` says what it does with each connection.
+/// Starts a server on the port where the master was. `what` selects how it treats each connection.
 fn squat(port: u16, what: &'static str) {
     let listener = eventually_some("the port is free", || {
         TcpListener::bind(("127.0.0.1", port)).ok()
@@ -358,7 +361,7 @@ fn an_empty_master_that_was_left_behind_is_used_or_ended() {
             all.filter(|(pid, words)| words.contains("rosmaster") && alive(*pid))
                 .count()
         };
-        eventually("there is one rosmaster", || masters() == 1);
+        eventually("exactly one rosmaster runs", || masters() == 1);
         assert_eq!(rescue.terminate().code(), Some(0));
         // The killed rosrescue may have been asking for the version of ROS.
         eventually("every process has ended", || scratch.survivors().is_empty());
@@ -412,7 +415,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     client.set_param("/kept", 1);
     fs::write(scratch.path("away"), "").unwrap();
     kill_master_and_rescue(&mut rescue, Duration::ZERO);
-    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+    let starting = eventually_some("exactly one rosmaster runs", || only_master(&scratch));
 
     rescue.start_again();
     eventually("rosrescue listens", || client.connect().is_ok());
@@ -431,7 +434,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     let (_, at) = master_of(&rescue);
     assert_eq!(Client::new(at).param("/kept"), Some(2.into()));
 
-    // Its death is noticed like that of a child.
+    // rosrescue notices the death of an adopted master like that of a child.
     signal(starting, Signal::KILL);
     eventually("another master serves", || {
         client.master_pid().is_some_and(|pid| pid != starting)
@@ -439,7 +442,7 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     assert_eq!(client.param("/kept"), Some(2.into()));
 }
 
-/// Master and rosrescue die within 200 ms of each other. However far the next master has got, it is used.
+/// The master and rosrescue die within 200 ms of each other. The next master is used, however far it has got.
 #[test]
 fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
     let scratch = Scratch::new();
@@ -465,7 +468,7 @@ fn a_starting_master_that_has_lost_its_port_is_ended() {
     let (_, master_port) = master_of(&rescue);
     fs::write(scratch.path("away"), "").unwrap();
     kill_master_and_rescue(&mut rescue, Duration::ZERO);
-    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+    let starting = eventually_some("exactly one rosmaster runs", || only_master(&scratch));
     squat(master_port, "closes");
     fs::remove_file(scratch.path("away")).unwrap();
     rescue.start_again();

@@ -1,4 +1,4 @@
-//! A service of a real systemd that is process 1 in namespaces of its own. Needs root and systemd.
+//! A service of a real systemd that is process 1 in new namespaces. Needs root and systemd.
 
 use std::fs;
 use std::path::Path;
@@ -50,7 +50,7 @@ impl Booted {
             pid,
             scratch,
         };
-        // Before that, its root is still this computer's.
+        // Until systemd runs, the root folder of the process is still that of this computer.
         eventually(
             "systemd runs as the first process; this needs root, systemd-sysv and dbus (see boot.log in the scratch folder)",
             || {
@@ -103,8 +103,8 @@ impl Booted {
         self.try_run(script).unwrap_or_else(|said| panic!("{said}"))
     }
 
-    /// Copies `file` to the simulated computer. Returns its name there, because its own folder may be hidden,
-    /// like /tmp.
+    /// Copies `file` to the simulated computer. Returns its name there, because the file's own folder, such as /tmp,
+    /// may be hidden.
     pub(super) fn give(&self, file: &Path) -> String {
         let name = file.file_name().unwrap();
         fs::copy(file, self.scratch.path("given").join(name)).unwrap();
@@ -144,7 +144,7 @@ impl Booted {
         }
     }
 
-    /// Every file in folders where an installation could leave something.
+    /// All files in folders where an installation could leave something.
     fn files(&self) -> String {
         self.run("find /etc /usr/local /usr/lib/systemd -path '/etc/.*' -prune -o -print | sort")
     }
@@ -217,7 +217,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     ));
     assert!(again.contains("nothing to change"), "{again}");
 
-    // The worker dies, and then it hangs.
+    // The worker dies; later it hangs.
     robot.write(
         "/etc/systemd/system/rosrescue.service.d/test.conf",
         "[Service]\nWatchdogSec=1",
@@ -259,7 +259,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
             .ends_with(" 7]\n")
     );
 
-    // The same with other options.
+    // The service is installed again with other options. A unit file that is not rosrescue's is refused.
     let worker = robot.property("MainPID");
     robot.run(
         "sed -i 's/^# Written by/# Mine, not written by/' /etc/systemd/system/rosrescue.service",

@@ -47,7 +47,7 @@ fn ros(scratch: &Scratch, program: &str, port: u16) -> Command {
     command
 }
 
-/// What roslaunch has written to its log files.
+/// The contents of roslaunch's log files.
 fn roslaunch_logs(scratch: &Scratch) -> String {
     let folders = fs::read_dir(scratch.log_dir()).into_iter().flatten();
     let files = folders
@@ -95,7 +95,7 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     });
     assert!(is_launched());
 
-    // Until it waits for its nodes, Ctrl-C is an error of roslaunch.
+    // Until roslaunch waits for its nodes, it treats Ctrl-C as an error.
     eventually("roslaunch waits for its nodes", || {
         let logs = roslaunch_logs(&scratch);
         logs.lines().any(|line| line.ends_with(": spin"))
@@ -127,7 +127,7 @@ fn rosrescue_ends_with_roslaunch_unless_roslaunch_was_killed() {
     let master = Client::new(port);
     let mut roslaunch = start(port);
     eventually("rosrescue listens", || master.connect().is_ok());
-    // roslaunch misses a Ctrl-C now and then while it starts, also without rosrescue. A user presses again.
+    // roslaunch sometimes misses a Ctrl-C while it starts, also without rosrescue, so it is pressed again.
     let mut pressed: Option<Instant> = None;
     eventually("roslaunch ends", || {
         if pressed.is_none_or(|at| at.elapsed() > Duration::from_secs(5)) {

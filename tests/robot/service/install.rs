@@ -1,4 +1,4 @@
-//! What `rosrescue install` prints and refuses, without a systemd: nothing is started here.
+//! The output and the refusals of `rosrescue install`, without a systemd: nothing is started here.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -68,14 +68,14 @@ fn impossible_options_are_explained_in_one_sentence() {
     assert!(!scratch.path(".config").exists());
 }
 
-/// Root may have no sudo and no variable with a name, as in a container.
+/// In a container, root may have no sudo and no variable with the user's name.
 #[test]
 fn a_dry_run_needs_no_sudo() {
     let scratch = Scratch::new();
     let user = Command::new("id").arg("-un").output().unwrap().stdout;
     let user = String::from_utf8(user).unwrap();
     let output = rosrescue(&scratch, &["install", "--dry-run"]);
-    // Its program is not in a system folder, which is all that is in the way.
+    // The only problem is that the program is not in a system folder.
     let said = said(&output, 1);
     for line in ["run     systemctl enable", &format!("User={user}")] {
         assert!(said.contains(line), "{line}: {said}");
@@ -121,7 +121,7 @@ fn install_is_idempotent_and_leaves_files_of_others_alone() {
     said(&rosrescue(&scratch, &other), 0);
     assert!(said(&rosrescue(&scratch, &other), 0).starts_with("nothing to change"));
     assert!(read(dropin).contains("rosrescue core -p 11399\n"));
-    // A file that the user has made his own stays.
+    // A file that the user has changed into their own stays.
     fs::write(&service, "# mine\n").unwrap();
     let refused = said(&rosrescue(&scratch, &install), 1);
     assert!(

@@ -1,4 +1,4 @@
-//! The Debian package, in a new Debian made by debootstrap, and under a systemd.
+//! The Debian package, in a fresh Debian made by debootstrap, and under a systemd.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -9,7 +9,7 @@ use crate::support::eventually;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Two versions of the package, 0.2.0 and 0.2.1, made once. This takes two minutes if cargo-deb is missing.
+/// Two versions of the package, 0.2.0 and 0.2.1, which are made once. This takes two minutes if cargo-deb is missing.
 #[track_caller]
 fn packages() -> &'static [PathBuf; 2] {
     static PACKAGES: OnceLock<[PathBuf; 2]> = OnceLock::new();
@@ -100,7 +100,7 @@ fn the_package_can_be_installed_upgraded_removed_and_purged_without_a_trace() {
     for line in &lines[3..6] {
         assert!(!line.ends_with(":0"), "{said}");
     }
-    // The last line is that of /etc/default. Nothing is left after the purge.
+    // The last line is that of /etc/default. The purge leaves nothing behind.
     let last = [
         "/usr/lib/systemd/system/rosrescue.service",
         "/usr/lib/systemd/system/rosrescue.socket",
@@ -125,7 +125,7 @@ fn an_upgrade_does_not_disturb_a_running_robot_and_removal_ends_its_service() {
             .is_err()
     );
 
-    // The unit that comes with the package.
+    // First, the unit in the package is used.
     robot.run("systemctl enable --now rosrescue.socket rosrescue.service");
     robot.wait_protected();
     robot.run("pgrep -x rosmaster; test -s /var/lib/rosrescue/log/latest-chkpt.yaml");

@@ -131,7 +131,7 @@ impl Stage {
         }
     }
 
-    /// Does to the master what happens to it while the nodes start.
+    /// Disturbs the master while the nodes start.
     pub(super) fn disturb(&self, dice: &mut Dice) {
         let Self::Kills(rescue, master_port, _) = self else {
             return;

@@ -1,10 +1,10 @@
-//! What nodes were told about their topics, and when.
+//! Notifications and answers about topics that nodes received, with their times.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value as Json;
 
-/// Something that a node was told about a topic.
+/// One notification or answer about a topic that a node received.
 #[derive(Clone, Debug)]
 struct Event {
     at: f64,
@@ -12,7 +12,7 @@ struct Event {
     uris: BTreeSet<String>,
 }
 
-/// Everything that rospy nodes have asked and were told, topic by topic.
+/// All requests, answers and notifications of rospy nodes, by topic.
 #[derive(Debug)]
 pub(crate) struct Traces {
     begin: f64,
@@ -46,7 +46,7 @@ impl Traces {
         }
     }
 
-    /// Describes what happened to `topic` in `node` and in its publishers, one line per event.
+    /// Describes the events of `topic` in `node` and in its publishers, one line per event.
     pub(super) fn of(&self, topic: &str, node: &str) -> String {
         let mut lines = Vec::new();
         for ((of, at), events) in &self.events {
@@ -71,8 +71,8 @@ impl Traces {
         )
     }
 
-    /// Lists from `source` that lack a publisher of which the node had been told before. No publisher goes
-    /// away while the nodes start, so such a list is older than the one before.
+    /// Lists from `source` that lack a publisher that the node already knew. No publisher ends while the nodes start,
+    /// so such a list is older than the one before.
     pub(super) fn older(&self, source: &str) -> Vec<String> {
         let mut found = Vec::new();
         for ((topic, node), events) in &self.events {
