@@ -8,8 +8,8 @@
 //! * The last notification of a subscriber has the value in the final state.
 //! * No two computers lead at the same time, and no two in the same term.
 //!
-//! A write is later than another one if it began after that one was acknowledged. Of two writes that overlap, either may
-//! be the last. A write that failed may take effect at any time.
+//! A write is later than another one if it began after that one was acknowledged. Of two writes that overlap, either
+//! may be the last. A write that failed may take effect at any time.
 
 use std::collections::BTreeMap;
 

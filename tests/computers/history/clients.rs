@@ -41,7 +41,7 @@ struct Shared {
     /// The name of the history and of the namespace of its parameters.
     name: String,
     written: AtomicI32,
-    /// How often etcd was set up anew. Its terms then start over.
+    /// How often etcd was set up again. Its terms then start over.
     etcds: AtomicU64,
     quiet: AtomicBool,
     finish: AtomicBool,
@@ -145,7 +145,7 @@ impl Clients {
         }
     }
 
-    /// Notes that etcd was set up anew while no rosrescue ran, so its terms start over.
+    /// Notes that etcd was set up again while no rosrescue ran, so its terms start over.
     pub(crate) fn forget_terms(&self) {
         self.shared.etcds.fetch_add(1, Ordering::Relaxed);
     }
@@ -192,7 +192,7 @@ impl Clients {
         End { values, told }
     }
 
-    /// Broken promises of the topic: the final state has the registered publishers, and each subscriber knows all of them.
+    /// Broken promises of the topic: the final state has the registered publishers, and each subscriber knows them.
     pub(crate) fn topic_wrongs(&self, state: &State) -> Vec<String> {
         let topic = self.shared.topic();
         let mut wrong = Vec::new();

@@ -36,7 +36,7 @@ pub(super) enum Fault {
     NoEtcd(usize),
     Etcd(usize),
     AllEtcds,
-    /// All etcds lose their data, and are set up anew as the guide says.
+    /// All etcds lose their data, and are set up again as the guide says.
     Wiped,
     Handover(usize),
 }
@@ -257,7 +257,7 @@ fn switch_on(fleet: &mut Fleet, one: usize) {
     computer.start_rescue();
 }
 
-/// Sets etcd up anew, as docs/several-computers.md says under "Backup".
+/// Sets etcd up again, as docs/several-computers.md says under "Backup".
 #[track_caller]
 fn wipe(fleet: &mut Fleet, clients: &Clients) {
     for computer in &mut fleet.computers {

@@ -190,7 +190,7 @@ fn one_failure_makes_no_call_wait_longer_than_five_quarters_of_the_time_to_live_
 }
 
 #[test]
-fn an_etcd_that_has_lost_its_data_is_given_the_state_of_who_lives() {
+fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
     for seed in first()..first() + schedules().min(100) {
         let mut world = lost(seed);
         world.heal();
