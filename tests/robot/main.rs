@@ -112,6 +112,7 @@ mod page {
     mod answers;
     mod browser;
     mod computers;
+    mod past;
 }
 
 /// The commands other than `core` and `proxy`.
