@@ -34,6 +34,8 @@ mod etcd;
 mod handover;
 /// Calls of all computers under random failures, and whether all that was promised was kept.
 mod history;
+/// What the log says about calls of other computers.
+mod log;
 /// What a computer that was cut off has written meets what others have.
 mod lonely;
 /// Two computers do not see each other, or not all of each other.
