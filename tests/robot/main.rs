@@ -59,6 +59,7 @@ mod master {
 /// A new master is given the state, and the health check examines the nodes.
 mod recovery {
     mod addresses;
+    mod dhcp;
     mod health_check;
     mod host_names;
     mod injection;
