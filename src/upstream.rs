@@ -11,7 +11,7 @@ pub(crate) mod verify;
 
 use std::{
     io,
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     sync::{Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
@@ -87,6 +87,8 @@ pub struct Head {
     pub path: String,
     /// Content encoding of the body, if there is one.
     pub encoding: Option<HeaderValue>,
+    /// Address of the caller, if a follower forwards the call. See [`peer::CALLER_HEADER`].
+    pub caller: Option<IpAddr>,
 }
 
 impl Head {
@@ -101,6 +103,7 @@ impl Default for Head {
         Self {
             path: "/".to_owned(),
             encoding: None,
+            caller: None,
         }
     }
 }

@@ -42,6 +42,10 @@ has_pam_systemd() {
     return 1
 }
 
+has_dhcp() {
+    busybox udhcpd --help 2>&1 | grep -q udhcpd && busybox udhcpc --help 2>&1 | grep -q udhcpc
+}
+
 # Prints the packages of everything that does not work here. `python3` may not be the one for which ROS was built.
 ros_missing() {
     for tool in rosmaster roslaunch rosnode rostopic rosservice rosparam; do
@@ -71,6 +75,7 @@ ros_missing() {
     need procps command -v pgrep
     need dpkg-dev command -v dpkg-shlibdeps
     need keepalived command -v keepalived
+    need busybox has_dhcp
 }
 
 install_missing() { # PACKAGES...

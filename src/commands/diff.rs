@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
 use crate::{
-    checkpoint::compare::{Difference, compare},
+    checkpoint::compare::{Described, compare},
     cli::DiffArgs,
 };
 
@@ -28,10 +28,8 @@ pub(super) async fn run(args: &DiffArgs) -> Result<Exit, CommandFailure> {
         }
     };
     let differences = compare(&a.state, &state, &args.hide.hide_values);
-    let differences = differences.into_iter().map(|difference| Line {
-        text: difference.text(names),
-        difference,
-    });
+    let differences = differences.into_iter();
+    let differences = differences.map(|difference| difference.described(names));
     let diff = Diff {
         names,
         a: match args.from {
@@ -55,14 +53,7 @@ struct Diff {
     names: [&'static str; 2],
     a: String,
     b: String,
-    differences: Vec<Line>,
-}
-
-#[derive(Serialize)]
-struct Line {
-    text: String,
-    #[serde(flatten)]
-    difference: Difference,
+    differences: Vec<Described>,
 }
 
 impl fmt::Display for Diff {

@@ -14,8 +14,11 @@ use super::{
 use crate::{
     checkpoint::{
         format::{RecordContent, Session},
-        log, session,
-        store::{self, OpenError, history, log::files},
+        session,
+        store::{
+            self, OpenError, history,
+            log::{NoPast, PastState, past_state},
+        },
     },
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
     clock, config,
@@ -199,43 +202,28 @@ pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, Command
         at => at.millis(clock::wall_millis()),
     };
     let shown = path.display();
-    let failed = |error: io::Error| {
-        CommandFailure::Usage(format!("cannot read the log beside `{shown}`: {error}"))
-    };
-    let mut unread = Vec::new();
-    for file in files(&path).map_err(failed)?.into_iter().rev() {
-        let text = match file.read() {
-            Ok(text) => text,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-            Err(error) => {
-                unread.push(format!("cannot read `{}`: {error}", file.path.display()));
-                continue;
+    match past_state(&path, time) {
+        Ok(past) => opened_at(past, args),
+        Err(NoPast::Folder(error)) => Err(CommandFailure::Usage(format!(
+            "cannot read the log beside `{shown}`: {error}"
+        ))),
+        Err(NoPast::Later(unread)) => {
+            for sentence in unread {
+                eprintln!("rosrescue: {sentence}");
             }
-        };
-        match log::moment(&text, time) {
-            Ok(Some(moment)) => return opened_at(file.path, &text, moment, unread, args),
-            Ok(None) => {}
-            Err(why) => unread.push(format!("cannot use `{}`: {why}", file.path.display())),
+            let time = clock::wall_text_millis(time.min(clock::wall_millis()));
+            Err(CommandFailure::Usage(format!(
+                "`{shown}` and the log beside it have no state of {time} or earlier. `rosrescue log -n 0` shows the \
+                 oldest one"
+            )))
         }
     }
-    for sentence in unread {
-        eprintln!("rosrescue: {sentence}");
-    }
-    let time = clock::wall_text_millis(time.min(clock::wall_millis()));
-    Err(CommandFailure::Usage(format!(
-        "`{shown}` and the log beside it have no state of {time} or earlier. `rosrescue log -n 0` shows the oldest one"
-    )))
 }
 
-fn opened_at(
-    path: PathBuf,
-    text: &[u8],
-    moment: log::Moment,
-    unread: Vec<String>,
-    args: &ReadArgs,
-) -> Result<Opened, CommandFailure> {
+fn opened_at(past: PastState, args: &ReadArgs) -> Result<Opened, CommandFailure> {
+    let PastState { path, moment, .. } = past;
     let rebuilt = moment.rebuilt;
-    let mut damage = unread;
+    let mut damage = past.unread;
     if !moment.exact {
         damage.push(format!(
             "`{}` lacks records before that time",
@@ -253,7 +241,7 @@ fn opened_at(
     }
     Ok(Opened {
         path,
-        bytes: text.len() as u64,
+        bytes: past.bytes,
         written: moment.at as f64 / 1e3,
         snapshot_seq: Some(moment.snapshot_seq),
         journal: moment.journal,

@@ -33,20 +33,51 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
     let path = files::present(&args.place).await;
     let wanted = Wanted::of(args);
     let mut reader = LogReader::new(args.hide.hide_values.clone());
-    let mut entries = newest(&path, &wanted, args.lines, &mut reader)?;
-    add_rescues(&mut entries, &path, &wanted);
-    if args.lines > 0 {
-        entries.drain(..entries.len().saturating_sub(args.lines));
-    }
-    for entry in &entries {
-        if !show(entry, args.json)? {
+    let mut rescues = rescues(&path, &wanted);
+    let mut found = false;
+    let mut last = 0;
+    let mut show_all = |entries: Vec<Entry>| {
+        found |= !entries.is_empty();
+        for mut entry in entries {
+            // A rescue has the number of the record before it.
+            match entry.seq {
+                0 => entry.seq = last,
+                seq => last = seq,
+            }
+            if !show(&entry, args.json)? {
+                return Ok::<_, CommandFailure>(false);
+            }
+        }
+        Ok(true)
+    };
+    if args.lines == 0 && wanted.is_everything() {
+        // A month has millions of changes, so they are shown while the rest is read.
+        for files in list(&path)?.chunks(LIVE_FILES) {
+            let entries = read_thin(&thinned(files, &wanted), &wanted, &mut reader);
+            if !show_all(with_rescues(entries, &mut rescues))? {
+                return Ok(Exit::Good);
+            }
+        }
+    } else {
+        let lines = match args.lines {
+            0 => usize::MAX,
+            lines => lines,
+        };
+        let entries = newest(&path, &wanted, lines, &mut reader)?;
+        let mut entries = with_rescues(entries, &mut rescues);
+        entries.extend(rescues.drain(..));
+        entries.drain(..entries.len().saturating_sub(lines));
+        if !show_all(entries)? {
             return Ok(Exit::Good);
         }
     }
+    if !show_all(rescues.into())? {
+        return Ok(Exit::Good);
+    }
     if !args.follow {
-        return Ok(match entries.is_empty() {
-            true => Exit::Bad,
-            false => Exit::Good,
+        return Ok(match found {
+            true => Exit::Good,
+            false => Exit::Bad,
         });
     }
     loop {
@@ -95,6 +126,10 @@ impl<'a> Wanted<'a> {
             all: subjects.iter().all(|names| names.is_empty()),
             words: words_of(args),
         }
+    }
+
+    fn is_everything(&self) -> bool {
+        self.all && self.since == 0 && self.until == u64::MAX
     }
 
     fn has_time(&self, at: u64) -> bool {
@@ -186,8 +221,8 @@ fn full(name: &str) -> String {
     format!("/{}", name.trim_start_matches('/'))
 }
 
-/// Reads at least the newest `lines` wanted entries, or all of them if `lines` is 0. Afterwards `reader` is at the end
-/// of the history.
+/// Reads at least the newest `lines` wanted entries, if there are so many. Afterwards `reader` is at the end of the
+/// history.
 fn newest(
     path: &Path,
     wanted: &Wanted<'_>,
@@ -196,12 +231,11 @@ fn newest(
 ) -> Result<Vec<Entry>, CommandFailure> {
     let files = list(path)?;
     let mut thin: VecDeque<Thin> = VecDeque::new();
-    let mut found = Vec::new();
     let mut most = lines;
     loop {
         let first = files.len() - thin.len();
         let counted: usize = thin.iter().map(|file| file.count).sum();
-        if first > 0 && (lines == 0 || counted < most || thin.len() < LIVE_FILES) {
+        if first > 0 && (counted < most || thin.len() < LIVE_FILES) {
             // Each time as many files as before, so that a short answer is quick.
             let from = first.saturating_sub(thin.len().clamp(LIVE_FILES, FILES_AT_ONCE));
             let more = files.get(from..first).unwrap_or_default();
@@ -215,20 +249,7 @@ fn newest(
             continue;
         }
         let mut this = reader.clone();
-        found.clear();
-        let mut texts = thin.iter().peekable();
-        let mut left = thin.len();
-        while let Some(file) = texts.next() {
-            left -= 1;
-            let next = texts.peek().map_or(0, |next| next.count);
-            if left >= LIVE_FILES && wanted.skips(file, next) {
-                this.forget();
-            } else if !file.text.is_empty() {
-                // It was reported when it was read.
-                let _ = this.read(&file.text);
-            }
-            found.extend(this.take().into_iter().filter(|entry| wanted.has(entry)));
-        }
+        let found = read_thin(thin.make_contiguous(), wanted, &mut this);
         if first == 0 || found.len() >= lines {
             *reader = this;
             return Ok(found);
@@ -236,6 +257,22 @@ fn newest(
         // Not every record changes something.
         most = most.saturating_mul(4);
     }
+}
+
+/// Reads the wanted entries of `files`, which follow each other.
+fn read_thin(files: &[Thin], wanted: &Wanted<'_>, reader: &mut LogReader) -> Vec<Entry> {
+    let mut found = Vec::new();
+    for (index, file) in files.iter().enumerate() {
+        let next = files.get(index + 1).map_or(0, |next| next.count);
+        if index + LIVE_FILES < files.len() && wanted.skips(file, next) {
+            reader.forget();
+        } else if !file.text.is_empty() {
+            // It was reported when it was read.
+            let _ = reader.read(&file.text);
+        }
+        found.extend(reader.take().into_iter().filter(|entry| wanted.has(entry)));
+    }
+    found
 }
 
 /// Reads `files`, several at a time.
@@ -269,26 +306,29 @@ fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
     })
 }
 
-/// Adds the rescues of which there is a report, after the last entry before them.
-fn add_rescues(entries: &mut Vec<Entry>, path: &Path, wanted: &Wanted<'_>) {
-    for kept in report_file::read(path) {
-        let at = (kept.report.detected_at * 1e3) as u64;
-        let place = entries.iter().rposition(|entry| entry.at <= at);
-        let seq = place
-            .and_then(|last| entries.get(last))
-            .map_or(0, |it| it.seq);
-        let entry = Entry {
-            seq,
-            at,
-            caller: None,
-            from: None,
-            change: None,
-            event: Some(rescue(&kept.report)),
-        };
-        if wanted.has(&entry) {
-            entries.insert(place.map_or(0, |last| last + 1), entry);
+/// The wanted rescues of which there is a report, oldest first.
+fn rescues(path: &Path, wanted: &Wanted<'_>) -> VecDeque<Entry> {
+    let rescues = report_file::read(path).into_iter().map(|kept| Entry {
+        seq: 0,
+        at: (kept.report.detected_at * 1e3) as u64,
+        caller: None,
+        from: None,
+        change: None,
+        event: Some(rescue(&kept.report)),
+    });
+    rescues.filter(|entry| wanted.has(entry)).collect()
+}
+
+/// Takes each rescue that is earlier than one of `entries`, and puts it before that.
+fn with_rescues(entries: Vec<Entry>, rescues: &mut VecDeque<Entry>) -> Vec<Entry> {
+    let mut all = Vec::with_capacity(entries.len());
+    for entry in entries {
+        while rescues.front().is_some_and(|rescue| rescue.at < entry.at) {
+            all.extend(rescues.pop_front());
         }
+        all.push(entry);
     }
+    all
 }
 
 fn rescue(report: &Report) -> String {

@@ -1,7 +1,7 @@
 //! Answers calls, from the master or from the mirror.
 
 use std::{
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
@@ -116,9 +116,9 @@ pub(super) struct Incoming {
 }
 
 impl Incoming {
-    /// A call from `source`, which this computer has got from `peer`.
-    pub(super) fn of(source: Source, peer: SocketAddr) -> Self {
-        let origin = Origin::At(peer.ip().to_canonical());
+    /// A call from `source`, made at the address `caller`.
+    pub(super) fn of(source: Source, caller: IpAddr) -> Self {
+        let origin = Origin::At(caller.to_canonical());
         Self { source, origin }
     }
 }
@@ -159,7 +159,7 @@ impl Calls {
         }
         match &self.others {
             None => {
-                let incoming = Incoming::of(Source::Here, peer);
+                let incoming = Incoming::of(Source::Here, peer.ip());
                 Ok(self.answer_here(head, body, call, incoming).await?)
             }
             Some(others) => others.answer(self, peer, head, body, call).await,

@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -175,8 +175,8 @@ struct Call<'a> {
     body: Bytes,
     call: Option<Request>,
     kind: Kind,
-    /// Who made the call, or the computer that forwards it.
-    from: SocketAddr,
+    /// Who made the call. The computer that forwards it, if the caller is there or is not known.
+    from: IpAddr,
 }
 
 impl Others {
@@ -192,6 +192,8 @@ impl Others {
         if asked_term.is_some() {
             head.path = Head::default().path;
         }
+        // Any program that may call can claim to be a follower. Only the log shows this address.
+        let said = head.caller.take().filter(|_| asked_term.is_some());
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         if body.len() > RECORD_BYTES_MAX && kind.mutates() {
             return Ok(too_large(body.len()));
@@ -214,7 +216,7 @@ impl Others {
             body,
             call,
             kind,
-            from: peer,
+            from: said.unwrap_or_else(|| peer.ip()).to_canonical(),
         };
         let mut standing = self.standing.clone();
         self.conduct(&on_its_way, &mut standing, asked_term).await
@@ -431,6 +433,14 @@ impl Call<'_> {
         reply
     }
 
+    fn head_for_leader(&self) -> Head {
+        let is_here = self.from.is_loopback();
+        Head {
+            caller: (!is_here).then_some(self.from),
+            ..self.head.clone()
+        }
+    }
+
     /// The leader's answer, or the mirror's if the leader is slow to answer a read.
     ///
     /// # Errors
@@ -440,7 +450,10 @@ impl Call<'_> {
         if self.kind == Kind::Read || self.is_subscribed() {
             return self.forward_read(leader, term).await.ok_or(true);
         }
-        match leader.forward(term, &self.head, &self.body).await {
+        match leader
+            .forward(term, &self.head_for_leader(), &self.body)
+            .await
+        {
             Ok(raw) => Ok(self.pass_on(leader, term, raw)),
             Err(error) => {
                 tracing::debug!(%error, "a call to the leader failed");
@@ -459,7 +472,7 @@ impl Call<'_> {
         // The request continues after the mirror has answered, because the leader's next answer in time shows that it
         // is back.
         let mut asked = {
-            let (leader, head, body) = (leader.clone(), self.head.clone(), self.body.clone());
+            let (leader, head, body) = (leader.clone(), self.head_for_leader(), self.body.clone());
             crate::task::spawn(async move { leader.forward(term, &head, &body).await })
         };
         let reply: Result<RawReply, PeerError> =

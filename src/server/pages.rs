@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `/` | the page for a browser, the status as text for other clients |
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
-//! | `/state.json` | nodes, topics, services and parameters |
+//! | `/state.json` | nodes, topics, services and parameters, now or at an earlier time |
 //! | `/events` | what changes, as it happens |
 //! | `/metrics` | counters in Prometheus' text format |
 //! | `/live` | 200 while rosrescue runs |
@@ -12,6 +12,7 @@
 
 mod events;
 mod params;
+mod past;
 mod robot;
 pub(crate) mod status;
 
@@ -28,7 +29,7 @@ use serde::Serialize;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
-use self::{events::Feed, params::Members, robot::Robot, status::Rate};
+use self::{events::Feed, params::Members, past::Past, robot::Robot, status::Rate};
 use super::{
     Server,
     clients::Clients,
@@ -42,6 +43,7 @@ use crate::{
     nodes::Nodes,
     status::{Board, metrics::metrics, stats::Stats},
     upstream::Upstream,
+    xmlrpc::Struct,
 };
 
 const HTML: &str = "text/html; charset=utf-8";
@@ -93,6 +95,8 @@ pub(crate) struct PageState {
     feed: Feed,
     /// Permit to build the complete state, which happens one request at a time.
     reading: Semaphore,
+    /// Permit to read earlier states, which happens for one request at a time, even if its client has gone.
+    reading_past: Arc<Semaphore>,
 }
 
 impl Default for PageState {
@@ -100,6 +104,7 @@ impl Default for PageState {
         Self {
             feed: Feed::default(),
             reading: Semaphore::new(1),
+            reading_past: Arc::new(Semaphore::new(1)),
         }
     }
 }
@@ -125,10 +130,14 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         "/page.css" => reply(StatusCode::OK, "text/css", include_str!("pages/web/page.css")),
         "/page.js" => script(include_str!("pages/web/page.js")),
         "/graph.js" => script(include_str!("pages/web/graph.js")),
+        "/time.js" => script(include_str!("pages/web/time.js")),
         "/layout.js" => script(include_str!("pages/web/layout.js")),
         "/dagre.js" => script(include_str!("pages/web/vendor/dagre.js")),
         "/status.json" => json(serde_json::to_string_pretty(&pages.status())),
-        "/state.json" => state(server, Asked::read(uri)).await,
+        "/state.json" => match Asked::read(uri) {
+            asked @ Asked { at: Some(_), .. } => past::state(server, asked).await,
+            asked => state(server, asked).await,
+        },
         "/events" => {
             let mut events = events::listen(server);
             if events.status() == StatusCode::OK {
@@ -183,6 +192,10 @@ struct Asked {
     params: Option<String>,
     /// Show only the parameters with this text in their names.
     search: Option<String>,
+    /// Show the state at this time.
+    at: Option<String>,
+    /// Show also how that state differs from the one at this time.
+    with: Option<String>,
 }
 
 impl Asked {
@@ -194,10 +207,35 @@ impl Asked {
             match &*name {
                 "params" => asked.params = Some(value),
                 "search" => asked.search = Some(value),
+                "at" => asked.at = Some(value),
+                "with" => asked.with = Some(value),
                 _ => {}
             }
         }
         asked
+    }
+
+    /// Answers with a part of the parameters, or with what `whole` makes of the first of them.
+    fn answer(
+        &self,
+        params: &Struct,
+        hide: &Hide,
+        whole: impl FnOnce(Members) -> WholeState,
+    ) -> HttpReply {
+        match (&self.params, &self.search) {
+            (_, Some(search)) => json(serde_json::to_string(&params::search(params, search, hide))),
+            (Some(name), _) => match params::members(params, name, hide) {
+                Some(members) => json(serde_json::to_string(&members)),
+                None => text(
+                    StatusCode::NOT_FOUND,
+                    "there is no such namespace\n".to_owned(),
+                ),
+            },
+            (None, None) => {
+                let members = params::members(params, "", hide).unwrap_or_default();
+                json(serde_json::to_string(&whole(members)))
+            }
+        }
     }
 }
 
@@ -213,6 +251,32 @@ struct WholeState {
     #[serde(flatten)]
     robot: Robot,
     params: Members,
+    /// For an earlier state.
+    #[serde(flatten)]
+    past: Option<Past>,
+}
+
+impl WholeState {
+    fn new(version: u64, mut robot: Robot, params: Members, past: Option<Past>) -> Self {
+        let registrations = robot.digest();
+        let totals = Totals {
+            nodes: robot.nodes.len(),
+            topics: robot.topics.len(),
+            services: robot.services.len(),
+        };
+        robot.nodes.truncate(LISTED);
+        robot.topics.truncate(LISTED);
+        robot.services.truncate(LISTED);
+        Self {
+            schema: SCHEMA,
+            version,
+            registrations,
+            totals,
+            robot,
+            params,
+            past,
+        }
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -228,47 +292,18 @@ async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
     let server = server.clone();
     let work = move || {
         let pages = &server.pages;
-        let (version, params) = (
-            pages.ledger.version(),
-            pages.ledger.with_mirror(Master::with_params_only),
-        );
-        let params = params.params();
-        match (asked.params, asked.search) {
-            (_, Some(search)) => json(serde_json::to_string(&params::search(
-                params,
-                &search,
-                &pages.hide,
-            ))),
-            (Some(name), _) => match params::members(params, &name, &pages.hide) {
-                Some(members) => json(serde_json::to_string(&members)),
-                None => text(
-                    StatusCode::NOT_FOUND,
-                    "there is no such namespace now\n".to_owned(),
-                ),
-            },
-            (None, None) => {
-                let mut robot = Robot::read(&pages.ledger, &pages.nodes);
-                let registrations = robot.digest();
-                let totals = Totals {
-                    nodes: robot.nodes.len(),
-                    topics: robot.topics.len(),
-                    services: robot.services.len(),
-                };
-                robot.nodes.truncate(LISTED);
-                robot.topics.truncate(LISTED);
-                robot.services.truncate(LISTED);
-                let params = params::members(params, "", &pages.hide);
-                json(serde_json::to_string(&WholeState {
-                    schema: SCHEMA,
-                    version,
-                    registrations,
-                    totals,
-                    robot,
-                    params: params.unwrap_or_default(),
-                }))
-            }
-        }
+        let version = pages.ledger.version();
+        let params = pages.ledger.with_mirror(Master::with_params_only);
+        asked.answer(params.params(), &pages.hide, |params| {
+            let robot = Robot::read(&pages.ledger, &pages.nodes);
+            WholeState::new(version, robot, params, None)
+        })
     };
+    in_background(work).await
+}
+
+/// Makes an answer in a thread that may block.
+async fn in_background(work: impl FnOnce() -> HttpReply + Send + 'static) -> HttpReply {
     let made = crate::task::spawn_blocking(work).await;
     made.unwrap_or_else(|error| text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")))
 }

@@ -27,7 +27,7 @@ use super::{
 use crate::{
     limit::rarely,
     master::{self, Kind, Master},
-    upstream::{Head, INSTANCE_HEADER},
+    upstream::{Head, INSTANCE_HEADER, peer::CALLER_HEADER},
     xmlrpc::{Python, Reply},
 };
 
@@ -109,8 +109,10 @@ async fn post(
         return Ok(refuse(&server, peer, &refusal));
     }
     let python = server.calls.ledger.with_mirror(Master::python);
+    let caller = request.headers().get(CALLER_HEADER);
     let head = Head {
         path: request.uri().to_string(),
+        caller: caller.and_then(|caller| caller.to_str().ok()?.parse().ok()),
         encoding: request
             .headers()
             .get(CONTENT_ENCODING)

@@ -21,7 +21,10 @@ use hyper::{
 use hyper_util::rt::TokioIo;
 use tokio::{net::TcpStream, time::timeout};
 
-use super::{CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer, python};
+use super::{
+    CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer,
+    peer::CALLER_HEADER, python,
+};
 use crate::{
     ros_env::MasterUri,
     xmlrpc::{self, Call, Python, Reply},
@@ -187,6 +190,9 @@ impl Connection {
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {
             request = request.header(CONTENT_ENCODING, encoding);
+        }
+        if let Some(caller) = head.caller {
+            request = request.header(CALLER_HEADER, caller.to_string());
         }
         let request = request
             .body(Full::new(body))

@@ -35,6 +35,10 @@ pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
 /// caller has the answer. Some notifications must not be sent earlier.
 pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
+/// Header of a forwarded call: the caller's address, for the journal. It is absent if the caller is on the computer that
+/// forwards the call. Earlier versions never send it, and ignore it.
+pub(crate) const CALLER_HEADER: &str = "x-rosrescue-caller";
+
 /// Why another computer did not answer.
 #[derive(Debug, Error)]
 #[error("{why}")]
@@ -86,7 +90,7 @@ impl Peer {
     ) -> Result<RawReply, PeerError> {
         let head = Head {
             path: format!("{PATH}{term}"),
-            encoding: head.encoding.clone(),
+            ..head.clone()
         };
         let idle = {
             let mut idle = self.idle();

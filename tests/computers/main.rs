@@ -34,6 +34,8 @@ mod etcd;
 mod handover;
 /// Random failures, and a check of all promises.
 mod history;
+/// The log's addresses of callers on several computers.
+mod log;
 /// Writes of a computer that was cut off are merged with the others' writes.
 mod lonely;
 /// Two computers cannot reach each other, or only some of each other's ports.

@@ -59,6 +59,7 @@ mod master {
 /// A new master gets the state, and the health check examines the nodes.
 mod recovery {
     mod addresses;
+    mod dhcp;
     mod health_check;
     mod host_names;
     mod injection;
@@ -112,6 +113,7 @@ mod page {
     mod answers;
     mod browser;
     mod computers;
+    mod past;
 }
 
 /// The commands other than `core` and `proxy`.

@@ -62,6 +62,21 @@ impl Netns {
         format!("{}.1", self.net)
     }
 
+    /// The address of this side after [`Self::move_near`].
+    pub(crate) fn moved(&self) -> String {
+        format!("{}.100", self.net)
+    }
+
+    /// The network interface of this side.
+    pub(crate) fn near_device(&self) -> String {
+        self.near.clone()
+    }
+
+    /// The network interface of the other side.
+    pub(crate) fn far_device(&self) -> String {
+        self.near.replacen('n', "f", 1)
+    }
+
     /// An address of the other side. `host` is from 2 to 39.
     pub(crate) fn far(&self, host: u8) -> String {
         format!("{}.{host}", self.net)
@@ -72,7 +87,7 @@ impl Netns {
         let Self { name, near, .. } = self;
         // `nodad`: usable at once, without a search for duplicates.
         ip(&format!("addr add {}/64 dev {near} nodad", self.near6()));
-        let far = near.replacen('n', "f", 1);
+        let far = self.far_device();
         for host in 2..6 {
             ip(&format!(
                 "-n {name} addr add {}/64 dev {far} nodad",

@@ -18,7 +18,10 @@ use super::generation::append_all;
 use super::load::FILE_BYTES_MAX;
 use super::names::previous;
 use super::{Disk, Names, Storage};
-use rescue_core::checkpoint::format::{self, Framed, Stamp};
+use rescue_core::checkpoint::{
+    format::{self, Framed, Stamp},
+    log::{self, Moment},
+};
 
 /// Size of the records for which a new part begins, in bytes.
 const PART_BYTES_MAX: u64 = 1 << 20;
@@ -276,4 +279,69 @@ pub(super) fn files_on(storage: &impl Storage, names: &Names) -> io::Result<Vec<
         closed: false,
     }));
     Ok(files)
+}
+
+/// A state of the history, and the file from which it was rebuilt.
+#[derive(Debug)]
+pub struct PastState {
+    pub path: PathBuf,
+    /// Size of the file in bytes, decompressed.
+    pub bytes: u64,
+    pub moment: Moment,
+    /// Why later files could not be used, one sentence each.
+    pub unread: Vec<String>,
+}
+
+/// Why there is no state of a time.
+#[derive(Debug, thiserror::Error)]
+pub enum NoPast {
+    #[error("cannot read the folder of the log: {0}")]
+    Folder(#[from] io::Error),
+    /// The whole history is later. The files that could not be used have one sentence each.
+    #[error("there is no state of this time or an earlier one")]
+    Later(Vec<String>),
+}
+
+/// Rebuilds the state that the history of the checkpoint at `path` had at `time`, in milliseconds since 1970. Links in
+/// `path` must be resolved.
+///
+/// # Errors
+///
+/// If there is no usable state of that time.
+pub fn past_state(path: &Path, time: u64) -> Result<PastState, NoPast> {
+    let mut unread = Vec::new();
+    for file in files(path)?.into_iter().rev() {
+        let shown = file.path.display();
+        let text = match file.read() {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            Err(error) => {
+                unread.push(format!("cannot read `{shown}`: {error}"));
+                continue;
+            }
+        };
+        match log::moment(&text, time) {
+            Ok(Some(moment)) => {
+                return Ok(PastState {
+                    bytes: text.len() as u64,
+                    path: file.path,
+                    moment,
+                    unread,
+                });
+            }
+            Ok(None) => {}
+            Err(why) => unread.push(format!("cannot use `{shown}`: {why}")),
+        }
+    }
+    Err(NoPast::Later(unread))
+}
+
+/// The time at which the history of the checkpoint at `path` begins, in milliseconds since 1970. `None` if it is unknown.
+pub fn oldest(path: &Path) -> Option<u64> {
+    let files = files(path).ok()?.into_iter();
+    let mut times = files.filter_map(|file| {
+        let text = file.read().ok()?;
+        Some(format::scan(&text).ok()?.taken_at()).filter(|at| *at > 0)
+    });
+    times.next()
 }

@@ -13,11 +13,11 @@ fn condition_is(name: &str) -> String {
 }
 
 /// Whether the graph has a box with this name.
-fn draws(kind: &str, name: &str) -> String {
+pub(super) fn draws(kind: &str, name: &str) -> String {
     format!("document.querySelector('#picture [data-{kind}=\"{name}\"]')")
 }
 
-fn open(browser: &mut Browser, robot: &Robot) {
+pub(super) fn open(browser: &mut Browser, robot: &Robot) {
     browser.open(&format!("http://127.0.0.1:{}/", robot.port()));
     browser.shows(
         "the page is live",
@@ -26,7 +26,7 @@ fn open(browser: &mut Browser, robot: &Robot) {
 }
 
 /// Checks that the page asked no other host and reported no error.
-fn assert_clean(browser: &Browser, robot: &Robot) {
+pub(super) fn assert_clean(browser: &Browser, robot: &Robot) {
     assert_eq!(browser.complaints(), Vec::<String>::new());
     let own = format!("http://127.0.0.1:{}/", robot.port());
     let requests = browser.requests();

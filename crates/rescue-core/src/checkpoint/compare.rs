@@ -41,7 +41,23 @@ pub struct Difference {
     pub registrations: Vec<String>,
 }
 
+/// A difference with its description.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Described {
+    pub text: String,
+    #[serde(flatten)]
+    pub difference: Difference,
+}
+
 impl Difference {
+    /// Adds the [`text`](Self::text).
+    pub fn described(self, names: [&str; 2]) -> Described {
+        Described {
+            text: self.text(names),
+            difference: self,
+        }
+    }
+
     /// Describes the difference. The arguments are names for A and B.
     pub fn text(&self, [a, b]: [&str; 2]) -> String {
         let (name, node) = (&self.name, self.node.as_deref().unwrap_or_default());

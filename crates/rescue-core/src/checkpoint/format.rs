@@ -84,7 +84,7 @@ pub enum Origin {
     Unknown,
     /// rosrescue itself, for example its health check.
     Rosrescue,
-    /// A program at this address. A call through another computer's rosrescue has that computer's address.
+    /// A program at this address, or on the computer with this address.
     At(IpAddr),
 }
 

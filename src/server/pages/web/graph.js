@@ -16,16 +16,16 @@ const TOOLS = ["/rqt_", "/rviz", "/rosapi", "/rosbridge", "/record_", "/rostopic
 const isDebug = (name) => HIDDEN.includes(name) || TOOLS.some((tool) => name.startsWith(tool));
 
 /**
- * The boxes and lines to draw. `filter` keeps the names that contain it and their neighbours, `leaves` adds topics without a
+ * The boxes and lines to draw. `changed` has what to mark. `filter` keeps the names that contain it and their neighbours, `leaves` adds topics without a
  * publisher or without a subscriber, `debug` adds rosout and tools.
  */
-export function select(robot, { filter, leaves, debug }) {
+export function select(robot, changed, { filter, leaves, debug }) {
   const shown = (name) => debug || !isDebug(name);
   const matches = (name) => name.toLowerCase().includes(filter.toLowerCase());
   const [boxes, lines, placeOf] = [[], [], new Map()];
   const box = (kind, name, health) => {
     const key = `${kind} ${name}`;
-    if (!placeOf.has(key)) placeOf.set(key, boxes.push({ kind, name, health }) - 1);
+    if (!placeOf.has(key)) placeOf.set(key, boxes.push({ kind, name, health, changed: changed.has(key) }) - 1);
     return placeOf.get(key);
   };
   const healthOf = new Map(robot.nodes.map((node) => [node.name, node.health]));
@@ -40,7 +40,7 @@ export function select(robot, { filter, leaves, debug }) {
       const [node, other] = [box("node", name, healthOf.get(name) ?? "unchecked"), box("topic", topic.name)];
       const publishes = topic.publishers.includes(name);
       const [from, to] = publishes ? [node, other] : [other, node];
-      lines.push({ from, to, both: publishes && topic.subscribers.includes(name) });
+      lines.push({ from, to, changed: changed.has(`line ${name} ${topic.name}`), both: publishes && topic.subscribers.includes(name) });
     }
   }
   return { boxes, lines };
@@ -133,20 +133,21 @@ function curve(points) {
 
 /** The picture of a graph, with its boxes and lines where `placed` has them. */
 export function draw(graph, placed) {
-  const lines = graph.lines.map(({ from, to, both }, index) => {
+  const lines = graph.lines.map(({ from, to, both, changed }, index) => {
     const points = [...placed.lines[index]];
     points[0] = edge(graph.boxes[from], placed.boxes[from], points[1]);
     points[points.length - 1] = edge(graph.boxes[to], placed.boxes[to], points.at(-2));
     const arrows = { "marker-end": "url(#arrow)", ...(both && { "marker-start": "url(#arrow)" }) };
-    return shape("path", { "data-from": from, "data-to": to, d: curve(points), ...arrows });
+    return shape("path", { class: changed ? "changed" : "", "data-from": from, "data-to": to, d: curve(points), ...arrows });
   });
-  const boxes = graph.boxes.map(({ kind, name, health, label, width, height }, index) => {
+  const boxes = graph.boxes.map(({ kind, name, health, changed, label, width, height }, index) => {
     const { x, y } = placed.boxes[index];
     const outline = kind === "node"
       ? shape("ellipse", { cx: x, cy: y, rx: width / 2, ry: height / 2 })
       : shape("rect", { x: x - width / 2, y: y - height / 2, width, height, rx: 3 });
-    const words = health && health !== "alive" ? `${kind} ${name}, ${health}` : `${kind} ${name}`;
-    return shape("g", { class: `box ${kind} ${health ?? ""}`, "data-id": index, [`data-${kind}`]: name, role: "button", "aria-label": words },
+    const state = health && !["alive", "registered"].includes(health) && health;
+    const words = [`${kind} ${name}`, state, changed && "changed"].filter(Boolean).join(", ");
+    return shape("g", { class: `box ${kind} ${health ?? ""} ${changed ? "changed" : ""}`, "data-id": index, [`data-${kind}`]: name, role: "button", "aria-label": words },
       shape("title", {}, words), outline, shape("text", { x, y: y + 4, "text-anchor": "middle" }, label));
   });
   const arrow = shape("marker", { id: "arrow", viewBox: "0 0 8 8", refX: 7.5, refY: 4, markerWidth: 8, markerHeight: 8, markerUnits: "userSpaceOnUse", orient: "auto-start-reverse" },

@@ -2,6 +2,7 @@
 // as text, never as markup.
 
 import { abandon, draw, layOut, measure, select } from "/graph.js";
+import { begin as beginTimeLine, changed, past, query, readPast } from "/time.js";
 
 const $ = (id) => document.getElementById(id);
 /** Rows of a list; more are found by searching. */
@@ -36,6 +37,8 @@ const ILL = { dead: "dead", unreachable: "unreachable", unchecked: "not checked"
 let status = null;
 let now = null;
 let robot = null;
+/** The state that the graph and the lists show. */
+const shownState = () => past ?? robot;
 /** Milliseconds by which the robot's clock is ahead of this one. */
 let skew = 0;
 
@@ -193,8 +196,10 @@ async function readState() {
       robot = await answer.json();
       showCounts();
       const isOther = before?.registrations !== robot.registrations;
-      if (isOther || JSON.stringify(before.params) !== JSON.stringify(robot.params)) showList();
-      if (isOther) showGraph();
+      const isNew = isOther || JSON.stringify(before.params) !== JSON.stringify(robot.params);
+      if (isNew) readPast();
+      if (isNew && !past) showList();
+      if (isOther && !past) showGraph();
     }
   } catch {
     // The next event requests it again.
@@ -395,11 +400,11 @@ const isTall = () => window.innerHeight > window.innerWidth;
 
 /** Draws the graph, or draws it again when the drawing under way is done. */
 async function showGraph() {
-  if (!robot) return;
+  if (!shownState()) return;
   redraw = drawing;
   if (drawing) return;
   drawing = true;
-  const graph = measure(select(robot, {
+  const graph = measure(select(shownState(), changed, {
     filter: $("graph-filter").value.trim(),
     leaves: $("graph-leaves").checked,
     debug: $("graph-debug").checked,
@@ -572,12 +577,13 @@ function nameList(title, kind, names) {
 function showDetails() {
   const panel = $("details");
   panel.hidden = !chosen;
+  const robot = shownState();
   if (!chosen || !robot) return;
   const [kind, name] = chosen;
   const found = (kind === "node" ? robot.nodes : robot.topics).find((of) => of.name === name);
   const parts = [el("h3", {}, name)];
   if (!found) {
-    parts.push(el("p", {}, "It is no longer registered."));
+    parts.push(el("p", {}, past ? "It was not registered then." : "It is no longer registered."));
   } else if (kind === "node") {
     parts.push(
       el("p", {}, health(found), found.api ? ` ${found.api}` : "", found.pid ? `, process ${found.pid}` : ""),
@@ -594,6 +600,7 @@ function showDetails() {
 }
 
 function health(node) {
+  if (past) return "";
   const texts = {
     alive: "alive",
     unchecked: node.checked_at ? `not checked since ${moment(node.checked_at)}` : "not checked yet",
@@ -625,6 +632,7 @@ function selectTab(next, focus) {
 }
 
 function showList() {
+  const robot = shownState();
   if (!robot) return;
   const text = $("list-filter").value.trim().toLowerCase();
   if (tab === "params") return showParams(text);
@@ -642,7 +650,8 @@ function showList() {
     services: ["service", "node", "address"],
   }[tab];
   const left = rows.length - ROWS + Math.max(0, robot.totals[tab] - robot[tab].length);
-  const body = rows.slice(0, ROWS).map((row) => el("tr", {}, ...row.map((cell, index) => {
+  const isChanged = ([cell]) => changed.has(`${tab.slice(0, -1)} ${cell.textContent ?? cell}`);
+  const body = rows.slice(0, ROWS).map((row) => el("tr", { class: isChanged(row) && "changed" }, ...row.map((cell, index) => {
     const label = index > 0 && heads[index] ? heads[index] : undefined;
     const kind = !Array.isArray(cell) ? undefined : label === "address" ? "names where" : "names";
     return el("td", { class: kind, "data-label": label }, ...[cell].flat());
@@ -679,7 +688,7 @@ let asked = 0;
 async function showParams(text) {
   const number = ++asked;
   if (!text) {
-    const { members, more } = robot.params;
+    const { members, more } = shownState().params;
     return $("list").replaceChildren(members.length ? paramList(members, more, "") : el("p", { class: "quiet" }, "no parameters"));
   }
   const found = await ask({ search: text });
@@ -688,9 +697,13 @@ async function showParams(text) {
   $("list").replaceChildren(list);
 }
 
-async function ask(query) {
+async function ask(part) {
   try {
-    const answer = await fetch(`/state.json?${new URLSearchParams(query)}`);
+    const answer = await fetch(`/state.json?${new URLSearchParams({ ...query(), ...part })}`);
+    if (answer.status === 503) {
+      await new Promise((resolve) => setTimeout(resolve, 300));
+      return await ask(part);
+    }
     return answer.ok ? await answer.json() : null;
   } catch {
     return null;
@@ -701,11 +714,11 @@ async function ask(query) {
 function paramList(entries, more, above) {
   const items = entries.map((entry) => {
     const name = above === null ? entry.name : `${above}/${entry.name}`;
-    if (entry.type === "namespace") return el("li", {}, namespace(entry, name));
+    if (entry.type === "namespace") return el("li", { class: changed.has(`param ${name}`) && "changed" }, namespace(entry, name));
     const value = entry.hidden
       ? el("i", {}, "(hidden)")
       : el("span", {}, entry.value + (entry.cut ? " …" : ""));
-    return el("li", { class: "param", title: `${name}, ${entry.type}` }, el("b", {}, entry.name), ": ", value);
+    return el("li", { class: changed.has(`param ${name}`) ? "param changed" : "param", title: `${name}, ${entry.type}` }, el("b", {}, entry.name), ": ", value);
   });
   if (more) items.push(el("li", { class: "quiet" }, `${more} more: search for a name`));
   return el("ul", {}, ...items);
@@ -760,4 +773,11 @@ setInterval(() => {
     connect();
   }
 }, 1000);
+beginTimeLine({
+  el, say, moment, robotTime,
+  redraw: () => {
+    showGraph();
+    showList();
+  },
+});
 connect();

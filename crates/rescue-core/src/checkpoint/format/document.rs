@@ -170,12 +170,13 @@ fn is_key(method: &str) -> bool {
         && letters.first().is_some_and(u8::is_ascii_lowercase)
 }
 
-/// Writes the end of a record: when it was made and by whom.
+/// Writes the end of a record: when it was made and by whom. A record of a caller on this computer has no more bytes
+/// than one in format 1, which had no label. For that, two of its commas have no blank behind them.
 fn write_label(out: &mut Vec<u8>, label: Label) {
     if label.at == 0 {
         return;
     }
-    out.extend_from_slice(b", t: ");
+    out.extend_from_slice(b",t: ");
     decimal(out, label.at);
     let from = match label.origin {
         Origin::COMMON => return,
@@ -253,7 +254,10 @@ pub(super) fn write_record(
             pending,
             label,
         } => {
-            out.extend_from_slice(b", ");
+            out.extend_from_slice(match form {
+                Form::Short => b",".as_slice(),
+                Form::Long => b", ",
+            });
             write_call(out, call, form)?;
             if *pending {
                 out.extend_from_slice(b", pending: true");

@@ -471,7 +471,7 @@ fn time_at_end(body: &[u8]) -> Option<u64> {
         false => text,
     };
     let (before, digits) = text.rsplit_once(": ")?;
-    let is_time = before.ends_with(" t") || before.ends_with(" at");
+    let is_time = [",t", " t", " at"].iter().any(|key| before.ends_with(key));
     is_time.then(|| digits.parse().ok()).flatten()
 }
 

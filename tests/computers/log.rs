@@ -1,0 +1,47 @@
+use crate::alone;
+use crate::computer::PORT;
+use crate::fleet::Fleet;
+use crate::support::{Client, encode_call, eventually, params, request};
+
+/// The address from which `key` was set, according to the log of each computer.
+fn origins(fleet: &Fleet, key: &str) -> Vec<String> {
+    let origin = |computer: &crate::computer::Computer| {
+        let checkpoint = computer.path("chkpt.yaml");
+        let checkpoint = checkpoint.to_str().unwrap();
+        let arguments = ["log", "--json", "--param", key, "--checkpoint", checkpoint];
+        let (_, text) = computer.rosrescue(&arguments);
+        let entry: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
+        entry["from"].as_str().unwrap_or_default().to_owned()
+    };
+    fleet.computers.iter().map(origin).collect()
+}
+
+#[test]
+fn the_log_of_every_computer_has_the_callers_address() {
+    let _alone = alone();
+    let fleet = Fleet::quick(&[]);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    let [follower, caller] = [&fleet.computers[rest[0]], &fleet.computers[rest[1]]];
+    caller.within(|| Client::at(&follower.address(), PORT).set_param("/far", 1));
+    follower.set_param("/near", 1);
+    // A follower of an earlier version names no caller.
+    let leading = &fleet.computers[leader];
+    let status = leading.status().unwrap();
+    let term = status["cluster"]["leader"]["term"].as_u64().unwrap();
+    let body = encode_call("setParam", params!["/old", "/earlier", 1]);
+    let head = format!("POST /cluster/{term} HTTP/1.1");
+    let call = request(&head, &["Content-Type: text/xml"], &body);
+    let answer = caller.within(|| Client::at(&leading.address(), PORT).exchange(&call));
+    assert_eq!(answer.unwrap().code, 200);
+    for (key, from) in [
+        ("/far", caller.address()),
+        ("/near", follower.address()),
+        ("/earlier", caller.address()),
+    ] {
+        let wanted = vec![from; 3];
+        eventually(&format!("the log of all has {key}"), || {
+            origins(&fleet, key) == wanted
+        });
+    }
+}
