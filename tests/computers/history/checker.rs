@@ -140,6 +140,18 @@ impl<'a> Judge<'a> {
         })
     }
 
+    /// Whether computers led in different terms between these times.
+    fn takeover_in(&self, from: Time, to: Time) -> bool {
+        let samples = self.history.samples.iter();
+        let between = samples.filter(|it| it.from <= to && it.to >= from);
+        let mut leaders = between.filter_map(|it| match it.says {
+            Says::Leads(term) => Some((it.computer, term)),
+            _ => None,
+        });
+        let first = leaders.next();
+        leaders.any(|leader| Some(leader) != first)
+    }
+
     fn writes_by_key(&self) -> BTreeMap<&'a str, Vec<Write<'a>>> {
         let mut keys: BTreeMap<&str, Vec<Write<'_>>> = BTreeMap::new();
         for op in &self.history.ops {
@@ -220,7 +232,15 @@ impl<'a> Judge<'a> {
                 // A leader may have shown a write that etcd never got, and the writer's computer acknowledged it later,
                 // while it was cut off. The others get such a write with the merge.
                 let elsewhere = |it: &&Write<'_>| it.alone && it.op.computer != op.computer;
-                if let Some(write) = write.filter(|it| !it.excused && !elsewhere(it))
+                // The next leader may lack a write that the previous one showed before it was acknowledged, until its
+                // computer sends it again.
+                let lost_for_a_while = |it: &&Write<'_>| {
+                    let acknowledged = it.op.end.filter(|acknowledged| *acknowledged > end);
+                    acknowledged.is_some_and(|until| self.takeover_in(op.start, until))
+                };
+                let counts =
+                    |it: &&Write<'_>| !it.excused && !elsewhere(it) && !lost_for_a_while(it);
+                if let Some(write) = write.filter(counts)
                     && let Some(acknowledged) = write.op.end
                 {
                     let floor = (end.max(acknowledged), write.op);
@@ -512,6 +532,28 @@ mod tests {
             read(2, 1, 25 * S, 25 * S + 1),
         ];
         bad(&before, &[], Some(2), "goes back");
+    }
+
+    #[test]
+    fn the_next_leader_may_lack_for_a_while_what_the_previous_one_showed_early() {
+        let ops = [
+            write(0, 1, 1, 2),
+            write(0, 2, S, 3 * S),
+            read(1, 2, 2 * S, 2 * S + 1),
+            read(1, 1, 4 * S, 4 * S + 1),
+        ];
+        bad(&ops, &[], Some(2), "goes back");
+        let leads = |computer, at, term| says(computer, at, at + 1, Says::Leads(Some(term)));
+        let history = History {
+            ops: ops.to_vec(),
+            samples: vec![leads(1, 2 * S, 1), leads(0, 5 * S / 2, 2)],
+            ..History::default()
+        };
+        let end = End {
+            values: BTreeMap::from([(KEY.to_owned(), 2)]),
+            told: Vec::new(),
+        };
+        assert_eq!(violations(&history, &end), <[String; 0]>::default());
     }
 
     #[test]

@@ -240,13 +240,14 @@ impl World {
             Event::Forward(from, to, term, call) => {
                 let computer = &self.computers[to];
                 // A caller that has the answer to an earlier attempt has closed the connection of a later one.
-                if computer.up
-                    && !self.history.is_heard(call)
-                    && self.network.joins(from, to)
-                    && computer.standing.answers_others(term)
-                {
+                if !computer.up || self.history.is_heard(call) || !self.network.joins(from, to) {
+                    return;
+                }
+                if computer.standing.answers_others(term) {
                     self.run_call(to, call, from);
                     self.input_changes(to);
+                } else if self.network.joins(to, from) {
+                    self.refused(from, call);
                 }
             }
             Event::Done(at, life, call, place) => {

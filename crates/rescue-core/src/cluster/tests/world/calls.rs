@@ -134,6 +134,15 @@ impl World {
         }
     }
 
+    /// Has a forwarded call sent again soon, because the other computer does not lead.
+    pub(super) fn refused(&mut self, at: usize, call: usize) {
+        let again = self.now + POLL;
+        let waiting = self.computers[at].waiting.iter_mut();
+        for (_, missed) in waiting.filter(|(of, _)| *of == call) {
+            *missed = again.min(*missed);
+        }
+    }
+
     /// Notes that a call of this computer's nodes was answered.
     pub(super) fn done(&mut self, at: usize, call: usize) {
         let computer = &mut self.computers[at];
