@@ -7,6 +7,7 @@ mod units;
 
 use std::{
     collections::BTreeMap,
+    ffi::OsString,
     fmt, fs,
     io::{self, IsTerminal, Write},
     net::{SocketAddr, TcpListener},
@@ -24,7 +25,7 @@ use super::{
     print,
 };
 use crate::{
-    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs},
+    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
     config::Config,
     process,
     server::listener,
@@ -574,7 +575,9 @@ fn read_service(
     let command = Cli::command()
         .mut_args(|option| option.env(None::<&str>))
         .mut_subcommands(|command| command.mut_args(|option| option.env(None::<&str>)));
-    let all = std::iter::once("rosrescue").chain(words.iter().map(String::as_str));
+    let mut all = vec![OsString::from("rosrescue")];
+    all.extend(words.iter().map(OsString::from));
+    config_file::insert(&command, &mut all).map_err(usage)?;
     let matches = command.try_get_matches_from(all).map_err(|error| {
         let text = error.to_string();
         let lines = text.lines().take_while(|line| !line.is_empty());
@@ -607,6 +610,7 @@ fn read_service(
         ),
     };
     let files = [
+        common.config.as_ref(),
         common.checkpoint.as_ref(),
         rosmaster.and_then(Option::as_ref),
     ];

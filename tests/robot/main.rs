@@ -100,6 +100,7 @@ mod limits {
 mod cli {
     mod addresses;
     mod as_roscore;
+    mod config_file;
     mod log;
     mod options;
     mod secrets;
