@@ -83,6 +83,7 @@ mod clients {
     mod connections;
     mod forwarding;
     mod hostile;
+    mod ipv6;
     mod networks;
     mod reads;
 }
