@@ -63,12 +63,26 @@ struct Plan {
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
+    needs_root(&place, &args.scope)?;
     carry_out(&install(args, &place)?, &place, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
+    needs_root(&place, &args.scope)?;
     carry_out(&uninstall(&place), &place, &args.scope)
+}
+
+/// Refuses a service of the computer without root, before any other obstacle is reported.
+fn needs_root(place: &Place, args: &ScopeArgs) -> Result<(), CommandFailure> {
+    if place.user || args.dry_run || rustix::process::geteuid().is_root() {
+        return Ok(());
+    }
+    let words: Vec<_> = std::env::args().skip(1).collect();
+    Err(CommandFailure::Usage(format!(
+        "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
+        words.join(" ")
+    )))
 }
 
 /// Where the unit files go, and which systemd runs the service.
@@ -305,13 +319,6 @@ fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Comma
         } else {
             Exit::Bad
         });
-    }
-    if !place.user && !rustix::process::geteuid().is_root() {
-        let words: Vec<_> = std::env::args().skip(1).collect();
-        return Err(CommandFailure::Usage(format!(
-            "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
-            words.join(" ")
-        )));
     }
     if args.yes {
         print(plan, &args.output)?;
