@@ -1,6 +1,6 @@
 #!/bin/sh
-# packaging/build-all.sh [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for all three,
-# in target/packages, with SHA256SUMS. Any amd64 computer will do: zig links for the old glibc 2.17 and compiles C for the
+# packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for all three,
+# in target/packages, with SHA256SUMS, signed by this key of gpg in SHA256SUMS.asc. Any amd64 computer will do: zig links for the old glibc 2.17 and compiles C for the
 # other processors. Run twice, in whichever folders, it makes the same bytes.
 #
 # Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools. Without rustup,
@@ -18,6 +18,12 @@ fail() { # MESSAGE
     echo "build-all.sh: $1" >&2
     exit 1
 }
+
+key=
+if [ "${1:-}" = --sign ]; then
+    key=$2
+    shift 2
+fi
 
 tools=$target/tools/zig
 case $tools in /*) ;; *) tools=$checkout/$tools ;; esac
@@ -66,4 +72,5 @@ for processor in amd64 "$@"; do
     packaging/build-deb.sh --target "$triple" --output "$packages"
 done
 cd "$packages"
-sha256sum ./*.deb >SHA256SUMS
+sha256sum -- *.deb >SHA256SUMS
+[ -z "$key" ] || gpg --batch --yes --armor --local-user "$key" --detach-sign SHA256SUMS

@@ -64,6 +64,9 @@ packaging/build-book.sh >/dev/null || [ $? = 3 ]
 mv target/book-source "$assets/doc"
 [ ! -d target/book ] || mv target/book "$assets/doc/html"
 cp -r examples/systemd examples/grafana examples/prometheus "$assets/doc/examples/"
+# This computer's strip knows only its own processor. The profile has stripped the program already.
+strip=--strip
+[ -z "$triple" ] || strip=--no-strip
 # shellcheck disable=SC2086 # no version, no words
-CARGO_TARGET_DIR=$target "$deb" --quiet --locked --no-build --profile "$profile" --strip $fast \
+CARGO_TARGET_DIR=$target "$deb" --quiet --locked --no-build --profile "$profile" $strip $fast \
     ${version:+--deb-version "$version"} ${triple:+--target "$triple" --variant old-glibc} --output "$output"

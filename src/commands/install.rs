@@ -64,13 +64,13 @@ struct Plan {
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
     needs_root(&place, &args.scope)?;
-    carry_out(&install(args, &place)?, &place, &args.scope)
+    carry_out(&install(args, &place)?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
     needs_root(&place, &args.scope)?;
-    carry_out(&uninstall(&place), &place, &args.scope)
+    carry_out(&uninstall(&place), &args.scope)
 }
 
 /// Refuses a service of the computer without root, before any other obstacle is reported.
@@ -311,7 +311,7 @@ fn uninstall(place: &Place) -> Plan {
 }
 
 /// Shows the plan, asks, and makes the changes.
-fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
+fn carry_out(plan: &Plan, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
     if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
         print(plan, &args.output)?;
         return Ok(if plan.obstacles.is_empty() {

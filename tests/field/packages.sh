@@ -32,6 +32,7 @@ make() { # SUITE PROCESSOR
     debootstrap --arch="$2" --variant=minbase "$check" --components="$components" "$1" "$root.new" "$archive" >&2
     in_root "$root.new" apt-get install -y --no-install-recommends "$python-rosmaster" procps >&2
     rm -rf "$root.new"/var/cache/apt/archives/*.deb
+    echo "127.0.0.1 localhost" >"$root.new/etc/hosts"
     mv "$root.new" "$root"
 }
 
@@ -54,7 +55,7 @@ earlier() { # PACKAGE NEW_PACKAGE
     parts=$(mktemp -d)
     dpkg-deb -R "$1" "$parts"
     sed -i 's/^Version: .*/Version: 0.1.9-1/' "$parts/DEBIAN/control"
-    dpkg-deb -b "$parts" "$2" >&2
+    dpkg-deb -Zgzip -z1 -b "$parts" "$2" >&2
     rm -rf "$parts"
 }
 
@@ -79,8 +80,10 @@ except ImportError: from xmlrpclib import ServerProxy
 print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         start() {
             ROS_IP=127.0.0.1 ROS_LOG_DIR=/tmp/log rosrescue core --no-rosout >>/tmp/said 2>&1 &
-            rosrescue wait --timeout 120
+            rosrescue wait --timeout 60 || { cat /tmp/said; exit 1; }
         }
+        # An earlier run may have failed.
+        dpkg -P rosrescue
         rm -rf /tmp/log /tmp/said
         list >/tmp/before
         begin=$(date +%s)
@@ -88,21 +91,21 @@ print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         start
         echo "installed and running after $(($(date +%s) - begin)) s"
         call "setParam(\"/test\", \"/kept\", 7)"
-        kill -9 $(pgrep -f "bin/rosmaster")
+        kill -9 $(pgrep -f "bin[/]rosmaster")
         call "getParam(\"/test\", \"/kept\")" | grep " 7]"
         # Calls pass to the next master.
         until rosrescue status --json | grep -q "\"open\": true"; do sleep 0.1; done
         dpkg -i /given/new.deb
         pkill -9 -x rosrescue
-        master=$(pgrep -f "bin/rosmaster")
+        master=$(pgrep -f "bin[/]rosmaster")
         start
         call "getParam(\"/test\", \"/kept\")" | grep " 7]"
         until rosrescue status --json | grep -q "\"open\": true"; do sleep 0.1; done
-        test "$(pgrep -f "bin/rosmaster")" = "$master"
+        test "$(pgrep -f "bin[/]rosmaster")" = "$master"
         rosrescue --version
         pkill -TERM -o -x rosrescue
         while pgrep -x rosrescue; do sleep 0.1; done >/dev/null
-        test -z "$(pgrep -f bin/rosmaster)"
+        test -z "$(pgrep -f bin[/]rosmaster)"
         dpkg -r rosrescue
         test ! -e /usr/bin/rosrescue
         dpkg -P rosrescue
