@@ -3,6 +3,7 @@
 //! anything. Nor have those that choose a time or a name in the log: the command would show another state than asked.
 
 pub(crate) mod cluster;
+pub(crate) mod config_file;
 mod files;
 mod live;
 mod serve;
@@ -10,18 +11,21 @@ mod service;
 mod tools;
 mod when;
 
-use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use std::ffi::OsString;
+
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, error::ErrorKind};
 
 pub use self::{
     cluster::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
+    config_file::OptionValue,
     files::{
         CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReadArgs,
         ReportArgs, RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{
-        CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, ReapArgs, ReapNodes, RestoreChoice,
-        SyncPolicy,
+        CommonArgs, CoreArgs, LogFormat, LoggingArgs, ProxyArgs, Reads, ReapArgs, ReapNodes,
+        RestoreChoice, SyncPolicy,
     },
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
@@ -46,8 +50,10 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Reads the command line and the environment. Ends the process with a message if they are wrong.
-    pub fn read() -> Self {
+    /// Reads the command line, the environment and the configuration file. Ends the process with a message if they are
+    /// wrong. Returns also the words of the command line with the options of the file, for a worker, which does not read
+    /// the file again: an edit must not keep it from starting.
+    pub fn read(is_worker: bool) -> (Self, Vec<OsString>) {
         let mut command = Self::command();
         let mut words: Vec<_> = std::env::args_os().collect();
         if words.get(1).is_some_and(|first| first == "help") {
@@ -61,8 +67,25 @@ impl Cli {
             // The variables of the options of `core` must not count as options given before another command.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
-        let matches = command.get_matches_from(words);
-        Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+        let refuse = |why| -> ! {
+            Self::command()
+                .error(ErrorKind::ValueValidation, why)
+                .exit()
+        };
+        let file = match is_worker {
+            true => Ok(config_file::FromFile::default()),
+            false => config_file::insert(&command, &mut words),
+        };
+        let file = file.unwrap_or_else(|why| refuse(why));
+        let matches = command.clone().get_matches_from(&words);
+        let mut cli = Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+        if let Some(Command::Tool(Tool::Check(args))) = &mut cli.command
+            && let Some((_, checked)) = matches.subcommand()
+        {
+            args.settings =
+                config_file::settings(&command, checked, &file).unwrap_or_else(|why| refuse(why));
+        }
+        (cli, words)
     }
 }
 

@@ -8,6 +8,7 @@
 //! Under systemd a socket unit replaces it.
 
 use std::{
+    ffi::OsString,
     io::{self, Read},
     net::TcpListener,
     os::{
@@ -60,17 +61,17 @@ pub enum GuardianError {
     Handover(#[from] FdMappingCollision),
 }
 
-/// Runs workers that serve `listeners` until one stops cleanly. Returns the exit status.
+/// Runs workers with the command line `words` that serve `listeners`, until one stops cleanly. Returns the exit status.
 ///
 /// # Errors
 ///
 /// If the first worker cannot be started, or signals cannot be received. Later failures are retried forever.
-pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
+pub fn run(listeners: &[TcpListener], words: &[OsString]) -> Result<i32, GuardianError> {
     evade_oom_killer();
     take_priority();
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
-    let mut worker = Worker::start(listeners, 0)?;
+    let mut worker = Worker::start(listeners, words, 0)?;
     let mut count = 0;
     loop {
         let end = worker.run_until_end(&signals, |signal| restarts.stop(signal));
@@ -93,7 +94,7 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         }
         let stop;
         count += 1;
-        (worker, stop) = start_again(listeners, &signals, pause, count)?;
+        (worker, stop) = start_again(listeners, words, &signals, pause, count)?;
         if let Some(signal) = stop.or_else(|| restarts.stopped_by()) {
             restarts.stop(signal);
             worker.pass_on(signal);
@@ -105,13 +106,14 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
 /// worker. After a signal the new worker only ends the processes that the dead worker left running.
 fn start_again(
     listeners: &[TcpListener],
+    words: &[OsString],
     signals: &Receiver<i32>,
     mut pause: Duration,
     restarts: u64,
 ) -> Result<(Worker, Option<i32>), GuardianError> {
     loop {
         let stop = wait(signals, pause)?;
-        match Worker::start(listeners, restarts) {
+        match Worker::start(listeners, words, restarts) {
             Ok(worker) => return Ok((worker, stop)),
             Err(error) if stop.is_some() => return Err(error),
             Err(error) => {
@@ -149,7 +151,11 @@ struct Worker {
 }
 
 impl Worker {
-    fn start(listeners: &[TcpListener], restarts: u64) -> Result<Self, GuardianError> {
+    fn start(
+        listeners: &[TcpListener],
+        words: &[OsString],
+        restarts: u64,
+    ) -> Result<Self, GuardianError> {
         let (link, of_worker) = UnixStream::pair()?;
         link.set_read_timeout(Some(START_TIME))?;
         let mut passed = Vec::new();
@@ -163,11 +169,11 @@ impl Worker {
             parent_fd,
             child_fd,
         });
-        let mut arguments = std::env::args_os();
         let mut command = Command::new(PROGRAM);
+        if let Some((name, arguments)) = words.split_first() {
+            command.arg0(name).args(arguments);
+        }
         command
-            .arg0(arguments.next().unwrap_or_else(|| "rosrescue".into()))
-            .args(arguments)
             .env(handover::LISTEN_FDS, count)
             .env(handover::GUARDIAN, std::process::id().to_string())
             .env(handover::RESTARTS, restarts.to_string())

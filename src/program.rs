@@ -2,6 +2,7 @@
 
 use std::{
     error::Error,
+    ffi::OsString,
     io::{IsTerminal, Write},
     process::ExitCode,
     time::{Duration, Instant},
@@ -9,7 +10,7 @@ use std::{
 
 use crate::{
     app,
-    cli::{Cli, Command, CommonArgs, LogFormat},
+    cli::{Cli, Command, LogFormat, LoggingArgs},
     commands,
     config::Config,
     guardian::{
@@ -50,7 +51,10 @@ pub fn main() -> ExitCode {
         // The worker is started as /proc/self/exe, so without this its name would be `exe`.
         let _ = rustix::thread::set_name(c"rosrescue");
     }
-    let cli = Cli::read();
+    let is_worker = sockets
+        .as_ref()
+        .is_some_and(|sockets| matches!(sockets.guard, Guard::Guardian { .. }));
+    let (cli, words) = Cli::read(is_worker);
     let env = |name: &str| std::env::var(name).ok();
     let hostname = rustix::system::uname()
         .nodename()
@@ -85,7 +89,7 @@ pub fn main() -> ExitCode {
             .error(ErrorKind::ValueValidation, error)
             .exit(),
     };
-    if let Err(error) = start_log(common, verbose) {
+    if let Err(error) = start_log(&common.logging, verbose) {
         Cli::command()
             .error(ErrorKind::ValueValidation, error)
             .exit();
@@ -95,7 +99,7 @@ pub fn main() -> ExitCode {
     {
         config.serve_at(sockets.addresses(), &env);
     }
-    match start(config, sockets, common.no_guardian, hostname) {
+    match start(config, sockets, common.no_guardian, hostname, words) {
         Ok(status) => ExitCode::from(u8::try_from(status).unwrap_or(1)),
         Err(error) => {
             eprintln!("rosrescue: {error}");
@@ -110,13 +114,14 @@ fn start(
     sockets: Option<Sockets>,
     no_guardian: bool,
     hostname: String,
+    words: Vec<OsString>,
 ) -> Result<i32, Box<dyn Error>> {
     let sockets = match sockets {
         Some(sockets) => sockets,
         None => {
             let listeners = listener::bind(&config.listen, config.port_option())?;
             if !no_guardian {
-                return Ok(guardian::run(&listeners)?);
+                return Ok(guardian::run(&listeners, &words)?);
             }
             Sockets::own(listeners)
         }
@@ -191,7 +196,7 @@ fn colour_is_welcome() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
+fn start_log(args: &LoggingArgs, verbose: bool) -> Result<(), String> {
     let default = if verbose {
         "warn,rosrescue=debug,etcd_kv=debug"
     } else {

@@ -1,6 +1,7 @@
 //! The status of rosrescue as plain data for people and monitors. Other modules fill it; nothing
 //! waits for it.
 
+pub(crate) mod call_times;
 pub(crate) mod cluster;
 pub(crate) mod computers;
 pub(crate) mod condition;

@@ -35,6 +35,7 @@ robot_missing() {
     need libdiagnostic-aggregator-tools has_node diagnostic_aggregator/aggregator_node
     need libdiagnostic-aggregator-dev has_package diagnostic_aggregator
     need python3-diagnostic-common-diagnostics has_node diagnostic_common_diagnostics/cpu_monitor.py
+    need python3-prometheus-client /usr/bin/python3 -c 'import prometheus_client.openmetrics.parser'
     need python3-psutil /usr/bin/python3 -c 'import psutil'
     need python3-rosbag has_node rosbag/record
     need python3-dynamic-reconfigure /usr/bin/python3 -c 'import dynamic_reconfigure'

@@ -17,6 +17,7 @@ fi
 . tests/install_robot.sh
 . tests/install_chromium.sh
 . tests/install_etcd.sh
+. tests/install_prometheus.sh
 
 cargo fmt --all --check
 cargo clippy --locked --workspace --all-targets -- -D warnings

@@ -83,6 +83,9 @@ pub struct ProxyArgs {
 /// Options that `core` and `proxy` share.
 #[derive(Args, Clone, Debug)]
 pub struct CommonArgs {
+    /// Configuration file: TOML, one `option = value` per line. The environment and the command line override it
+    #[arg(long, env = "ROSRESCUE_CONFIG", value_name = "FILE", help_heading = ADVANCED)]
+    pub config: Option<PathBuf>,
     /// File that records the state of the master [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or
     /// ~/.ros/log; latest-chkpt-PORT.yaml for a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
@@ -210,7 +213,7 @@ pub struct CommonArgs {
     pub resync_interval: f64,
     /// Who answers reads while there is a master. The mirror, rosrescue's own copy, is several times faster.
     /// Choose the master if programs call it directly [default: mirror for core, master for proxy]
-    #[arg(long, env = "ROSRESCUE_READS", value_enum, help_heading = ADVANCED)]
+    #[arg(long, env = "ROSRESCUE_READS", value_enum, hide = true)]
     pub reads: Option<Reads>,
     /// Number of connections to the master for reads
     #[arg(
@@ -250,6 +253,14 @@ pub struct CommonArgs {
     #[arg(long, env = "ROSRESCUE_NO_GUARDIAN")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub no_guardian: bool,
+    /// What is logged, and how.
+    #[command(flatten)]
+    pub logging: LoggingArgs,
+}
+
+/// Options for the log on stderr.
+#[derive(Args, Clone, Debug)]
+pub struct LoggingArgs {
     /// Format of the log on stderr
     #[arg(long, env = "ROSRESCUE_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     pub log_format: LogFormat,

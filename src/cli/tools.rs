@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 
 use super::{
-    ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReportArgs,
-    RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
+    ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, LogArgs, OptionValue,
+    ParamsArgs, ReportArgs, RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
 use crate::hide::{self, Hide};
@@ -109,12 +109,18 @@ pub struct CheckArgs {
     /// publisher. Exit status 1 if a connection is missing
     #[arg(long)]
     pub live: bool,
+    /// Configuration file of `core` or `proxy`: TOML, one `option = value` per line
+    #[arg(long, env = "ROSRESCUE_CONFIG", value_name = "FILE")]
+    pub config: Option<PathBuf>,
     /// The cluster options of `core`.
     #[command(flatten)]
     pub cluster: ClusterArgs,
     /// How to print the result.
     #[command(flatten)]
     pub output: OutputArgs,
+    /// The options of `core` or `proxy`, and where each value comes from.
+    #[arg(skip)]
+    pub settings: Vec<OptionValue>,
 }
 
 /// Options of `rosrescue drill`.

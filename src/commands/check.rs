@@ -17,7 +17,10 @@ use serde::Serialize;
 
 use self::facts::SetupFacts;
 use super::{CommandFailure, Exit, counted, print};
-use crate::{cli::CheckArgs, ros_env::MasterUri};
+use crate::{
+    cli::{CheckArgs, OptionValue},
+    ros_env::MasterUri,
+};
 
 pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     let master = args.master.as_deref().map(MasterUri::parse).transpose();
@@ -37,11 +40,12 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     };
     let mut findings = judge::judge(&facts);
     findings.extend(planting::look(&facts.disk.checkpoint));
+    findings.extend(sources(&args.settings));
     finish(args, findings)
 }
 
 fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, CommandFailure> {
-    let report = Report::new(findings);
+    let report = Report::new(findings, &args.settings);
     print(&report, &args.output)?;
     Ok(match report.problems {
         0 => Exit::Good,
@@ -72,16 +76,39 @@ struct Finding {
     todo: String,
 }
 
+/// Where the values of the options come from.
+fn sources(settings: &[OptionValue]) -> Vec<Finding> {
+    let (defaults, chosen): (Vec<_>, Vec<_>) = settings
+        .iter()
+        .partition(|setting| setting.source == "default");
+    let chosen = chosen.into_iter().map(|setting| {
+        let value = setting.value.as_deref().unwrap_or("none");
+        format!("{} = {value} ({})", setting.option, setting.source)
+    });
+    let rest = counted(defaults.len(), "option");
+    chosen
+        .chain([format!("{rest} with the default value")])
+        .map(|what| Finding {
+            severity: Severity::Ok,
+            subject: "options",
+            what,
+            todo: String::new(),
+        })
+        .collect()
+}
+
 /// All findings, worst first.
 #[derive(Clone, Debug, Serialize)]
-struct Report {
+struct Report<'a> {
     problems: usize,
     warnings: usize,
     findings: Vec<Finding>,
+    /// All options of `core` or `proxy`.
+    options: &'a [OptionValue],
 }
 
-impl Report {
-    fn new(mut findings: Vec<Finding>) -> Self {
+impl<'a> Report<'a> {
+    fn new(mut findings: Vec<Finding>, options: &'a [OptionValue]) -> Self {
         let count = |of| findings.iter().filter(|one| one.severity == of).count();
         let (problems, warnings) = (count(Severity::Problem), count(Severity::Warning));
         findings.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
@@ -89,11 +116,12 @@ impl Report {
             problems,
             warnings,
             findings,
+            options,
         }
     }
 }
 
-impl fmt::Display for Report {
+impl fmt::Display for Report<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for finding in &self.findings {
             let severity = match finding.severity {

@@ -7,6 +7,7 @@ mod units;
 
 use std::{
     collections::BTreeMap,
+    ffi::OsString,
     fmt, fs,
     io::{self, IsTerminal, Write},
     net::{SocketAddr, TcpListener},
@@ -24,7 +25,7 @@ use super::{
     print,
 };
 use crate::{
-    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs},
+    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
     config::Config,
     process,
     server::listener,
@@ -62,12 +63,26 @@ struct Plan {
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
-    carry_out(&install(args, &place)?, &place, &args.scope)
+    needs_root(&place, &args.scope)?;
+    carry_out(&install(args, &place)?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
-    carry_out(&uninstall(&place), &place, &args.scope)
+    needs_root(&place, &args.scope)?;
+    carry_out(&uninstall(&place), &args.scope)
+}
+
+/// Refuses a service of the computer without root, before any other obstacle is reported.
+fn needs_root(place: &Place, args: &ScopeArgs) -> Result<(), CommandFailure> {
+    if place.user || args.dry_run || rustix::process::geteuid().is_root() {
+        return Ok(());
+    }
+    let words: Vec<_> = std::env::args().skip(1).collect();
+    Err(CommandFailure::Usage(format!(
+        "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
+        words.join(" ")
+    )))
 }
 
 /// Where the unit files go, and which systemd runs the service.
@@ -296,7 +311,7 @@ fn uninstall(place: &Place) -> Plan {
 }
 
 /// Shows the plan, asks, and makes the changes.
-fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
+fn carry_out(plan: &Plan, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
     if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
         print(plan, &args.output)?;
         return Ok(if plan.obstacles.is_empty() {
@@ -304,13 +319,6 @@ fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Comma
         } else {
             Exit::Bad
         });
-    }
-    if !place.user && !rustix::process::geteuid().is_root() {
-        let words: Vec<_> = std::env::args().skip(1).collect();
-        return Err(CommandFailure::Usage(format!(
-            "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
-            words.join(" ")
-        )));
     }
     if args.yes {
         print(plan, &args.output)?;
@@ -574,7 +582,9 @@ fn read_service(
     let command = Cli::command()
         .mut_args(|option| option.env(None::<&str>))
         .mut_subcommands(|command| command.mut_args(|option| option.env(None::<&str>)));
-    let all = std::iter::once("rosrescue").chain(words.iter().map(String::as_str));
+    let mut all = vec![OsString::from("rosrescue")];
+    all.extend(words.iter().map(OsString::from));
+    config_file::insert(&command, &mut all).map_err(usage)?;
     let matches = command.try_get_matches_from(all).map_err(|error| {
         let text = error.to_string();
         let lines = text.lines().take_while(|line| !line.is_empty());
@@ -607,6 +617,7 @@ fn read_service(
         ),
     };
     let files = [
+        common.config.as_ref(),
         common.checkpoint.as_ref(),
         rosmaster.and_then(Option::as_ref),
     ];

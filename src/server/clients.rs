@@ -93,8 +93,8 @@ impl Clients {
         }
     }
 
-    /// Notes that the call of `peer` that began at `start` has ended, with or without an answer.
-    pub fn answered(&self, peer: SocketAddr, start: Instant) {
+    /// Notes that the call of `peer` that began at `start` has ended, with or without an answer. Returns its duration.
+    pub fn answered(&self, peer: SocketAddr, start: Instant) -> Duration {
         let now = Instant::now();
         let longest = now.duration_since(start);
         if let Some(mut seen) = self.present.get_mut(&peer) {
@@ -105,6 +105,7 @@ impl Clients {
                 longest_at: Some(now),
             });
         }
+        longest
     }
 
     fn past(&self) -> MutexGuard<'_, HashMap<String, Times>> {

@@ -6,7 +6,7 @@
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
 //! | `/state.json` | nodes, topics, services and parameters, now or at an earlier time |
 //! | `/events` | what changes, as it happens |
-//! | `/metrics` | counters in Prometheus' text format |
+//! | `/metrics` | metrics in Prometheus' text format, or OpenMetrics |
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master, the mirror or another computer, else 503 |
 
@@ -41,13 +41,19 @@ use crate::{
     ledger::Ledger,
     master::Master,
     nodes::Nodes,
-    status::{Board, metrics::metrics, stats::Stats},
+    status::{
+        Board,
+        metrics::{metrics, openmetrics},
+        stats::Stats,
+    },
     upstream::Upstream,
     xmlrpc::Struct,
 };
 
 const HTML: &str = "text/html; charset=utf-8";
 const JSON: &str = "application/json";
+const OPENMETRICS: &str = "application/openmetrics-text";
+const OPENMETRICS_1: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Version of `/state.json`. It changes when a field is removed or changes its meaning.
 const SCHEMA: u32 = 1;
@@ -123,7 +129,8 @@ pub(super) async fn page(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -
 async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpReply {
     let pages = &server.pages;
     match uri.path() {
-        "/" if wants_html(headers) => {
+        // A browser. curl accepts any type.
+        "/" if accepts(headers, "text/html") => {
             reply(StatusCode::OK, HTML, include_str!("pages/web/page.html"))
         }
         "/" => text(StatusCode::OK, pages.status().to_string()),
@@ -146,11 +153,13 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
             }
             events
         }
-        "/metrics" => reply(
-            StatusCode::OK,
-            "text/plain; version=0.0.4",
-            metrics(pages.stats, &pages.status()),
-        ),
+        "/metrics" => {
+            let text = metrics(pages.stats, &pages.status());
+            match accepts(headers, OPENMETRICS) {
+                true => reply(StatusCode::OK, OPENMETRICS_1, openmetrics(&text)),
+                false => reply(StatusCode::OK, "text/plain; version=0.0.4", text),
+            }
+        }
         "/live" => text(StatusCode::OK, "live\n".to_owned()),
         "/ready" if pages.board.read().answers(pages.gate.state()) => {
             text(StatusCode::OK, "ready\n".to_owned())
@@ -167,11 +176,11 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
     }
 }
 
-/// Whether the client is a browser. curl accepts any type.
-fn wants_html(headers: &HeaderMap) -> bool {
+/// Whether the client names this type.
+fn accepts(headers: &HeaderMap, kind: &str) -> bool {
     let accepted = headers.get_all(ACCEPT).into_iter();
     let mut accepted = accepted.filter_map(|accepted| accepted.to_str().ok());
-    accepted.any(|accepted| accepted.contains("text/html"))
+    accepted.any(|accepted| accepted.contains(kind))
 }
 
 fn script(text: &'static str) -> HttpReply {

@@ -166,7 +166,8 @@ async fn post(
     }
     let start = Instant::now();
     let answered = answer(&server, peer, deadlines, head, body, call).await;
-    server.clients.answered(peer, start);
+    let time = server.clients.answered(peer, start);
+    server.stats.times.count(kind, time);
     answered
 }
 

@@ -3,7 +3,10 @@
 //! The format is written by hand, because every value is already in a [`Status`]; a metrics library
 //! would keep a second copy of each.
 
-use std::fmt::{Display, Write};
+use std::{
+    fmt::{Display, Write},
+    fs,
+};
 
 use super::{
     computers::Computers,
@@ -15,6 +18,10 @@ use crate::{cluster::machine::Role, health::Health};
 
 /// Number of nodes that have a line of their own.
 const ILL_MOST: usize = 100;
+/// The histogram of the duration of calls.
+const TIMES: &str = "call_duration_seconds";
+/// Ticks per second in `/proc/PID/stat`, on every processor that Linux runs on today.
+const TICKS: f64 = 100.0;
 
 /// The text that `/metrics` answers with.
 pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
@@ -25,7 +32,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 29] = [
+    let values: [(&str, &str, Option<f64>); 28] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -50,7 +57,6 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("lost_addresses", "addresses that this computer has lost and at which nodes are registered", Some(status.nodes.lost_addresses.len() as f64)),
         ("bypassing", "processes and computers that bypass rosrescue and talk to the master directly", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
-        ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),
         ("journal_bytes", "size of the checkpoint's journal", Some(journal.bytes as f64)),
         ("snapshot_bytes", "size of the checkpoint before its journal", Some(journal.snapshot_bytes as f64)),
         ("disk_free_bytes", "bytes free on the checkpoint's disk", journal.disk_free_bytes.map(|bytes| bytes as f64)),
@@ -68,7 +74,70 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     if let Some(cluster) = &status.cluster {
         add_cluster(&mut text, cluster);
     }
+    let help = "duration of calls, from the decoded request to the answer, by class of method";
+    head(&mut text, TIMES, help, "histogram");
+    stats.times.write(&mut text, &format!("rosrescue_{TIMES}"));
+    head(
+        &mut text,
+        "build_info",
+        "1, with the version of rosrescue",
+        "gauge",
+    );
+    let version = escaped(env!("ROSRESCUE_VERSION"));
+    let _ = writeln!(text, "rosrescue_build_info{{version=\"{version}\"}} 1");
+    add_process(&mut text, status.started);
     text
+}
+
+/// The text of [`metrics`] as OpenMetrics: the name of a counter's family is without `_total`, and the text has an end.
+pub(crate) fn openmetrics(text: &str) -> String {
+    let mut open = String::with_capacity(text.len() + 6);
+    for line in text.lines() {
+        let mut words = line.splitn(4, ' ');
+        match (words.next(), words.next(), words.next(), words.next()) {
+            (Some("#"), Some(word), Some(name), Some(rest)) => {
+                let name = name.strip_suffix("_total").unwrap_or(name);
+                let _ = writeln!(open, "# {word} {name} {rest}");
+            }
+            _ => {
+                let _ = writeln!(open, "{line}");
+            }
+        }
+    }
+    open + "# EOF\n"
+}
+
+/// Adds what Prometheus' client libraries say about their process.
+fn add_process(text: &mut String, started: f64) {
+    let read = |file: &str| fs::read_to_string(format!("/proc/self/{file}")).unwrap_or_default();
+    let (stat, status, limits) = (read("stat"), read("status"), read("limits"));
+    // The second field is the program's name in parentheses, and may have spaces.
+    let fields = stat.rsplit(')').next().unwrap_or_default();
+    let ticks = fields.split_whitespace().skip(11).take(2);
+    let ticks = ticks
+        .filter_map(|ticks| ticks.parse::<f64>().ok())
+        .sum::<f64>();
+    let number = |text: &str, name: &str, at: usize| {
+        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
+        line.split_whitespace().nth(at)?.parse::<f64>().ok()
+    };
+    let bytes = |name| Some(number(&status, name, 0)? * 1024.0);
+    let open = fs::read_dir("/proc/self/fd").map(|open| open.count() as f64);
+    #[rustfmt::skip]
+    let values = [
+        ("process_cpu_seconds_total", "processor time of this process, in seconds", Some(ticks / TICKS)),
+        ("process_resident_memory_bytes", "memory of this process, in bytes", bytes("VmRSS:")),
+        ("process_virtual_memory_bytes", "virtual memory of this process, in bytes", bytes("VmSize:")),
+        ("process_threads", "threads of this process", number(&status, "Threads:", 0)),
+        ("process_open_fds", "open file descriptors", open.ok()),
+        ("process_max_fds", "limit of open file descriptors", number(&limits, "Max open files", 0)),
+        ("process_start_time_seconds", "when this process was started, in seconds since 1970", Some(started)),
+    ];
+    for (name, help, value) in values {
+        if let Some(value) = value {
+            add_named(text, name, help, value);
+        }
+    }
 }
 
 /// Adds a line for each node that is dead or unreachable.
@@ -134,12 +203,18 @@ fn add_cluster(text: &mut String, of: &Computers) {
 }
 
 fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
+    add_named(text, &format!("rosrescue_{name}"), help, value);
+}
+
+fn add_named(text: &mut String, name: &str, help: &str, value: impl Display) {
     let kind = match name.ends_with("_total") {
         true => "counter",
         false => "gauge",
     };
-    head(text, name, help, kind);
-    let _ = writeln!(text, "rosrescue_{name} {value}");
+    let _ = writeln!(
+        text,
+        "# HELP {name} {help}\n# TYPE {name} {kind}\n{name} {value}"
+    );
 }
 
 /// A label's value with the escapes of Prometheus' text format.
@@ -179,6 +254,18 @@ fn head(text: &mut String, name: &str, help: &str, kind: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn openmetrics_names_the_family_of_a_counter_and_ends() {
+        let mut text = String::new();
+        add(&mut text, "calls_total", "calls", 2);
+        add(&mut text, "nodes", "nodes of all", 3);
+        assert_eq!(
+            openmetrics(&text),
+            "# HELP rosrescue_calls calls\n# TYPE rosrescue_calls counter\nrosrescue_calls_total 2\n\
+             # HELP rosrescue_nodes nodes of all\n# TYPE rosrescue_nodes gauge\nrosrescue_nodes 3\n# EOF\n"
+        );
+    }
     use crate::status::cluster::ClusterFacts;
 
     #[test]

@@ -2,6 +2,8 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::call_times::CallTimes;
+
 /// A count of events. It only grows.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
@@ -27,6 +29,7 @@ macro_rules! counters {
         #[derive(Debug, Default)]
         pub struct Stats {
             $(#[doc = $meaning] pub $name: Counter,)*
+            pub(crate) times: CallTimes,
         }
 
         impl Stats {

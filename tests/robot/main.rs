@@ -84,6 +84,7 @@ mod clients {
     mod connections;
     mod forwarding;
     mod hostile;
+    mod ipv6;
     mod networks;
     mod reads;
 }
@@ -101,6 +102,7 @@ mod limits {
 mod cli {
     mod addresses;
     mod as_roscore;
+    mod config_file;
     mod log;
     mod options;
     mod secrets;

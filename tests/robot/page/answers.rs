@@ -1,7 +1,9 @@
 //! The answers of the pages, without a browser.
 
 use std::fs;
+use std::io::Write;
 use std::path::Path;
+use std::process::{Command, Stdio};
 
 use serde_json::Value;
 
@@ -227,4 +229,74 @@ fn every_metric_of_the_examples_exists() {
         }
     }
     assert!(seen > 25, "{seen}");
+}
+
+/// Feeds `text` to a command.
+fn feed(command: &mut Command, text: &str) {
+    let mut child = command
+        .stdin(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    child
+        .stdin
+        .take()
+        .unwrap()
+        .write_all(text.as_bytes())
+        .unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.is_empty(), "{said}");
+}
+
+#[test]
+fn the_metrics_follow_the_conventions() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    let client = robot.client();
+    client.set_param("/one", 1);
+    let plain = get(&client, "/metrics", &[]);
+    let text = plain.text();
+    feed(Command::new("promtool").args(["check", "metrics"]), &text);
+    let alerts = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/examples/prometheus/alerts.yaml"
+    );
+    feed(
+        Command::new("promtool")
+            .args(["check", "rules", alerts])
+            .stdout(Stdio::null()),
+        "",
+    );
+    for line in [
+        "rosrescue_build_info{version=\"",
+        "rosrescue_worker_restarts_total 0",
+        "rosrescue_call_duration_seconds_bucket{class=\"write\",le=\"+Inf\"} ",
+        "process_cpu_seconds_total ",
+        "process_resident_memory_bytes ",
+        "process_virtual_memory_bytes ",
+        "process_threads ",
+        "process_open_fds ",
+        "process_max_fds ",
+        "process_start_time_seconds ",
+    ] {
+        assert!(text.contains(&format!("\n{line}")), "{line}\n{text}");
+    }
+    let writes = text.lines().find_map(|line| {
+        line.strip_prefix("rosrescue_call_duration_seconds_count{class=\"write\"} ")
+    });
+    assert_ne!(writes, Some("0"));
+    // As Prometheus asks for it.
+    let accept =
+        "Accept: application/openmetrics-text;version=1.0.0;q=0.5,text/plain;version=0.0.4;q=0.3";
+    let open = get(&client, "/metrics", &[accept]);
+    assert_eq!(
+        open.header("content-type"),
+        Some("application/openmetrics-text; version=1.0.0; charset=utf-8")
+    );
+    let parse = "import sys; from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse; \
+                 assert len(list(parse(sys.stdin.read()))) > 40";
+    feed(
+        Command::new("/usr/bin/python3").args(["-c", parse]),
+        &open.text(),
+    );
 }

@@ -97,6 +97,24 @@ fn call_until(done: &AtomicBool, client: &Client) -> Duration {
 }
 
 #[test]
+fn a_worker_restarts_although_the_configuration_file_is_broken_meanwhile() {
+    let scratch = Scratch::new();
+    let file = scratch.path("rosrescue.toml");
+    fs::write(&file, "hold = 3\nno-rosout = true\n").unwrap();
+    let setup = Setup::core(&scratch, free_port()).env("ROSRESCUE_CONFIG", &file);
+    let rescue = setup.guarded().start();
+    fs::write(&file, "hold = [").unwrap();
+    let dead = worker(&scratch);
+    signal(dead, Signal::KILL);
+    let new = worker_after(&scratch, dead);
+    eventually("calls pass again", || {
+        status(&rescue.client())["open"] == true
+    });
+    let words = fs::read_to_string(format!("/proc/{new}/cmdline")).unwrap();
+    assert!(words.contains("--hold=3\0--no-rosout"), "{words}");
+}
+
+#[test]
 fn a_killed_worker_costs_no_connection_and_no_state() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);

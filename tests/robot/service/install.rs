@@ -68,6 +68,31 @@ fn impossible_options_are_explained_in_one_sentence() {
     assert!(!scratch.path(".config").exists());
 }
 
+#[test]
+fn without_root_the_first_thing_it_says_is_that_it_needs_root() {
+    let scratch = Scratch::new();
+    // A user who may not read this folder.
+    let program = tempfile::Builder::new().tempdir_in("/tmp").unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    fs::set_permissions(program.path(), open).unwrap();
+    let copy = program.path().join("rosrescue");
+    fs::copy(PROGRAM, &copy).unwrap();
+    for command in ["install", "uninstall"] {
+        let mut own = Command::new("setpriv");
+        scratch.prepare(&mut own);
+        own.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+        own.arg(&copy)
+            .args([command, "--yes"])
+            .env("PATH", "/usr/bin:/bin")
+            .current_dir("/");
+        let said = said(&own.output().unwrap(), 2);
+        assert!(
+            said.contains(&format!("needs root: run `sudo rosrescue {command} --yes`")),
+            "{said}"
+        );
+    }
+}
+
 /// In a container, root may have no sudo and no variable with the user's name.
 #[test]
 fn a_dry_run_needs_no_sudo() {

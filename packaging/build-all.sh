@@ -1,0 +1,76 @@
+#!/bin/sh
+# packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for all three,
+# in target/packages, with SHA256SUMS, signed by this key of gpg in SHA256SUMS.asc. Any amd64 computer will do: zig links for the old glibc 2.17 and compiles C for the
+# other processors. Run twice, in whichever folders, it makes the same bytes.
+#
+# Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools. Without rustup,
+# CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).
+set -eu
+cd "$(dirname "$0")/.."
+checkout=$PWD
+target=${CARGO_TARGET_DIR:-target}
+zig=0.15.2
+zigbuild=0.23.0
+# The newest C library that a program may need: Ubuntu 14.04, Debian 8 and JetPack 4 have 2.19 or later.
+glibc=2.17
+
+fail() { # MESSAGE
+    echo "build-all.sh: $1" >&2
+    exit 1
+}
+
+key=
+if [ "${1:-}" = --sign ]; then
+    key=$2
+    shift 2
+fi
+
+tools=$target/tools/zig
+case $tools in /*) ;; *) tools=$checkout/$tools ;; esac
+if ! [ "$("$tools/bin/cargo-zigbuild" --version 2>/dev/null)" = "cargo-zigbuild $zigbuild" ]; then
+    python3 -m venv "$tools"
+    "$tools/bin/pip" install --quiet "ziglang==$zig" "cargo-zigbuild==$zigbuild" >&2
+fi
+export PATH="$tools/bin:$PATH"
+
+# What the bytes may depend on: the commit and its date, and no folder of this computer.
+SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
+ROSRESCUE_COMMIT=${ROSRESCUE_COMMIT:-$(git rev-parse --short=7 HEAD)$(git diff --quiet HEAD || echo +)}
+export SOURCE_DATE_EPOCH ROSRESCUE_COMMIT
+cargo_home=${CARGO_HOME:-$HOME/.cargo}
+sysroot=$(rustc --print sysroot)
+export RUSTFLAGS="--remap-path-prefix=$checkout=/rosrescue --remap-path-prefix=$cargo_home=/cargo --remap-path-prefix=$sysroot=/rust"
+export CFLAGS="-ffile-prefix-map=$cargo_home=/cargo"
+
+packages=$target/packages
+rm -rf "$packages"
+mkdir -p "$packages"
+[ $# -gt 0 ] || set -- arm64 armhf
+# amd64 first: its program makes the manual pages and completions of all packages.
+for processor in amd64 "$@"; do
+    case $processor in
+        amd64) triple=x86_64-unknown-linux-gnu ;;
+        arm64) triple=aarch64-unknown-linux-gnu ;;
+        armhf) triple=armv7-unknown-linux-gnueabihf ;;
+        *) fail "unknown processor $processor; there are arm64 and armhf besides amd64" ;;
+    esac
+    if [ -n "$(ls "$sysroot/lib/rustlib/$triple/lib" 2>/dev/null)" ]; then
+        build_std=
+    elif [ -n "${CARGO_UNSTABLE_BUILD_STD:-}" ]; then
+        build_std=$CARGO_UNSTABLE_BUILD_STD
+    else
+        rustup target add "$triple" >&2 || fail "Rust's standard library for $triple is missing"
+        build_std=
+    fi
+    CARGO_UNSTABLE_BUILD_STD=$build_std \
+        cargo zigbuild --profile dist --locked --target "$triple.$glibc" >&2
+    program=$target/$triple/dist/rosrescue
+    needs=$(readelf --dyn-syms --wide "$program" | grep -o 'GLIBC_[0-9.]*' | sort -V | tail -n 1)
+    if [ "$(printf '%s\n%s\n' "$needs" "GLIBC_$glibc" | sort -V | tail -n 1)" != "GLIBC_$glibc" ]; then
+        fail "$program needs $needs, which is later than $glibc"
+    fi
+    packaging/build-deb.sh --target "$triple" --output "$packages"
+done
+cd "$packages"
+sha256sum -- *.deb >SHA256SUMS
+[ -z "$key" ] || gpg --batch --yes --armor --local-user "$key" --detach-sign SHA256SUMS
