@@ -493,7 +493,8 @@ impl History {
             let same = same.filter(|of| of.key == key && Some(of.value) == read.value);
             same.count() > 1
         };
-        let counts = |read: &&&Read| !lost(read.value) && !(several(read) && in_vain(read));
+        let unknown = |read: &&Read| lost(read.value) || several(read) && in_vain(read);
+        let counts = |read: &&&Read| !unknown(read);
         for read in reads.iter().filter(counts) {
             if let Some((first, _)) = places.of_value(self, key, read.value) {
                 // What a leader showed early counts once the journal has it. If it was lost with the leader and made
