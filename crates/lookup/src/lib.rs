@@ -1,4 +1,4 @@
-//! Resolves host names. Callers that ask for the same name at the same time share one lookup. Each lookup runs in a
+//! Resolves host names. Callers that ask for the same name within a second share one lookup. Each lookup runs in a
 //! thread of its own, so a dead name server delays neither the tokio runtime nor the end of the process.
 
 use std::{
@@ -6,6 +6,7 @@ use std::{
     io,
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
 };
 
 use tokio::sync::{Semaphore, watch};
@@ -17,11 +18,17 @@ const LOOKUPS: usize = 64;
 /// The addresses of a name without a port, or why there are none.
 type Found = Result<Arc<[SocketAddr]>, Arc<io::Error>>;
 
-static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
-static UNDER_WAY: Mutex<BTreeMap<String, watch::Receiver<Option<Found>>>> =
-    Mutex::new(BTreeMap::new());
+/// How long after the beginning of a lookup other callers share it. A lookup that began before the name was known may
+/// wait for a dead name server for half a minute, while a new one succeeds at once.
+const SHARED_FOR: Duration = Duration::from_secs(1);
 
-fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Found>>>> {
+/// The lookups under way by name, and when they began.
+type Lookups = BTreeMap<String, (Instant, watch::Receiver<Option<Found>>)>;
+
+static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
+static UNDER_WAY: Mutex<Lookups> = Mutex::new(BTreeMap::new());
+
+fn under_way() -> MutexGuard<'static, Lookups> {
     UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -37,10 +44,10 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     let mut answer = {
         let mut under_way = under_way();
         match under_way.get(host) {
-            Some(answer) => answer.clone(),
-            None => {
+            Some((began, answer)) if began.elapsed() < SHARED_FOR => answer.clone(),
+            _ => {
                 let (tell, answer) = watch::channel(None);
-                under_way.insert(host.to_owned(), answer.clone());
+                under_way.insert(host.to_owned(), (Instant::now(), answer.clone()));
                 tokio::spawn(look_up(host.to_owned(), tell));
                 answer
             }
@@ -113,5 +120,15 @@ mod tests {
         assert!(under_way().get("::1").is_none());
         let nobody = addresses("nobody.invalid", 4711).await;
         assert!(nobody.is_err(), "{nobody:?}");
+    }
+
+    #[tokio::test]
+    async fn a_lookup_that_takes_long_does_not_delay_a_later_one() {
+        let (_never, answer) = watch::channel(None);
+        let began = Instant::now().checked_sub(SHARED_FOR).unwrap();
+        under_way().insert("ip6-localhost".to_owned(), (began, answer));
+        // The answer itself depends on this computer's `/etc/hosts`.
+        let _ = addresses("ip6-localhost", 4711).await;
+        assert!(under_way().get("ip6-localhost").is_none());
     }
 }
