@@ -30,6 +30,9 @@ pub struct Merged {
     /// The writes to send to the leader, in this order.
     pub send: Vec<Request>,
     pub lost: Vec<Lost>,
+    /// The parameters that others have set to the same value. They may have set them to another value before, and nodes
+    /// heard that one later than this computer's.
+    pub equal: Vec<String>,
 }
 
 /// A write that was answered while its computer was cut off, and that is lost because of a conflict.
@@ -110,7 +113,7 @@ pub fn merge<'a>(
         let path = param_of(call);
         match judge(changes, now, call) {
             Verdict::Runs => merged.send.push(call.clone()),
-            Verdict::Holds => {}
+            Verdict::Holds => merged.equal.extend(parameter_of(call)),
             // A value that this computer itself deleted later does not count as lost.
             Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
             Verdict::Lost(lost) => merged.lost.push(lost),

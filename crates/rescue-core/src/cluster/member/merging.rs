@@ -168,7 +168,7 @@ impl Member {
         let merged = merge::merge(&period.changes, &self.journal.state, &left);
         let parameters = merged.lost.iter();
         let parameters = parameters.filter_map(|lost| parameter_of(&lost.call));
-        self.merging.untold.extend(parameters);
+        self.merging.untold.extend(parameters.chain(merged.equal));
         let lost = merged.lost.iter();
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
         self.merging.left = Some(merged.send);
