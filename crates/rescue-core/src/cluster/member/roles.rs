@@ -38,6 +38,8 @@ impl Member {
                     self.tell(News::Deposed);
                 }
                 self.released();
+                // What is left was not answered, and its callers call again.
+                self.outgoing.forget();
                 self.give_up();
             }
         }
