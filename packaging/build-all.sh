@@ -1,7 +1,7 @@
 #!/bin/sh
-# packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for all three,
-# in target/packages, with SHA256SUMS, signed by this key of gpg in SHA256SUMS.asc. Any amd64 computer will do: zig links for the old glibc 2.17 and compiles C for the
-# other processors. Run twice, in whichever folders, it makes the same bytes.
+# packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for
+# all three, on an amd64 computer. They are in target/packages, with SHA256SUMS and, with a key of gpg, SHA256SUMS.asc.
+# zig links for glibc 2.17 and compiles C for the other processors. The bytes should not depend on the folder.
 #
 # Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools. Without rustup,
 # CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).

@@ -34,6 +34,7 @@ mod pid_file;
 pub(crate) mod pidfd;
 mod rosout;
 mod stat;
+mod usage;
 
 use log_config::LogConfig;
 pub(crate) use orphan::{Orphan, is_in_our_network};
@@ -41,6 +42,7 @@ use output::Output;
 use pid_file::PidFile;
 pub(crate) use rosout::Rosout;
 pub(crate) use stat::Stat;
+pub(crate) use usage::usage;
 
 /// How long a process may take to end after SIGINT, and then again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);

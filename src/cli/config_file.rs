@@ -49,7 +49,7 @@ pub(crate) fn insert(command: &Command, words: &mut Vec<OsString>) -> Result<Fro
     let at = words.len().min(1 + usize::from(name.is_some()));
     let loose = command.clone().ignore_errors(true);
     let Ok(matches) = loose.try_get_matches_from(words.iter()) else {
-        // Somebody asks for help or the version.
+        // The words ask for help or the version.
         return Ok(FromFile::default());
     };
     let given = matches.subcommand().map_or(&matches, |(_, given)| given);

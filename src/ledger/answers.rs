@@ -173,9 +173,8 @@ impl Ledger {
                 counts.map(|of| of.call).collect()
             }
         };
-        let mut set_again: Vec<&Request> = Vec::new();
+        let mut set_again = Vec::new();
         if !changes {
-            set_again.extend(writes.iter().copied().filter(|call| sets_parameter(call)));
             // A call that changes nothing still becomes pending, because the master may hold what the mirror lacks: a
             // registration that it ran for a rosrescue that died before the reply, or any state if the checkpoint is
             // older than the master. Parameter subscriptions are left out: they cannot be read from the master, and
@@ -185,16 +184,18 @@ impl Ledger {
                 is_unregistration(call)
                     || (inner.unconfirmed && *call.method() != Method::SubscribeParam)
             };
-            writes.retain(|call| room && unsure(call) && !inner.pending.contains(call));
+            let is_pending =
+                |call: &&Request| room && unsure(call) && !inner.pending.contains(call);
+            (writes, set_again) = writes.into_iter().partition(is_pending);
+            // A parameter that is set again has no record here, but it is the last write also for the other computers.
+            set_again.retain(|call| sets_parameter(call));
         }
-        // A parameter that is set again has no record here, but it is the last write also for the other computers.
-        set_again.retain(|call| !writes.contains(call));
         let at = clock::wall_millis();
-        if inner.is_replicated() && !set_again.is_empty() {
-            inner.share_only(&set_again, source, Label { at, origin });
-            self.shared.notify_one();
-        }
+        inner.share_only(&set_again, source, Label { at, origin });
         if writes.is_empty() {
+            if !set_again.is_empty() {
+                self.shared.notify_one();
+            }
             return Some((reply, inner.mark(), number));
         }
         // The new version outdates a running inspection, which could restore what this call removes.

@@ -234,8 +234,11 @@ impl Inner {
         matches!(self.shared, Shared::Here { .. })
     }
 
-    /// Passes `calls` from `source`, which change nothing, to the other computers only.
+    /// Passes `calls` from `source`, which change nothing, to the other computers only, if there are any.
     pub(super) fn share_only(&mut self, calls: &[&Request], source: &Source, label: Label) {
+        if calls.is_empty() || !self.is_replicated() {
+            return;
+        }
         let entries = calls.iter();
         let entries = entries.map(|&call| RecordContent::labelled(call.clone().into(), label));
         let entries: Vec<_> = entries.collect();

@@ -9,10 +9,13 @@ use std::fs;
 pub(crate) struct Stat {
     state: char,
     pub(super) parent: u32,
-    threads: u32,
+    pub(crate) threads: u64,
     /// When it was started, in clock ticks since boot. Start time and id together identify the process.
     pub(crate) started: u64,
-    has_memory: bool,
+    /// Processor time, in clock ticks.
+    ticks: u64,
+    virtual_bytes: u64,
+    resident_pages: u64,
 }
 
 impl Stat {
@@ -26,21 +29,37 @@ impl Stat {
         let mut fields = line.rsplit(')').next()?.split_whitespace();
         let state = fields.next()?.chars().next()?;
         let parent = fields.next()?.parse().ok()?;
-        let threads = fields.nth(15)?.parse().ok()?;
-        let started = fields.nth(1)?.parse().ok()?;
-        let has_memory = fields.next()? != "0";
+        let mut number = |skipped| fields.nth(skipped)?.parse::<u64>().ok();
+        let ticks = number(9)? + number(0)?;
+        let threads = number(4)?;
+        let started = number(1)?;
+        let virtual_bytes = number(0)?;
+        let resident_pages = number(0)?;
         Some(Self {
             state,
             parent,
             threads,
             started,
-            has_memory,
+            ticks,
+            virtual_bytes,
+            resident_pages,
         })
     }
 
     /// Whether the process still runs. A process that ends frees its memory first, and then closes its sockets.
     pub(crate) fn is_alive(self) -> bool {
-        self.has_memory && !matches!(self.state, 'Z' | 'X')
+        self.virtual_bytes > 0 && !matches!(self.state, 'Z' | 'X')
+    }
+
+    /// The processor time of the process and its threads, in seconds.
+    pub(crate) fn cpu_seconds(self) -> f64 {
+        self.ticks as f64 / rustix::param::clock_ticks_per_second() as f64
+    }
+
+    /// The memory that the process has reserved and the memory that it uses, in bytes.
+    pub(crate) fn memory(self) -> (u64, u64) {
+        let resident = self.resident_pages * rustix::param::page_size() as u64;
+        (self.virtual_bytes, resident)
     }
 
     /// Whether no thread of the process runs any more. The first thread may end before the others.
@@ -63,7 +82,8 @@ mod tests {
     #[test]
     fn a_line_of_the_kernel_is_understood() {
         let stat = Stat::parse(LINE).unwrap();
-        assert_eq!((stat.parent, stat.started), (3, 4711));
+        assert_eq!((stat.parent, stat.started, stat.ticks), (3, 4711, 11));
+        assert_eq!((stat.virtual_bytes, stat.resident_pages), (8192, 5));
         assert!(stat.is_alive() && !stat.is_stopped());
         let with = |from: &str, to: &str| Stat::parse(&LINE.replace(from, to)).unwrap();
         assert!(!with(" S ", " Z ").is_alive());

@@ -41,6 +41,7 @@ use crate::{
     ledger::Ledger,
     master::Master,
     nodes::Nodes,
+    process::usage,
     status::{
         Board,
         metrics::{metrics, openmetrics},
@@ -154,11 +155,17 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
             events
         }
         "/metrics" => {
-            let text = metrics(pages.stats, &pages.status());
-            match accepts(headers, OPENMETRICS) {
-                true => reply(StatusCode::OK, OPENMETRICS_1, openmetrics(&text)),
-                false => reply(StatusCode::OK, "text/plain; version=0.0.4", text),
-            }
+            let (server, open) = (server.clone(), accepts(headers, OPENMETRICS));
+            // The kernel counts the open file descriptors.
+            in_background(move || {
+                let status = server.pages.status();
+                let text = metrics(server.pages.stats, &status, &usage(status.started));
+                match open {
+                    true => reply(StatusCode::OK, OPENMETRICS_1, openmetrics(&text)),
+                    false => reply(StatusCode::OK, "text/plain; version=0.0.4", text),
+                }
+            })
+            .await
         }
         "/live" => text(StatusCode::OK, "live\n".to_owned()),
         "/ready" if pages.board.read().answers(pages.gate.state()) => {

@@ -3,10 +3,7 @@
 //! The format is written by hand, because every value is already in a [`Status`]; a metrics library
 //! would keep a second copy of each.
 
-use std::{
-    fmt::{Display, Write},
-    fs,
-};
+use std::fmt::{Display, Write};
 
 use super::{
     computers::Computers,
@@ -20,11 +17,12 @@ use crate::{cluster::machine::Role, health::Health};
 const ILL_MOST: usize = 100;
 /// The histogram of the duration of calls.
 const TIMES: &str = "call_duration_seconds";
-/// Ticks per second in `/proc/PID/stat`, on every processor that Linux runs on today.
-const TICKS: f64 = 100.0;
+
+/// A metric of this process: name, help and value.
+pub(crate) type ProcessMetric = (&'static str, &'static str, f64);
 
 /// The text that `/metrics` answers with.
-pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
+pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric]) -> String {
     let mut text = String::new();
     for (name, help, value) in stats.list() {
         add(&mut text, &format!("{name}_total"), help, value);
@@ -85,7 +83,9 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     );
     let version = escaped(env!("ROSRESCUE_VERSION"));
     let _ = writeln!(text, "rosrescue_build_info{{version=\"{version}\"}} 1");
-    add_process(&mut text, status.started);
+    for (name, help, value) in process {
+        add_named(&mut text, name, help, value);
+    }
     text
 }
 
@@ -105,39 +105,6 @@ pub(crate) fn openmetrics(text: &str) -> String {
         }
     }
     open + "# EOF\n"
-}
-
-/// Adds what Prometheus' client libraries say about their process.
-fn add_process(text: &mut String, started: f64) {
-    let read = |file: &str| fs::read_to_string(format!("/proc/self/{file}")).unwrap_or_default();
-    let (stat, status, limits) = (read("stat"), read("status"), read("limits"));
-    // The second field is the program's name in parentheses, and may have spaces.
-    let fields = stat.rsplit(')').next().unwrap_or_default();
-    let ticks = fields.split_whitespace().skip(11).take(2);
-    let ticks = ticks
-        .filter_map(|ticks| ticks.parse::<f64>().ok())
-        .sum::<f64>();
-    let number = |text: &str, name: &str, at: usize| {
-        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-        line.split_whitespace().nth(at)?.parse::<f64>().ok()
-    };
-    let bytes = |name| Some(number(&status, name, 0)? * 1024.0);
-    let open = fs::read_dir("/proc/self/fd").map(|open| open.count() as f64);
-    #[rustfmt::skip]
-    let values = [
-        ("process_cpu_seconds_total", "processor time of this process, in seconds", Some(ticks / TICKS)),
-        ("process_resident_memory_bytes", "memory of this process, in bytes", bytes("VmRSS:")),
-        ("process_virtual_memory_bytes", "virtual memory of this process, in bytes", bytes("VmSize:")),
-        ("process_threads", "threads of this process", number(&status, "Threads:", 0)),
-        ("process_open_fds", "open file descriptors", open.ok()),
-        ("process_max_fds", "limit of open file descriptors", number(&limits, "Max open files", 0)),
-        ("process_start_time_seconds", "when this process was started, in seconds since 1970", Some(started)),
-    ];
-    for (name, help, value) in values {
-        if let Some(value) = value {
-            add_named(text, name, help, value);
-        }
-    }
 }
 
 /// Adds a line for each node that is dead or unreachable.
@@ -254,6 +221,7 @@ fn head(text: &mut String, name: &str, help: &str, kind: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::status::cluster::ClusterFacts;
 
     #[test]
     fn openmetrics_names_the_family_of_a_counter_and_ends() {
@@ -266,7 +234,6 @@ mod tests {
              # HELP rosrescue_nodes nodes of all\n# TYPE rosrescue_nodes gauge\nrosrescue_nodes 3\n# EOF\n"
         );
     }
-    use crate::status::cluster::ClusterFacts;
 
     #[test]
     fn a_cluster_has_its_own() {

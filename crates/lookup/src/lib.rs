@@ -47,8 +47,9 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
             Some((began, answer)) if began.elapsed() < SHARED_FOR => answer.clone(),
             _ => {
                 let (tell, answer) = watch::channel(None);
-                under_way.insert(host.to_owned(), (Instant::now(), answer.clone()));
-                tokio::spawn(look_up(host.to_owned(), tell));
+                let began = Instant::now();
+                under_way.insert(host.to_owned(), (began, answer.clone()));
+                tokio::spawn(look_up(host.to_owned(), began, tell));
                 answer
             }
         }
@@ -83,7 +84,15 @@ fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
     address
 }
 
-async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
+/// Drops the entry of the lookup that began at `began`. A later one for the same name goes on.
+fn forget(host: &str, began: Instant) {
+    let mut under_way = under_way();
+    if under_way.get(host).is_some_and(|(of, _)| *of == began) {
+        under_way.remove(host);
+    }
+}
+
+async fn look_up(host: String, began: Instant, tell: watch::Sender<Option<Found>>) {
     // The semaphore is never closed.
     let permit = PERMITS.acquire().await;
     let name = host.clone();
@@ -97,13 +106,13 @@ async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
             addresses.into()
         });
         // The entry is removed before the result is sent, so that later callers start a new lookup.
-        under_way().remove(&name);
+        forget(&name, began);
         tell.send_replace(Some(found));
     };
     // If no thread can be started, the sender is dropped, and the waiting callers get an error.
     let named = std::thread::Builder::new().name("lookup".to_owned());
     if named.spawn(search).is_err() {
-        under_way().remove(&host);
+        forget(&host, began);
     }
 }
 

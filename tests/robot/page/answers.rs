@@ -1,14 +1,13 @@
 //! The answers of the pages, without a browser.
 
 use std::fs;
-use std::io::Write;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 use serde_json::Value;
 
 use crate::support::{
-    Client, Mode, Response, Robot, Scratch, Setup, Wire, eventually, request, tree,
+    Client, Mode, Response, Robot, Scratch, Setup, Wire, eventually, feed, request, tree,
 };
 
 const SECRET: &str = "hunter2";
@@ -231,20 +230,10 @@ fn every_metric_of_the_examples_exists() {
     assert!(seen > 25, "{seen}");
 }
 
-/// Feeds `text` to a command.
-fn feed(command: &mut Command, text: &str) {
-    let mut child = command
-        .stdin(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    child
-        .stdin
-        .take()
-        .unwrap()
-        .write_all(text.as_bytes())
-        .unwrap();
-    let output = child.wait_with_output().unwrap();
+/// Runs a command that finds nothing wrong with `text`.
+#[track_caller]
+fn accepts(command: &mut Command, text: &str) {
+    let output = feed(command, text.as_bytes());
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && said.is_empty(), "{said}");
 }
@@ -256,15 +245,13 @@ fn the_metrics_follow_the_conventions() {
     client.set_param("/one", 1);
     let plain = get(&client, "/metrics", &[]);
     let text = plain.text();
-    feed(Command::new("promtool").args(["check", "metrics"]), &text);
+    accepts(Command::new("promtool").args(["check", "metrics"]), &text);
     let alerts = concat!(
         env!("CARGO_MANIFEST_DIR"),
         "/examples/prometheus/alerts.yaml"
     );
-    feed(
-        Command::new("promtool")
-            .args(["check", "rules", alerts])
-            .stdout(Stdio::null()),
+    accepts(
+        Command::new("promtool").args(["check", "rules", alerts]),
         "",
     );
     for line in [
@@ -284,7 +271,7 @@ fn the_metrics_follow_the_conventions() {
     let writes = text.lines().find_map(|line| {
         line.strip_prefix("rosrescue_call_duration_seconds_count{class=\"write\"} ")
     });
-    assert_ne!(writes, Some("0"));
+    assert!(writes.is_some_and(|count| count != "0"), "{text}");
     // As Prometheus asks for it.
     let accept =
         "Accept: application/openmetrics-text;version=1.0.0;q=0.5,text/plain;version=0.0.4;q=0.3";
@@ -295,7 +282,7 @@ fn the_metrics_follow_the_conventions() {
     );
     let parse = "import sys; from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse; \
                  assert len(list(parse(sys.stdin.read()))) > 40";
-    feed(
+    accepts(
         Command::new("/usr/bin/python3").args(["-c", parse]),
         &open.text(),
     );

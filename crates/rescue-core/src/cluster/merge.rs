@@ -30,8 +30,8 @@ pub struct Merged {
     /// The writes to send to the leader, in this order.
     pub send: Vec<Request>,
     pub lost: Vec<Lost>,
-    /// The parameters that others have set to the same value. They may have set them to another value before, and nodes
-    /// heard that one later than this computer's.
+    /// The parameters that others have set to the same value. They may have set another value since, which nodes on this
+    /// computer heard before this computer's own value.
     pub equal: Vec<String>,
 }
 

@@ -16,8 +16,8 @@ const TOOLS = ["/rqt_", "/rviz", "/rosapi", "/rosbridge", "/record_", "/rostopic
 const isDebug = (name) => HIDDEN.includes(name) || TOOLS.some((tool) => name.startsWith(tool));
 
 /**
- * The boxes and lines to draw. `changed` has what to mark. `filter` keeps the names that contain it and their neighbours, `leaves` adds topics without a
- * publisher or without a subscriber, `debug` adds rosout and tools.
+ * The boxes and lines to draw. `changed` has what to mark. `filter` keeps the names that contain it and their neighbours,
+ * `leaves` adds topics without a publisher or without a subscriber, `debug` adds rosout and tools.
  */
 export function select(robot, changed, { filter, leaves, debug }) {
   const shown = (name) => debug || !isDebug(name);

@@ -31,7 +31,7 @@ pub(super) struct Reading {
     /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
     fresh: Option<u8>,
     watching: bool,
-    /// Whether it is being found out if the session in etcd continues.
+    /// Whether `app/cluster` is finding out if the session in etcd continues.
     pub(super) deciding: bool,
     /// The keys `leader` and `alive` as etcd showed them last, also before the machine starts.
     view: View,

@@ -77,7 +77,7 @@ fn the_others_win_although_they_have_set_it_back() {
 
 #[test]
 fn a_write_to_what_others_have_written_too_is_neither_sent_nor_lost() {
-    // Nodes are notified of its value again, because they may have heard an older one last.
+    // Nodes are notified again, because they may have heard this computer's value after a newer one of the others.
     let equal = Merged {
         equal: vec!["/a".to_owned()],
         ..Merged::default()
