@@ -1,5 +1,5 @@
-//! Resolves host names. Callers that ask for the same name within a second share one lookup. Each lookup runs in a
-//! thread of its own, so a dead name server delays neither the tokio runtime nor the end of the process.
+//! Resolves host names. Callers that ask for the same name at about the same time share one lookup. Each lookup runs in
+//! a thread of its own, so a dead name server delays neither the tokio runtime nor the end of the process.
 
 use std::{
     collections::BTreeMap,
@@ -9,26 +9,36 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
-/// Maximum number of lookups at the same time. There is a limit because a dead name server blocks each thread for about
-/// ten seconds.
+/// Maximum number of lookups at the same time, one per name. There is a limit because a dead name server blocks each
+/// thread for 10 to 30 seconds.
 const LOOKUPS: usize = 64;
+
+/// Maximum number of further lookups of names that are being looked up already.
+const REPEATED: usize = 32;
 
 /// The addresses of a name without a port, or why there are none.
 type Found = Result<Arc<[SocketAddr]>, Arc<io::Error>>;
 
-/// How long after the beginning of a lookup other callers share it. A lookup that began before the name was known may
-/// wait for a dead name server for half a minute, while a new one succeeds at once.
+/// How long callers share the first lookup of a name. They share each further one twice as long as the one before. A
+/// lookup that began before the name was known may wait for a dead name server for half a minute, while a new one
+/// succeeds at once.
 const SHARED_FOR: Duration = Duration::from_secs(1);
 
-/// The lookups under way by name, and when they began.
-type Lookups = BTreeMap<String, (Instant, watch::Receiver<Option<Found>>)>;
+/// The last lookup of a name that is under way.
+struct Lookup {
+    began: Instant,
+    /// For how long others share it.
+    shared_for: Duration,
+    answer: watch::Receiver<Option<Found>>,
+}
 
 static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
-static UNDER_WAY: Mutex<Lookups> = Mutex::new(BTreeMap::new());
+static REPEATS: Semaphore = Semaphore::const_new(REPEATED);
+static UNDER_WAY: Mutex<BTreeMap<String, Lookup>> = Mutex::new(BTreeMap::new());
 
-fn under_way() -> MutexGuard<'static, Lookups> {
+fn under_way() -> MutexGuard<'static, BTreeMap<String, Lookup>> {
     UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -41,19 +51,7 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(vec![SocketAddr::new(address, port)]);
     }
-    let mut answer = {
-        let mut under_way = under_way();
-        match under_way.get(host) {
-            Some((began, answer)) if began.elapsed() < SHARED_FOR => answer.clone(),
-            _ => {
-                let (tell, answer) = watch::channel(None);
-                let began = Instant::now();
-                under_way.insert(host.to_owned(), (began, answer.clone()));
-                tokio::spawn(look_up(host.to_owned(), began, tell));
-                answer
-            }
-        }
-    };
+    let mut answer = share_or_begin(host);
     let found = answer.wait_for(Option::is_some).await;
     let found = found.map_err(io::Error::other)?.clone();
     match found {
@@ -61,6 +59,29 @@ pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
         Some(Err(error)) => Err(io::Error::new(error.kind(), error)),
         None => Err(io::ErrorKind::NotFound.into()),
     }
+}
+
+/// The answer of a lookup of `host` that is under way or begins now.
+fn share_or_begin(host: &str) -> watch::Receiver<Option<Found>> {
+    let mut under_way = under_way();
+    let (shared_for, permit) = match under_way.get(host) {
+        None => (SHARED_FOR, None),
+        Some(last) if last.began.elapsed() < last.shared_for => return last.answer.clone(),
+        Some(last) => match REPEATS.try_acquire() {
+            Ok(permit) => (2 * last.shared_for, Some(permit)),
+            Err(_) => return last.answer.clone(),
+        },
+    };
+    let (tell, answer) = watch::channel(None);
+    let began = Instant::now();
+    let lookup = Lookup {
+        began,
+        shared_for,
+        answer: answer.clone(),
+    };
+    under_way.insert(host.to_owned(), lookup);
+    tokio::spawn(look_up(host.to_owned(), began, permit, tell));
+    answer
 }
 
 /// Whether `address` belongs to this computer. If it does, the kernel chooses `address` itself as the source address of
@@ -87,14 +108,23 @@ fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
 /// Drops the entry of the lookup that began at `began`. A later one for the same name goes on.
 fn forget(host: &str, began: Instant) {
     let mut under_way = under_way();
-    if under_way.get(host).is_some_and(|(of, _)| *of == began) {
+    if under_way.get(host).is_some_and(|last| last.began == began) {
         under_way.remove(host);
     }
 }
 
-async fn look_up(host: String, began: Instant, tell: watch::Sender<Option<Found>>) {
-    // The semaphore is never closed.
-    let permit = PERMITS.acquire().await;
+/// Looks up a name. Waits for a permit if it has none.
+async fn look_up(
+    host: String,
+    began: Instant,
+    permit: Option<SemaphorePermit<'static>>,
+    tell: watch::Sender<Option<Found>>,
+) {
+    let permit = match permit {
+        Some(permit) => Some(permit),
+        // The semaphore is never closed.
+        None => PERMITS.acquire().await.ok(),
+    };
     let name = host.clone();
     let search = move || {
         let _permit = permit;
@@ -131,13 +161,35 @@ mod tests {
         assert!(nobody.is_err(), "{nobody:?}");
     }
 
+    /// Puts a lookup that never ends under way.
+    fn never_ending(host: &str, age: Duration) -> watch::Sender<Option<Found>> {
+        let (never, answer) = watch::channel(None);
+        let lookup = Lookup {
+            began: Instant::now().checked_sub(age).unwrap(),
+            shared_for: SHARED_FOR,
+            answer,
+        };
+        under_way().insert(host.to_owned(), lookup);
+        never
+    }
+
     #[tokio::test]
     async fn a_lookup_that_takes_long_does_not_delay_a_later_one() {
-        let (_never, answer) = watch::channel(None);
-        let began = Instant::now().checked_sub(SHARED_FOR).unwrap();
-        under_way().insert("ip6-localhost".to_owned(), (began, answer));
+        let _never = never_ending("ip6-localhost", SHARED_FOR);
         // The answer itself depends on this computer's `/etc/hosts`.
         let _ = addresses("ip6-localhost", 4711).await;
         assert!(under_way().get("ip6-localhost").is_none());
+    }
+
+    /// Otherwise a few names of dead computers would block the lookups of all others.
+    #[tokio::test]
+    async fn a_name_that_is_looked_up_again_and_again_is_looked_up_more_and_more_rarely() {
+        let _never = never_ending("again.invalid", SHARED_FOR);
+        let began = || under_way().get("again.invalid").map(|of| of.began);
+        let (first, _) = (began(), share_or_begin("again.invalid"));
+        let second = began();
+        assert_ne!(first, second);
+        let last = under_way().get("again.invalid").map(|of| of.shared_for);
+        assert_eq!(last, Some(2 * SHARED_FOR));
     }
 }

@@ -1,6 +1,6 @@
 //! Changes of this computer that may not be in the journal yet. Pure.
 
-use std::{collections::VecDeque, ops::RangeInclusive};
+use std::{collections::VecDeque, ops::RangeFrom};
 
 use crate::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent},
@@ -55,8 +55,13 @@ impl Outgoing {
         self.changes.iter()
     }
 
+    /// The number of the last change, or 0.
+    pub fn last(&self) -> u64 {
+        self.changes.back().map_or(0, Change::seq)
+    }
+
     /// Applies the changes with these numbers to `state`.
-    pub fn apply(&self, seqs: RangeInclusive<u64>, state: &mut Master) {
+    pub fn apply(&self, seqs: RangeFrom<u64>, state: &mut Master) {
         for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
             match change {
                 Change::Call(record, _) => {

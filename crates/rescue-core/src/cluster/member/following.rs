@@ -182,9 +182,9 @@ impl Member {
     pub(super) fn adopt(&mut self) {
         if self.follows() {
             let mut state = self.cut_off.on(&self.journal.state);
-            // Also the writes answered as a leader, as long as it is unknown whether another computer leads.
-            let (held, answered) = (self.journal.progress.seq, self.outgoing.acknowledged);
-            self.outgoing.apply(held + 1..=answered, &mut state);
+            // Also what this computer showed as a leader, as long as it is unknown whether another computer leads.
+            let held = self.journal.progress.seq;
+            self.outgoing.apply(held + 1.., &mut state);
             self.act(Action::FollowState(state));
         }
     }
@@ -303,6 +303,15 @@ impl Member {
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.place.term, |leader| leader.term);
         let epoch = self.lost.times;
+        // A former leader's mirror still has the changes that the journal may lack.
+        let own = view
+            .leader
+            .as_ref()
+            .is_some_and(|of| of.id == self.settings().id);
+        let seq = match self.follows() && own {
+            true => seq.max(self.outgoing.last()),
+            false => seq,
+        };
         self.place = Place { epoch, term, seq };
     }
 

@@ -55,7 +55,7 @@ impl Member {
                 self.act(Action::ServeOwnOnly(false));
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
-                let last = self.outgoing.changes().last().map_or(0, |of| of.seq());
+                let last = self.outgoing.last();
                 let at_once = Mutant::DeletesKeptWrites.lives();
                 self.chores.keep_until(if at_once { 0 } else { last });
             }

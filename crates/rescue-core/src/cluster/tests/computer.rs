@@ -126,6 +126,8 @@ pub(super) struct Computer {
     pub(super) waiting: Vec<(usize, u64)>,
     /// The furthest place in the journal that a leader's answer has shown.
     pub(super) told: Place,
+    /// The last place that it may have shown, if it led until its role changed last.
+    pub(super) left: Option<Place>,
     /// The place in the journal up to which the mirror is current.
     pub(super) followed: Place,
     /// Whether there is a watch. Its number, time and content follow.
@@ -187,6 +189,7 @@ impl Computer {
             standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
             told: Place::at_the_start(),
+            left: None,
             followed: Place::default(),
             watching: false,
             watch: 0,
@@ -223,12 +226,13 @@ impl Computer {
 
     /// Stops recording. Returns the merged portions that are not answered.
     pub(super) fn leave(&mut self, binds: bool) -> Vec<(u64, Asker, wire::MergeAnswer)> {
-        if binds && self.ledger.sharing.is_some() {
-            let seq = self.ledger.last();
-            self.tell_of(Place {
-                seq,
-                ..self.followed
-            });
+        let recorded = self.ledger.sharing.is_some().then(|| self.ledger.last());
+        self.left = recorded.filter(|_| binds).map(|seq| Place {
+            seq,
+            ..self.followed
+        });
+        if let Some(left) = self.left {
+            self.tell_of(left);
         }
         self.ledger.leave()
     }

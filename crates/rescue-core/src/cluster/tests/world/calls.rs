@@ -279,18 +279,23 @@ impl World {
         let key = self.history.reads[read].key;
         let computer = &self.computers[at];
         let fresh = computer.followed.shows(computer.told);
-        let (may, alone) = match &computer.standing {
-            Standing::Alone => (true, true),
+        let alone = computer.member.role() == Role::Alone;
+        let led = alone && computer.left == Some(computer.told);
+        let may = match &computer.standing {
+            Standing::Alone => true,
             Standing::Leads {
                 pass: Pass::Calls, ..
-            } => (true, false),
-            Standing::Leads { pass, .. } => (fresh && *pass == Pass::Reads, false),
-            Standing::Follows { .. } => (fresh, false),
-            Standing::Nobody { known } => (fresh && *known, false),
+            } => true,
+            Standing::Leads { pass, .. } => fresh && *pass == Pass::Reads,
+            Standing::Follows { .. } => fresh,
+            Standing::Nobody { known } => fresh && *known,
         };
+        assert!(
+            may || !led,
+            "{at}: a former leader's mirror does not answer"
+        );
         if may {
             let value = self.value(at, key);
-            let alone = alone || computer.member.role() == Role::Alone;
             let shows = if alone { Shows::Alone } else { self.shows(at) };
             self.read_done(read, value, shows);
         } else if self.now < self.history.reads[read].began + 8_000 * MS {
