@@ -45,7 +45,7 @@ pub(super) fn value_of(state: &Master, number: usize) -> Option<i32> {
 }
 
 /// A write of a node, and its fate.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Call {
     pub(super) computer: usize,
     pub(super) key: usize,
@@ -64,8 +64,11 @@ pub(super) struct Call {
     unsynced: bool,
     /// Whether the merge found that the write holds: it was made, or others had set the same value.
     held: bool,
-    /// When a leader made the write for a computer that was cut off, and the length of the log then.
-    merged: Option<(u64, usize)>,
+    /// When leaders made the write for a computer that was cut off, and the length of the log then. A leader that loses
+    /// leadership before the log has the write leaves that to the next one.
+    merged: Vec<(u64, usize)>,
+    /// The leaders that have made the write in any merge.
+    merged_by: Vec<usize>,
 }
 
 /// A read of a node.
@@ -154,7 +157,8 @@ impl History {
             reported: false,
             unsynced: false,
             held: false,
-            merged: None,
+            merged: Vec::new(),
+            merged_by: Vec::new(),
         });
         number
     }
@@ -216,13 +220,17 @@ impl History {
         in_log || call.reported || call.held || etcd.lost
     }
 
-    /// Notes that a leader has made `call` for the computer `from`.
-    pub(super) fn merged(&mut self, from: usize, call: &Request, now: u64, log: usize) {
+    /// Notes that the leader `by` has made `call` for the computer `from`.
+    pub(super) fn merged(&mut self, (from, by): (usize, usize), call: &Request, at: (u64, usize)) {
         // A value that the merge sets again, to notify nodes, is no call of a node.
-        let call = self.find(call.params());
+        let Some(number) = self.find(call.params()) else {
+            return;
+        };
+        let call = &mut self.calls[number];
+        call.merged_by.push(by);
         // Only calls by nodes of `from` count. It answered other calls as a leader.
-        if let Some(call) = call.filter(|call| self.calls[*call].computer == from) {
-            self.calls[call].merged.get_or_insert((now, log));
+        if call.computer == from {
+            call.merged.push(at);
         }
     }
 
@@ -338,19 +346,17 @@ impl History {
                 !sent && (others || etcd.value_at(key, cut * 1000) == Some(call.value))
             });
             let excused = call.reported || call.unsynced || superseded || equalled;
-            // The last value may come from a computer that was cut off, and could not tell this write from its own or
-            // from the value before: it compared two states.
-            let unseen = same.clone().any(|(_, last)| {
-                let (Some(cut), Some((moment, _))) = (last.alone, last.merged) else {
-                    return false;
-                };
-                let mut own = self.calls.iter();
-                let own = own
-                    .any(|of| (of.computer, of.key, of.value) == (last.computer, key, call.value));
-                let before = etcd.value_at(key, cut * 1000) == Some(call.value);
-                (own || before) && self.compared(last.computer, cut, moment, etcd)
+            // The last value may come from a computer that was cut off, and could not see this write.
+            let mut last_ones = same.clone();
+            let unseen = last_ones.any(|(last, _)| {
+                let merge = self.merge_of(last, places);
+                merge.is_some_and(|merge| self.changes_were_hidden(last, merge, places, etcd))
             });
-            if (may_be_lost || unseen) && !alone || alone && excused {
+            let excused = match alone {
+                true => excused || unseen && recorded,
+                false => may_be_lost || unseen,
+            };
+            if excused {
                 continue;
             }
             let older = last_heard.is_none_or(|of| of < call.made);
@@ -376,40 +382,63 @@ impl History {
         skipped.any(|(of, at)| *of == computer && (since..=moment).contains(at))
     }
 
-    /// Checks that no write answered while cut off has replaced a write that others made meanwhile.
+    /// When the merge made the write `number`, which a computer answered while it was cut off, and its place in the
+    /// journal.
+    fn merge_of(&self, number: usize, places: &Places) -> Option<(u64, usize)> {
+        let merged = &self.calls[number].merged;
+        let (_, first) = merged.first()?;
+        let mut changed = places.changed[number].iter();
+        let place = *changed.find(|at| **at >= first * 1000)?;
+        let mut made = merged.iter().rev();
+        let (moment, _) = made.find(|(_, log)| log * 1000 <= place)?;
+        Some((*moment, place))
+    }
+
+    /// Whether the merge that made the write `number` may have missed the changes of others, because it compared two
+    /// states. Those do not show that others set a value and set it back, nor that they set what this computer's nodes
+    /// set, too, or what it answered as the leader before it was cut off.
+    fn changes_were_hidden(
+        &self,
+        number: usize,
+        (moment, place): (u64, usize),
+        places: &Places,
+        etcd: &Etcd,
+    ) -> bool {
+        let call = &self.calls[number];
+        let Some(cut) = call.alone else { return false };
+        let before = etcd.value_at(call.key, place);
+        let first = places.of_value(self, call.key, before);
+        let back = first.is_some_and(|(first, _)| first < cut * 1000);
+        let mut own = self.calls.iter();
+        let own = own.any(|of| {
+            let own = of.computer == call.computer || of.by == Some(call.computer);
+            own && of.key == call.key && Some(of.value) == before
+        });
+        (back || own) && self.compared(call.computer, cut, moment, etcd)
+    }
+
+    /// Checks that no write made while cut off has replaced a write that others made meanwhile.
     fn check_merged(&self, places: &Places, etcd: &Etcd) -> Result<(), String> {
         for (number, call) in self.calls.iter().enumerate() {
-            let (Some(cut), Some((moment, log))) = (call.alone, call.merged) else {
+            let (Some(cut), Some(merge)) = (call.alone, self.merge_of(number, places)) else {
                 continue;
             };
-            // A comparison of states does not show that others set a value and set it back, nor that they set what this
-            // computer's nodes set, too, or what it answered as the leader before it was cut off.
-            let compared = self.compared(call.computer, cut, moment, etcd);
-            let merged = places.changed[number].iter().find(|at| **at >= log * 1000);
-            let Some(merged) = merged else { continue };
-            let before = etcd.value_at(call.key, *merged);
-            let first = places.of_value(self, call.key, before);
-            let back = first.is_some_and(|(first, _)| first < cut * 1000);
-            let mut own = self.calls.iter();
-            let own = own.any(|of| {
-                let own = of.computer == call.computer || of.by == Some(call.computer);
-                own && of.key == call.key && Some(of.value) == before
-            });
-            if compared && (back || own) {
+            if self.changes_were_hidden(number, merge, places, etcd) {
                 continue;
             }
+            let (_, merged) = merge;
             for (of, other) in self.calls.iter().enumerate() {
                 let theirs = other.computer != call.computer && other.key == call.key;
-                // Writes that this computer itself answered came before it was cut off.
-                let counts = other.heard.is_some()
-                    && other.alone.is_none()
-                    && other.by != Some(call.computer);
+                // Writes that this computer itself answered or merged came before it was cut off.
+                let own =
+                    other.by == Some(call.computer) || other.merged_by.contains(&call.computer);
+                let counts = other.heard.is_some() && other.alone.is_none() && !own;
                 if !theirs || !counts || other.value == call.value {
                     continue;
                 }
                 let first = places.changed[of].first();
                 let first = first.filter(|at| etcd.writers[*at / 1000] != call.computer);
-                if first.is_some_and(|at| *at >= cut * 1000 && at < merged) {
+                if first.is_some_and(|at| *at >= cut * 1000 && *at < merged) {
                     return Err(format!("{call:?} has replaced {other:?} of others"));
                 }
             }
@@ -444,7 +473,12 @@ impl History {
             }
             let Some(heard) = call.heard else { continue };
             // A later write may have taken the place of this one when the writes were kept, and may be lost.
-            if call.alone.is_some() && !call.held || brought_back(call) {
+            // Until a restart, it may have counted as lost, and after it a comparison of states found no change.
+            let revived = match (call.alone, call.merged.last()) {
+                (Some(cut), Some((moment, _))) => self.compared(computer, cut, *moment, etcd),
+                _ => false,
+            };
+            if call.alone.is_some() && !call.held || revived || brought_back(call) {
                 continue;
             }
             // A value in a whole state may come from another call.

@@ -189,7 +189,7 @@ impl World {
                                 vec![Value::from(1), "".into(), 0.into()].into(),
                             ]));
                             let log = self.etcd.log.len();
-                            self.history.merged(from, call, self.now, log);
+                            self.history.merged((from, at), call, (self.now, log));
                             if let Some((_, notices)) = ran {
                                 self.tell_notices(at, notices);
                             }
