@@ -60,6 +60,7 @@ struct Socket {
 }
 
 struct World {
+    reap: Reap,
     dice: Dice,
     clock: u64,
     programs: Vec<Program>,
@@ -87,6 +88,8 @@ struct Counts {
     events: u64,
     reused_ports: u64,
     reaped: u64,
+    /// Nodes that lost their port to another one, or whose port refused connections.
+    evicted: u64,
     known: u64,
     prevented: u64,
     displaced: u64,
@@ -94,8 +97,9 @@ struct Counts {
 }
 
 impl World {
-    fn new(seed: u64) -> Self {
+    fn new(seed: u64, reap: Reap) -> Self {
         Self {
+            reap,
             dice: Dice(seed),
             clock: 0,
             programs: Vec::new(),
@@ -246,16 +250,24 @@ impl World {
         let api = Self::api(&self.programs[index]);
         let params = [name.as_str(), "/t", "x/Y", api.as_str()];
         let call = Request::new(Method::RegisterPublisher, params);
+        let taking = match self.reap {
+            Reap::All => Eviction::before(&self.mirror, &call),
+            _ => None,
+        };
+        let taken = taking.map_or(Vec::new(), |taking| taking.nodes);
+        self.assert_port_is_lost(&taken, index);
+        let mut gone: BTreeSet<_> = taken.into_iter().collect();
         for moving in Moving::by(&self.mirror, &call) {
             let evidence = self.evidence(&moving.node, &moving.from);
-            let first = moving.is_unregistered_first(Reap::Local, evidence);
-            if first {
+            if moving.is_unregistered_first(self.reap, evidence) {
                 self.counts.prevented += u64::from(moving.hits_another(evidence));
-                let eviction = Eviction::of(&self.mirror, [moving.node]);
-                self.mirror.apply(&eviction.unwrap().call);
-            } else {
+                gone.insert(moving.node);
+            } else if !gone.contains(&moving.node) {
                 self.shut_down(&moving);
             }
+        }
+        if let Some(eviction) = Eviction::of(&self.mirror, gone) {
+            self.mirror.apply(&eviction.call);
         }
         self.mirror.apply(&call);
         self.registrations += 1;
@@ -269,6 +281,26 @@ impl World {
         }
         // rosrescue looks at once, before the kernel gives a port to another program.
         self.look(false);
+    }
+
+    /// Checks that the nodes `taken` listen no more at the port that the program `index` registers.
+    fn assert_port_is_lost(&mut self, taken: &[String], index: usize) {
+        for name in taken {
+            let holder = self.holder[name];
+            let program = &self.programs[holder];
+            // Documented: a program with several names loses the earlier ones. Nor can an address that leads to two
+            // networks tell their programs apart.
+            let far = |place| matches!(place, Place::OtherNetwork | Place::Forwarded);
+            let excused = holder == index || far(program.place) || far(self.programs[index].place);
+            let lives = program.runs && !program.closed;
+            assert!(
+                !lives || excused,
+                "a living node is unregistered: {name} {program:?}"
+            );
+            self.counts.unproved += u64::from(lives && holder != index);
+            self.counts.evicted += 1;
+            self.programs[holder].names.remove(name);
+        }
     }
 
     /// The master tells what listens at the old address to shut down.
@@ -348,6 +380,37 @@ impl World {
         if let Some(listener) = self.listener(api) {
             let said = (self.registered[name], self.programs[listener].own_pid);
             self.said.insert(name.to_owned(), said);
+        } else if self.reap == Reap::All {
+            self.refused(api.to_owned());
+        }
+    }
+
+    /// The port of `api` refuses connections. Anything may happen until its nodes are unregistered.
+    fn refused(&mut self, api: String) {
+        let nodes = self.mirror.nodes().filter(|(_, at)| *at == api);
+        let asked: Vec<_> = nodes
+            .map(|(name, _)| (name.to_owned(), self.registered[name]))
+            .collect();
+        if !self.looking && self.dice.one_in(2) {
+            self.event();
+        }
+        for (name, registered) in asked {
+            if self.registered[&name] != registered || self.mirror.api_of(&name) != Some(&api) {
+                continue;
+            }
+            let holder = &mut self.programs[self.holder[&name]];
+            // A forwarder may be started again. In another network, the node listens elsewhere.
+            let far = matches!(holder.place, Place::OtherNetwork | Place::Forwarded);
+            let lives = holder.runs && !holder.closed;
+            assert!(
+                !lives || far,
+                "a living node is unregistered: {name} {holder:?}"
+            );
+            self.counts.unproved += u64::from(lives);
+            holder.names.remove(&name);
+            let calls = self.mirror.unregister_calls(&name);
+            self.mirror.apply(&Request::multicall(calls));
+            self.counts.evicted += 1;
         }
     }
 
@@ -538,8 +601,8 @@ impl World {
 }
 
 /// Plays one robot.
-fn play(seed: u64, events: usize) -> Counts {
-    let mut world = World::new(seed);
+fn play(seed: u64, events: usize, reap: Reap) -> Counts {
+    let mut world = World::new(seed, reap);
     for _ in 0..events {
         world.event();
         if world.dice.one_in(4) {
@@ -555,28 +618,34 @@ fn no_living_node_is_unregistered_and_no_innocent_one_is_shut_down() {
     let first: u64 = seed.map_or(1, |seed| seed.parse().unwrap());
     let rounds = std::env::var("ROSRESCUE_ROUNDS").ok();
     let rounds: u64 = rounds.map_or(200, |rounds| rounds.parse().unwrap());
-    let mut sum = Counts::default();
-    for seed in first..first + rounds {
-        let played = std::panic::catch_unwind(|| play(seed, EVENTS));
-        let counts = played.unwrap_or_else(|_| panic!("repeat it with ROSRESCUE_SEED={seed}"));
-        sum.events += counts.events;
-        sum.reused_ports += counts.reused_ports;
-        sum.reaped += counts.reaped;
-        sum.known += counts.known;
-        sum.prevented += counts.prevented;
-        sum.displaced += counts.displaced;
-        sum.unproved += counts.unproved;
-    }
-    println!("seeds {first} to {}: {sum:?}", first + rounds - 1);
-    assert!(sum.events >= 500 * rounds);
-    for count in [
-        sum.reused_ports,
-        sum.reaped,
-        sum.known,
-        sum.prevented,
-        sum.displaced,
-    ] {
-        assert!(count >= rounds / 4, "{sum:?}");
+    for reap in [Reap::Local, Reap::All] {
+        let mut sum = Counts::default();
+        for seed in first..first + rounds {
+            let played = std::panic::catch_unwind(|| play(seed, EVENTS, reap));
+            let again = |_| panic!("{reap:?}: repeat it with ROSRESCUE_SEED={seed}");
+            let counts = played.unwrap_or_else(again);
+            sum.events += counts.events;
+            sum.reused_ports += counts.reused_ports;
+            sum.reaped += counts.reaped;
+            sum.evicted += counts.evicted;
+            sum.known += counts.known;
+            sum.prevented += counts.prevented;
+            sum.displaced += counts.displaced;
+            sum.unproved += counts.unproved;
+        }
+        let last = first + rounds - 1;
+        println!("{reap:?}, seeds {first} to {last}: {sum:?}");
+        assert!(sum.events >= 500 * rounds);
+        assert_eq!(sum.evicted > 0, reap == Reap::All);
+        for count in [
+            sum.reused_ports,
+            sum.reaped,
+            sum.known,
+            sum.prevented,
+            sum.displaced,
+        ] {
+            assert!(count >= rounds / 4, "{sum:?}");
+        }
     }
 }
 
@@ -590,7 +659,8 @@ fn the_simulation_finds_each_wrong_rule() {
         WrongRule::OnlyNamesCount,
     ] {
         WrongRule::put(Some(rule));
-        let found = (1..200).find(|seed| std::panic::catch_unwind(|| play(*seed, EVENTS)).is_err());
+        let found = (1..200)
+            .find(|seed| std::panic::catch_unwind(|| play(*seed, EVENTS, Reap::Local)).is_err());
         WrongRule::put(None);
         println!("{rule:?} is found with seed {found:?}");
         assert!(found.is_some(), "{rule:?}");
