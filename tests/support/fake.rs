@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::fd::AsRawFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
+use std::time::SystemTime;
 
 use rosrescue::xmlrpc::{self, Reply, Value};
 
@@ -22,6 +23,8 @@ pub(crate) struct Heard {
     pub(crate) params: Vec<Value>,
     /// Whether rosrescue itself made the call, under the name of the master, as nodes expect.
     pub(crate) from_rosrescue: bool,
+    pub(crate) from: Option<IpAddr>,
+    pub(crate) at: SystemTime,
 }
 
 #[derive(Debug, Default)]
@@ -227,6 +230,7 @@ fn claim(table: &Mutex<BTreeMap<String, String>>, topic: &str, topic_type: Optio
 }
 
 fn serve_node(inner: &Inner, stream: TcpStream) {
+    let from = stream.peer_addr().ok().map(|peer| peer.ip());
     let mut stream = BufReader::new(stream);
     while let Some((head, body)) = read_request(&mut stream) {
         let Ok(call) = xmlrpc::decode_call(&body) else {
@@ -240,6 +244,8 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
             method: call.method.clone(),
             params: call.params,
             from_rosrescue: head.contains("\nuser-agent: rosrescue/"),
+            from,
+            at: SystemTime::now(),
         });
         if lock(&inner.ignored).as_ref() == Some(&call.method) {
             continue;

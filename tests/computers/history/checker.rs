@@ -68,6 +68,8 @@ pub(crate) struct Told {
     pub(crate) subscriber: String,
     pub(crate) key: String,
     pub(crate) value: Value,
+    /// Its last notifications, for the report.
+    pub(crate) trail: String,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -298,9 +300,10 @@ fn told(end: &End) -> Vec<String> {
             subscriber,
             key,
             value,
+            trail,
         } = told;
         (*value != last).then(|| {
-            format!("{subscriber} was told that {key} is {value:?}, and in the end it is {last:?}")
+            format!("{subscriber} was told that {key} is {value:?}, and in the end it is {last:?}: {trail}")
         })
     });
     wrong.collect()
@@ -562,6 +565,7 @@ mod tests {
             subscriber: "/s".to_owned(),
             key: KEY.to_owned(),
             value,
+            trail: String::new(),
         };
         let end = |value| End {
             values: BTreeMap::from([(KEY.to_owned(), 2)]),

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use rosrescue::xmlrpc::Value;
 
@@ -13,7 +13,7 @@ use crate::computer::{NAMES, PORT};
 use crate::fleet::Fleet;
 use crate::network::{COUNT, enter};
 use crate::support::links::Dice;
-use crate::support::{Client, Finish, State, eventually, params, request};
+use crate::support::{Client, Finish, Heard, State, eventually, params, request};
 use crate::traffic::{Named, TYPE};
 
 /// Pause between two calls of a client.
@@ -174,16 +174,19 @@ impl Clients {
             values.extend(found.and_then(Value::as_int).map(|value| (key, value)));
         }
         let told = self.subscribers.iter().flat_map(|node| {
-            let updates = node.it().heard("paramUpdate");
+            let mut updates = node.it().calls();
+            updates.retain(|call| call.method == "paramUpdate");
             self.shared.keys().into_iter().map(move |key| {
-                let of_key = |update: &&Vec<Value>| {
-                    let name = update[1].as_str().unwrap_or_default();
+                let of_key = |update: &&Heard| {
+                    let name = update.params[1].as_str().unwrap_or_default();
                     name.trim_end_matches('/') == key
                 };
-                let last = updates.iter().rfind(of_key);
+                let updates: Vec<_> = updates.iter().filter(of_key).collect();
+                let last = updates.last();
                 Told {
                     subscriber: node.it().name.clone(),
-                    value: last.and_then(|update| update[2].as_int()),
+                    value: last.and_then(|update| update.params[2].as_int()),
+                    trail: trail(updates.iter().rev().take(8).rev()),
                     key,
                 }
             })
@@ -373,6 +376,24 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
         }
         thread::sleep(SAMPLE);
     }
+}
+
+/// When and by whom a subscriber was notified, as in `07:03:01.250 by rosrescue at 10.77.0.1: Int(7)`.
+fn trail<'a>(updates: impl Iterator<Item = &'a &'a Heard>) -> String {
+    let line = |update: &&Heard| {
+        let since = update.at.duration_since(UNIX_EPOCH).unwrap();
+        let (secs, ms) = (since.as_secs() % 86_400, since.subsec_millis());
+        let (h, m, s) = (secs / 3600, secs / 60 % 60, secs % 60);
+        let by = if update.from_rosrescue {
+            "rosrescue"
+        } else {
+            "rosmaster"
+        };
+        let from = update.from.map(|from| from.to_string()).unwrap_or_default();
+        let value = &update.params[2];
+        format!("\n  {h:02}:{m:02}:{s:02}.{ms:03} by {by} at {from}: {value:?}")
+    };
+    updates.map(line).collect()
 }
 
 /// The warnings of all computers about lost writes of these parameters.
