@@ -1,10 +1,11 @@
 #!/bin/sh
 # packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for
-# all three, on an amd64 computer. They are in target/packages, with SHA256SUMS and, with a key of gpg, SHA256SUMS.asc.
-# zig links for glibc 2.17 and compiles C for the other processors. The bytes should not depend on the folder.
+# all three, on an amd64 computer. They are in target/packages, with SHA256SUMS and, with
+# a key of gpg, SHA256SUMS.asc. zig links for glibc 2.17 and compiles C for the other processors. The bytes depend on the
+# commit, on Rust's version and on whether there is an mdBook, and not on folders.
 #
-# Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools. Without rustup,
-# CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).
+# Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools.
+# Without rustup, CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).
 set -eu
 cd "$(dirname "$0")/.."
 checkout=$PWD
@@ -39,13 +40,18 @@ ROSRESCUE_COMMIT=${ROSRESCUE_COMMIT:-$(git rev-parse --short=7 HEAD)$(git diff -
 export SOURCE_DATE_EPOCH ROSRESCUE_COMMIT
 cargo_home=${CARGO_HOME:-$HOME/.cargo}
 sysroot=$(rustc --print sysroot)
-export RUSTFLAGS="--remap-path-prefix=$checkout=/rosrescue --remap-path-prefix=$cargo_home=/cargo --remap-path-prefix=$sysroot=/rust"
+# The last prefix that fits counts. With rust-src, rustc names the standard library's files there.
+rustc=/rustc/$(rustc -vV | sed -n 's/^commit-hash: //p')
+export RUSTFLAGS="--remap-path-prefix=$checkout=/rosrescue --remap-path-prefix=$cargo_home=/cargo --remap-path-prefix=$sysroot=/rust \
+--remap-path-prefix=$sysroot/lib/rustlib/src/rust=$rustc"
 export CFLAGS="-ffile-prefix-map=$cargo_home=/cargo"
 
 packages=$target/packages
 rm -rf "$packages"
 mkdir -p "$packages"
 [ $# -gt 0 ] || set -- arm64 armhf
+build_std=${CARGO_UNSTABLE_BUILD_STD:-}
+unset CARGO_UNSTABLE_BUILD_STD
 # amd64 first: its program makes the manual pages and completions of all packages.
 for processor in amd64 "$@"; do
     case $processor in
@@ -54,16 +60,14 @@ for processor in amd64 "$@"; do
         armhf) triple=armv7-unknown-linux-gnueabihf ;;
         *) fail "unknown processor $processor; there are arm64 and armhf besides amd64" ;;
     esac
+    # cargo takes an empty CARGO_UNSTABLE_BUILD_STD for a wish, too.
+    missing=$build_std
     if [ -n "$(ls "$sysroot/lib/rustlib/$triple/lib" 2>/dev/null)" ]; then
-        build_std=
-    elif [ -n "${CARGO_UNSTABLE_BUILD_STD:-}" ]; then
-        build_std=$CARGO_UNSTABLE_BUILD_STD
-    else
+        missing=
+    elif [ -z "$build_std" ]; then
         rustup target add "$triple" >&2 || fail "Rust's standard library for $triple is missing"
-        build_std=
     fi
-    CARGO_UNSTABLE_BUILD_STD=$build_std \
-        cargo zigbuild --profile dist --locked --target "$triple.$glibc" >&2
+    env ${missing:+"CARGO_UNSTABLE_BUILD_STD=$missing"} cargo zigbuild --profile dist --locked --target "$triple.$glibc" >&2
     program=$target/$triple/dist/rosrescue
     needs=$(readelf --dyn-syms --wide "$program" | grep -o 'GLIBC_[0-9.]*' | sort -V | tail -n 1)
     if [ "$(printf '%s\n%s\n' "$needs" "GLIBC_$glibc" | sort -V | tail -n 1)" != "GLIBC_$glibc" ]; then
