@@ -1,10 +1,10 @@
 #!/bin/sh
 # packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for
-# all three, on an amd64 computer. They are in target/packages, with SHA256SUMS and, with
+# all three, on an amd64 computer. They are in target/packages, with a bill of materials (CycloneDX), SHA256SUMS and, with
 # a key of gpg, SHA256SUMS.asc. zig links for glibc 2.17 and compiles C for the other processors. The bytes depend on the
 # commit, on Rust's version and on whether there is an mdBook, and not on folders.
 #
-# Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig and cargo-zigbuild into target/tools.
+# Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig, cargo-zigbuild and cargo-cyclonedx into target/tools.
 # Without rustup, CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).
 set -eu
 cd "$(dirname "$0")/.."
@@ -12,6 +12,7 @@ checkout=$PWD
 target=${CARGO_TARGET_DIR:-target}
 zig=0.15.2
 zigbuild=0.23.0
+cyclonedx=0.5.9
 # The newest C library that a program may need: Ubuntu 14.04, Debian 8 and JetPack 4 have 2.19 or later.
 glibc=2.17
 
@@ -33,6 +34,11 @@ if ! [ "$("$tools/bin/cargo-zigbuild" --version 2>/dev/null)" = "cargo-zigbuild 
     "$tools/bin/pip" install --quiet "ziglang==$zig" "cargo-zigbuild==$zigbuild" >&2
 fi
 export PATH="$tools/bin:$PATH"
+bom=$target/tools/bin/cargo-cyclonedx
+if ! [ "$("$bom" cyclonedx --version 2>/dev/null)" = "cargo-cyclonedx-cyclonedx $cyclonedx" ]; then
+    echo "build-all.sh: installing cargo-cyclonedx $cyclonedx into $target/tools: some two minutes on two cores" >&2
+    cargo install --quiet --locked --version "$cyclonedx" --root "$target/tools" cargo-cyclonedx
+fi
 
 # What the bytes may depend on: the commit and its date, and no folder of this computer.
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
@@ -75,6 +81,14 @@ for processor in amd64 "$@"; do
     fi
     packaging/build-deb.sh --target "$triple" --output "$packages"
 done
+
+# The bill of materials: what amd64 is built of, of which the others need no more. The tool writes one beside each
+# manifest, with the checkout's folder in its references.
+RUSTFLAGS='' CFLAGS='' "$bom" cyclonedx --quiet --format json --spec-version 1.5 --target x86_64-unknown-linux-gnu \
+    --override-filename target-bom >&2
+version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)
+sed "s|$checkout|/rosrescue|g" target-bom.json >"$packages/rosrescue_$version.cdx.json"
+rm target-bom.json crates/*/target-bom.json
 cd "$packages"
-sha256sum -- *.deb >SHA256SUMS
+sha256sum -- *.deb *.json >SHA256SUMS
 [ -z "$key" ] || gpg --batch --yes --armor --local-user "$key" --detach-sign SHA256SUMS
