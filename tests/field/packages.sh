@@ -2,6 +2,7 @@
 # packages.sh FOLDER [RELEASE/PROCESSOR]...: tries the Debian packages in FOLDER (of packaging/build-all.sh) in new
 # installations of these releases, or of all. Each package is installed, runs the release's rosmaster through its death,
 # is upgraded from the version before with the state in place, removed and purged. Prints one row of Markdown for each.
+# Where the release has no rosmaster, the package is only installed, upgraded and purged.
 #
 # Needs root, debootstrap, dpkg-dev, and for ARM qemu-user-static with binfmt_misc. Takes one to three minutes for each,
 # with ARM ten. Installations are kept in target/field/packages.
@@ -12,8 +13,8 @@ packages=$(cd "$1" && pwd)
 shift
 roots=${CARGO_TARGET_DIR:-$checkout/target}/field/packages
 mkdir -p "$roots"
-[ $# -gt 0 ] || set -- xenial/amd64 bionic/amd64 focal/amd64 jammy/amd64 bullseye/amd64 bookworm/amd64 trixie/amd64 \
-    bullseye/arm64 bookworm/arm64 trixie/arm64 bullseye/armhf bookworm/armhf trixie/armhf
+[ $# -gt 0 ] || set -- xenial/amd64 bionic/amd64 focal/amd64 jammy/amd64 noble/amd64 bullseye/amd64 bookworm/amd64 \
+    trixie/amd64 bullseye/arm64 bookworm/arm64 trixie/arm64 bullseye/armhf bookworm/armhf trixie/armhf
 
 # Installs a release with its rosmaster, once.
 make() { # SUITE PROCESSOR
@@ -23,14 +24,19 @@ make() { # SUITE PROCESSOR
     archive=${ROSRESCUE_TEST_DEBIAN:-http://deb.debian.org/debian} python=python3 components=main
     check=--keyring=/usr/share/keyrings/debian-archive-keyring.gpg
     case $1 in
-        xenial | bionic | focal | jammy)
+        xenial | bionic | focal | jammy | noble)
             archive=${ROSRESCUE_TEST_UBUNTU:-http://archive.ubuntu.com/ubuntu} components=main,universe
             check=--no-check-gpg
             ;;
     esac
     case $1 in xenial | bionic) python=python ;; esac
-    debootstrap --arch="$2" --variant=minbase "$check" --components="$components" "$1" "$root.new" "$archive" >&2
-    in_root "$root.new" apt-get install -y --no-install-recommends "$python-rosmaster" procps >&2
+    # Debian 12's debootstrap does not know Ubuntu 24.04, but makes all Ubuntus alike. 24.04 has no rosmaster.
+    like=$1 rosmaster=$python-rosmaster
+    case $1 in noble) like=jammy rosmaster=python3 ;; esac
+    # A caller that asks whether it worked has switched off `set -e`.
+    debootstrap --arch="$2" --variant=minbase "$check" --components="$components" "$1" "$root.new" "$archive" \
+        "/usr/share/debootstrap/scripts/$like" >&2 || return 1
+    in_root "$root.new" apt-get install -y --no-install-recommends "$rosmaster" procps >&2 || return 1
     rm -rf "$root.new"/var/cache/apt/archives/*.deb
     echo "127.0.0.1 localhost" >"$root.new/etc/hosts"
     mv "$root.new" "$root"
@@ -88,6 +94,14 @@ print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         list >/tmp/before
         begin=$(date +%s)
         dpkg -i /given/old.deb
+        if ! command -v rosmaster; then
+            dpkg -i /given/new.deb
+            rosrescue --version
+            dpkg -P rosrescue
+            list >/tmp/after
+            diff /tmp/before /tmp/after
+            exit
+        fi
         start
         echo "installed and running after $(($(date +%s) - begin)) s"
         call "setParam(\"/test\", \"/kept\", 7)"
@@ -112,7 +126,8 @@ print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         list >/tmp/after
         diff /tmp/before /tmp/after
     ' >"$root.log" 2>&1; then
-        echo "| $suite | $processor | $(grep -o "running after .*" "$root.log"), $(grep ^rosrescue "$root.log" | tail -n 1) |"
+        how=$(grep -o "running after .*" "$root.log") || how="installed, upgraded and purged without a rosmaster"
+        echo "| $suite | $processor | $how, $(grep "^rosrescue " "$root.log" | tail -n 1) |"
     else
         tail -n 20 "$root.log" >&2
         echo "| $suite | $processor | failed, see $root.log |"
