@@ -86,7 +86,7 @@ except ImportError: from xmlrpclib import ServerProxy
 print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         start() {
             ROS_IP=127.0.0.1 ROS_LOG_DIR=/tmp/log rosrescue core --no-rosout >>/tmp/said 2>&1 &
-            rosrescue wait --timeout 60 || { cat /tmp/said; exit 1; }
+            rosrescue wait --timeout 150 || { cat /tmp/said; exit 1; }
         }
         # An earlier run may have failed.
         dpkg -P rosrescue
