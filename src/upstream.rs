@@ -296,7 +296,17 @@ impl Upstream {
             master: address.to_string(),
             source,
         };
-        let connecting = async { open(self.find(&address).await?).await };
+        let connecting = async {
+            let (addresses, confirmed) = self.find(&address).await?;
+            // At an old address there may be nobody any more, as after the restart of a container. Trying it must not
+            // delay the next lookup for long.
+            let limit = if confirmed {
+                CONNECT_LIMIT
+            } else {
+                self.probe_timeout
+            };
+            timeout(limit, open(addresses)).await?
+        };
         match timeout(CONNECT_LIMIT, connecting).await {
             Err(_) => Err(unreachable(io::ErrorKind::TimedOut.into())),
             Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
@@ -309,11 +319,11 @@ impl Upstream {
         }
     }
 
-    /// Looks up the master's addresses. If that fails, returns the last known ones: a failing name server must not cut
-    /// off a living master.
-    async fn find(&self, address: &MasterUri) -> io::Result<Vec<SocketAddr>> {
+    /// Looks up the master's addresses. If that fails, returns the last known ones and false: a failing name server must
+    /// not cut off a living master.
+    async fn find(&self, address: &MasterUri) -> io::Result<(Vec<SocketAddr>, bool)> {
         if let Ok(ip) = address.host.parse() {
-            return Ok(vec![SocketAddr::new(ip, address.port)]);
+            return Ok((vec![SocketAddr::new(ip, address.port)], true));
         }
         let (found, asked) = (self.found.clone(), address.clone());
         // The lookup runs in a task of its own, so that a late answer can serve the next connection. A moved master is
@@ -328,13 +338,16 @@ impl Upstream {
             let found = found.as_ref().filter(|(of, _)| of == address);
             found.map(|(_, addresses)| addresses.clone())
         };
-        if known().is_some() {
+        let confirmed = if known().is_some() {
             // The rest of a probe's time is left for the master itself.
-            let _ = timeout(self.probe_timeout / 4, lookup).await;
+            let found = timeout(self.probe_timeout / 4, lookup).await;
+            matches!(found, Ok(Ok(Ok(()))))
         } else {
             lookup.await.map_err(io::Error::other)??;
-        }
-        known().ok_or_else(|| io::ErrorKind::NotFound.into())
+            true
+        };
+        let known = known().map(|addresses| (addresses, confirmed));
+        known.ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
     fn silence(&self) -> Silence {
@@ -411,4 +424,33 @@ pub(crate) async fn test_master() -> (
     let sentinel = upstream.connect_sentinel().await.unwrap();
     let (accepted, _) = listener.accept().await.unwrap();
     (listener, accepted, upstream.into(), sentinel.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A container that is started again has another address, and no kernel answers at the old one.
+    #[tokio::test]
+    async fn an_old_address_that_does_not_answer_delays_the_next_lookup_only_for_a_moment() {
+        let full =
+            socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
+        full.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into())
+            .unwrap();
+        full.listen(0).unwrap();
+        let old = full.local_addr().unwrap().as_socket().unwrap();
+        // The kernel ignores further connections.
+        let _waiting = std::net::TcpStream::connect(old).unwrap();
+        let uri = MasterUri::parse("http://nobody.invalid:11312").unwrap();
+        let name = HeaderValue::from_static("test");
+        let upstream = Upstream::new(uri.clone(), name, Duration::from_millis(200), 3);
+        upstream.found.send_replace(Some((uri, vec![old])));
+        let began = Instant::now();
+        let outcome = upstream.connect().await;
+        assert!(
+            matches!(outcome, Err(ConnectError::Unreachable { .. })),
+            "{outcome:?}"
+        );
+        assert!(began.elapsed() < CONNECT_LIMIT / 2, "{:?}", began.elapsed());
+    }
 }

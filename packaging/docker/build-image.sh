@@ -12,10 +12,12 @@ mkdir -p "$root/var/lib/rosrescue" "$root/etc" "$work/libc"
 dpkg-deb --fsys-tarfile "$package" | tar x -C "$root" ./usr/bin/rosrescue
 chmod 777 "$root/var/lib/rosrescue"
 processor=$(dpkg-deb -f "$package" Architecture)
-(cd "$work" && apt-get download -qq "libc6:$processor" && dpkg-deb -x libc6_*.deb libc)
-# The loader, the libraries that the program names, and those that look up host names.
+(cd "$work" && apt-get download -qq "libc6:$processor" "libgcc-s1:$processor" &&
+    for library in libc6_*.deb libgcc-s1_*.deb; do dpkg-deb -x "$library" libc; done)
+# The loader, the libraries that the program names (libgcc unless build-all.sh made the package), and those that look up
+# host names.
 (cd "$work/libc" && find . -name 'ld-linux*' -o -name 'libc.so*' -o -name 'libm.so*' -o -name 'libpthread.so*' \
-    -o -name 'libdl.so*' -o -name 'libnss_dns.so*' -o -name 'libnss_files.so*' -o -name 'libresolv.so*') |
+    -o -name 'libdl.so*' -o -name 'libgcc_s.so*' -o -name 'libnss_dns.so*' -o -name 'libnss_files.so*' -o -name 'libresolv.so*') |
     tar c -C "$work/libc" -T - | tar x -C "$root"
 echo "rosrescue:x:10001:10001::/var/lib/rosrescue:/" >"$root/etc/passwd"
 echo "hosts: files dns" >"$root/etc/nsswitch.conf"
