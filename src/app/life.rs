@@ -11,8 +11,9 @@ use crate::{
     resolver,
 };
 
-/// How long nodes have to answer, including the lookup of their hosts.
-const LIFE_SIGN: Duration = Duration::from_secs(1);
+/// How long nodes have to answer, including the lookup of their hosts. After a reboot, the first packets may be lost: the
+/// kernel asks for a neighbour's hardware address once per second.
+const LIFE_SIGN: Duration = Duration::from_secs(3);
 
 /// Whether any node of `state` answers. After a reboot of this computer (`same_boot` is false) only
 /// nodes on other computers count, because no local process survived and a local port may belong to
