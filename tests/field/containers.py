@@ -10,7 +10,7 @@ Layouts, each with nodes of rospy and roscpp in a container of their own:
 
 The victims are the master's and rosrescue's container in turn; of the vendor's container only the roscore, or its
 rosmaster, which a loop in that container starts again. A container is killed by `podman kill` and started after a pause,
-or its process is killed and the restart policy starts it at once, or it is removed and made anew.
+or its process is killed and the restart policy starts it at once, or it is removed and made again.
 
 After each kill: no gap between the numbers of messages, no link made or lost, no node's process ended, a parameter was
 read all the time that the master was away, `rostopic list` works during the outage and after it, and the master has all

@@ -7,7 +7,6 @@ use std::os::fd::AsRawFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
-use std::time::SystemTime;
 
 use rosrescue::xmlrpc::{self, Reply, Value};
 
@@ -24,7 +23,8 @@ pub(crate) struct Heard {
     /// Whether rosrescue itself made the call, under the name of the master, as nodes expect.
     pub(crate) from_rosrescue: bool,
     pub(crate) from: Option<IpAddr>,
-    pub(crate) at: SystemTime,
+    /// Milliseconds since 1970.
+    pub(crate) at: u64,
 }
 
 #[derive(Debug, Default)]
@@ -245,7 +245,7 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
             params: call.params,
             from_rosrescue: head.contains("\nuser-agent: rosrescue/"),
             from,
-            at: SystemTime::now(),
+            at: rosrescue::clock::wall_millis(),
         });
         if lock(&inner.ignored).as_ref() == Some(&call.method) {
             continue;

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::Value;
 
@@ -378,12 +378,10 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
     }
 }
 
-/// When and by whom a subscriber was notified, as in `07:03:01.250 by rosrescue at 10.77.0.1: Int(7)`.
+/// When and by whom a subscriber was notified, as in `2026-11-26T07:03:01.250Z by rosrescue at 10.77.0.1: Int(7)`.
 fn trail<'a>(updates: impl Iterator<Item = &'a &'a Heard>) -> String {
     let line = |update: &&Heard| {
-        let since = update.at.duration_since(UNIX_EPOCH).unwrap();
-        let (secs, ms) = (since.as_secs() % 86_400, since.subsec_millis());
-        let (h, m, s) = (secs / 3600, secs / 60 % 60, secs % 60);
+        let at = rosrescue::clock::wall_text_millis(update.at);
         let by = if update.from_rosrescue {
             "rosrescue"
         } else {
@@ -391,7 +389,7 @@ fn trail<'a>(updates: impl Iterator<Item = &'a &'a Heard>) -> String {
         };
         let from = update.from.map(|from| from.to_string()).unwrap_or_default();
         let value = &update.params[2];
-        format!("\n  {h:02}:{m:02}:{s:02}.{ms:03} by {by} at {from}: {value:?}")
+        format!("\n  {at} by {by} at {from}: {value:?}")
     };
     updates.map(line).collect()
 }
