@@ -282,7 +282,7 @@ class Layout:
                 # The parts of roscore do not survive it, as in a container that is for roscore alone.
                 podman("exec", name, "pkill", "-KILL", "-f", "bin/(roscore|rosmaster)|lib/rosout", check=False)
             else:
-                podman("exec", name, "pkill", "-KILL", "-f", "bin/rosmaster")
+                podman("exec", name, "pkill", "-KILL", "-f", "bin/rosmaster", check=False)
             self.during(pause)
             return None
         if victim == "rosrescue":
@@ -373,6 +373,10 @@ class Layout:
             if victim == "vendor":
                 way = ("roscore", "rosmaster")[number // 2 % 2]
             self.once(number, victim, way, 0 if way == "policy" else pause)
+        if self.inside:
+            refused = sum("run_id on parameter server does not match" in line for line in self.lines("roscore"))
+            if refused:
+                self.fail("%d times a new roscore ended because rosrescue had restored /run_id before it" % refused)
         # A node that starts now finds everybody.
         self.node("late", "listener.py", "20")
         late = os.path.join(self.said, "late")
