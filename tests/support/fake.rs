@@ -387,14 +387,11 @@ impl Server {
         serve: impl Fn(TcpStream) + Send + Sync + 'static,
     ) -> Self {
         // Not port 0: the kernel could give the same port to an outgoing connection before we listen. A process that is
-        // being started may hold the socket by which the port was found to be free for a moment.
-        let listener = match port {
-            0 => eventually_some("a free port", || {
-                TcpListener::bind((address, free_port())).ok()
-            }),
-            port => TcpListener::bind((address, port))
-                .unwrap_or_else(|error| panic!("port {port}: {error}")),
-        };
+        // being started may hold a closed socket of this program for a moment.
+        let listener = eventually_some("a free port", || {
+            let port = if port == 0 { free_port() } else { port };
+            TcpListener::bind((address, port)).ok()
+        });
         let port = listener.local_addr().unwrap().port();
         let done = Arc::new(AtomicBool::new(false));
         let open = Arc::new(Mutex::new(Vec::new()));

@@ -62,8 +62,11 @@ impl Booted {
         eventually("a boot", || {
             ["running\n", "degraded\n"].contains(&&*state())
         });
-        let failed = booted.run("systemctl list-units --failed --no-legend");
-        assert_eq!(state(), "running\n", "{failed}");
+        // Another unit of the distribution may fail, which does not concern rosrescue.
+        print!(
+            "{}",
+            booted.run("systemctl list-units --failed --no-legend")
+        );
         booted.run("useradd --create-home robot");
         booted
     }
