@@ -282,7 +282,10 @@ fn wipe(fleet: &mut Fleet, clients: &Clients) {
     fleet.computers[leader].options.extend(always);
     fleet.computers[leader].start_rescue();
     let computer = &fleet.computers[leader];
-    eventually("it leads", || computer.role_is("leading"));
+    // Before that, etcd may lack its state.
+    eventually("rosrescue wait has ended", || {
+        computer.rosrescue(&["wait"]).0 == Some(0)
+    });
     fleet.computers[leader].options = options;
     for other in fleet.others(leader) {
         fleet.computers[other].start_rescue();
