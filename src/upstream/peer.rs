@@ -16,8 +16,10 @@ use crate::{master, ros_env::MasterUri, xmlrpc};
 const IDLE_MOST: usize = 64;
 /// Prefix of the path of calls for the leader of a term. The term follows.
 const PATH: &str = "/cluster/";
-/// Number of unanswered probes after which a connection ends. The cluster's own probes notice a dead computer sooner.
-const SILENT_PROBES: u32 = 3;
+/// A connection ends a second after this many unanswered probes, of which there is one per second. The kernel then drops
+/// what the other end has not acknowledged. That must be before this computer is cut off and answers a forwarded call
+/// itself: otherwise the leader would run the old call when the network is back.
+const SILENT_PROBES: u32 = 1;
 
 /// The term in a path, if the request is meant for the leader of that term.
 pub(crate) fn term_of(path: &str) -> Option<u64> {
