@@ -1,8 +1,11 @@
 //! Calls to the rosrescue of another computer.
 
-use std::sync::{
-    Arc, Mutex, MutexGuard, PoisonError,
-    atomic::{AtomicBool, Ordering},
+use std::{
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
 };
 
 use bytes::Bytes;
@@ -16,10 +19,12 @@ use crate::{master, ros_env::MasterUri, xmlrpc};
 const IDLE_MOST: usize = 64;
 /// Prefix of the path of calls for the leader of a term. The term follows.
 const PATH: &str = "/cluster/";
-/// A connection ends a second after this many unanswered probes, of which there is one per second. The kernel then drops
-/// what the other end has not acknowledged. That must be before this computer is cut off and answers a forwarded call
-/// itself: otherwise the leader would run the old call when the network is back.
+/// A connection ends a [`PROBE`] after this many unanswered ones, and the kernel drops what the other end has not
+/// acknowledged. That must be before this computer is cut off and answers a forwarded call itself: otherwise the leader
+/// would run the old call when the network is back.
 const SILENT_PROBES: u32 = 1;
+/// Longest time for another computer to answer a probe.
+const PROBE: Duration = Duration::from_secs(1);
 
 /// The term in a path, if the request is meant for the leader of that term.
 pub(crate) fn term_of(path: &str) -> Option<u64> {
@@ -151,13 +156,13 @@ impl Peer {
 #[derive(Debug)]
 pub(crate) struct Peers {
     instance: HeaderValue,
-    probe_timeout: std::time::Duration,
+    probe_timeout: Duration,
     present: Mutex<Option<Arc<Peer>>>,
 }
 
 impl Peers {
     /// Creates the connections. `instance` identifies this process; see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
-    pub(crate) fn new(instance: HeaderValue, probe_timeout: std::time::Duration) -> Self {
+    pub(crate) fn new(instance: HeaderValue, probe_timeout: Duration) -> Self {
         Self {
             instance,
             probe_timeout,
@@ -176,7 +181,7 @@ impl Peers {
             upstream: Upstream::new(
                 uri.clone(),
                 self.instance.clone(),
-                self.probe_timeout,
+                self.probe_timeout.min(PROBE),
                 SILENT_PROBES,
             ),
             idle: Mutex::default(),

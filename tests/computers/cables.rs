@@ -135,6 +135,32 @@ fn a_computer_that_is_cut_off_twice_continues_from_its_own_writes() {
     fleet.assert_nodes_live();
 }
 
+/// The kernel sends what was written to a connection again and again, also after its computer has answered the call
+/// itself.
+#[test]
+fn a_call_that_a_cut_cable_held_up_does_not_replace_a_later_one() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let leader = fleet.await_whole();
+    let cut = (leader + 1) % 3;
+    let lonely = &fleet.computers[cut];
+    // Its connection to the leader exists.
+    lonely.set_param("/contested", 0);
+    fleet.network.cut_cable(cut);
+    lonely.set_param("/contested", 1);
+    assert!(lonely.role_is("alone"));
+    fleet.network.mend_cable(cut);
+    fleet.computers[leader].set_param("/contested", 2);
+    fleet.await_whole();
+    let stays = holds(Duration::from_secs(2), || {
+        fleet.computers[leader].param("/contested") == Some(Value::Int(2))
+    });
+    assert!(stays, "{:?}", fleet.computers[leader].param("/contested"));
+    await_param(&fleet, "/contested", 2);
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
+}
+
 #[test]
 fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
     let _alone = alone();

@@ -1,14 +1,30 @@
 #!/bin/sh
 # boot_systemd.sh FOLDER PROGRAM GIVEN: becomes a systemd that is process 1 in its own namespaces, over a copy of this
 # computer's files that vanishes with it. PROGRAM appears there as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
-# Needs root.
+# Needs root. Its control group, named after the folder of FOLDER, stays until `boot_systemd.sh --forget FOLDER`.
 #
-#     unshare --mount --pid --cgroup --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM GIVEN
+#     unshare --mount --pid --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM GIVEN
+#     unshare --mount boot_systemd.sh --forget FOLDER
 set -eu
+forgets=
+if [ "$1" = --forget ]; then
+    forgets=yes
+    shift
+fi
 folder=$1
+mount -t tmpfs tmpfs "$folder"
+mkdir "$folder/groups"
+mount -t cgroup2 cgroup2 "$folder/groups"
+group=$folder/groups/$(basename "$(dirname "$folder")")
+if [ -n "$forgets" ]; then
+    find "$group" -depth -type d -exec rmdir {} +
+    exit
+fi
 program=$2
 given=$3
-mount -t tmpfs tmpfs "$folder"
+# Two systemds in one control group would remove each other's groups and end each other's processes.
+mkdir "$group"
+echo 0 >"$group/cgroup.procs"
 mkdir "$folder/upper" "$folder/work" "$folder/root"
 mount -t overlay -o "lowerdir=/,upperdir=$folder/upper,workdir=$folder/work" overlay "$folder/root"
 root=$folder/root
@@ -20,7 +36,6 @@ mount --bind "$given" "$root/given"
 mount -t proc proc "$root/proc"
 mount -o bind,ro "$root/proc/sys" "$root/proc/sys"
 mount -t sysfs -o ro sysfs "$root/sys"
-mount -t cgroup2 cgroup2 "$root/sys/fs/cgroup"
 mount -t tmpfs -o mode=755 tmpfs "$root/dev"
 for device in null zero full random urandom tty; do
     : >"$root/dev/$device"
@@ -47,5 +62,8 @@ Requires=basic.target
 After=basic.target
 AllowIsolate=yes
 UNIT
-exec env -i container=rosrescue-test PATH=/usr/sbin:/usr/bin:/sbin:/bin \
-    chroot "$root" /lib/systemd/systemd --unit=multi-user.target --log-target=journal --show-status=no
+# shellcheck disable=SC2016 # in the new namespace
+exec env -i container=rosrescue-test PATH=/usr/sbin:/usr/bin:/sbin:/bin unshare --cgroup sh -euc '
+    mount -t cgroup2 cgroup2 "$1/sys/fs/cgroup"
+    exec chroot "$1" /lib/systemd/systemd --unit=multi-user.target --log-target=journal --show-status=no
+' sh "$root"

@@ -283,9 +283,8 @@ fn wipe(fleet: &mut Fleet, clients: &Clients) {
     fleet.computers[leader].start_rescue();
     let computer = &fleet.computers[leader];
     // Before that, etcd may lack its state.
-    eventually("rosrescue wait has ended", || {
-        computer.rosrescue(&["wait"]).0 == Some(0)
-    });
+    let (status, said) = computer.rosrescue(&["wait"]);
+    assert_eq!(status, Some(0), "{said}");
     fleet.computers[leader].options = options;
     for other in fleet.others(leader) {
         fleet.computers[other].start_rescue();

@@ -508,8 +508,10 @@ impl Machine {
     fn acknowledge_early(&mut self, now: Instant, actions: &mut Vec<Action>) {
         let may = match self.role {
             // Once it gives up leadership, another computer may lead at any moment.
-            Role::Leading if self.releasing.is_some() => false,
-            Role::Leading => self.settings.commit == Commit::Interval && self.is_sole(now),
+            Role::Leading => {
+                let stays = self.releasing.is_none();
+                stays && self.settings.commit == Commit::Interval && self.is_sole(now)
+            }
             Role::Alone => self.settings.alone == WhenAlone::Serve,
             _ => false,
         };

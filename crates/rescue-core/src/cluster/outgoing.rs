@@ -1,6 +1,6 @@
 //! Changes of this computer that may not be in the journal yet. Pure.
 
-use std::{collections::VecDeque, ops::RangeFrom};
+use std::collections::VecDeque;
 
 use crate::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent},
@@ -60,9 +60,9 @@ impl Outgoing {
         self.changes.back().map_or(0, Change::seq)
     }
 
-    /// Applies the changes with these numbers to `state`.
-    pub fn apply(&self, seqs: RangeFrom<u64>, state: &mut Master) {
-        for change in self.changes.iter().filter(|of| seqs.contains(&of.seq())) {
+    /// Applies the changes after number `seq` to `state`.
+    pub fn apply_after(&self, seq: u64, state: &mut Master) {
+        for change in self.changes.iter().filter(|of| of.seq() > seq) {
             match change {
                 Change::Call(record, _) => {
                     if let RecordContent::Call { call, .. } = &record.entry {

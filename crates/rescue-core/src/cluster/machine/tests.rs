@@ -509,3 +509,14 @@ fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
     machine.on(now, Input::Decided { seq, goes_on });
     assert_eq!(machine.session(), JournalSession::GoesOn);
 }
+
+#[test]
+fn a_leader_that_gives_up_leadership_acknowledges_nothing_that_the_journal_lacks() {
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    machine.settings.commit = Commit::Interval;
+    let before = machine.on(now + ms(1), Input::Recorded(1));
+    assert!(before.contains(&Action::Acknowledge(1)), "{before:?}");
+    machine.on(now + ms(2), Input::HandOver(String::new()));
+    let after = machine.on(now + ms(3), Input::Recorded(2));
+    assert!(!after.contains(&Action::Acknowledge(2)), "{after:?}");
+}

@@ -183,8 +183,8 @@ impl Member {
         if self.follows() {
             let mut state = self.cut_off.on(&self.journal.state);
             // Also what this computer showed as a leader, as long as it is unknown whether another computer leads.
-            let held = self.journal.progress.seq;
-            self.outgoing.apply(held + 1.., &mut state);
+            self.outgoing
+                .apply_after(self.journal.progress.seq, &mut state);
             self.act(Action::FollowState(state));
         }
     }
