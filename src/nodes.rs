@@ -173,10 +173,10 @@ impl Nodes {
         names
     }
 
-    /// Notes that the node at `port` did not answer.
-    pub(super) fn mark_unreachable(&self, port: &str) {
+    /// Notes that the node at `port` did not answer a notification or, if `in_check` is true, a health check.
+    pub(super) fn mark_unreachable(&self, port: &str, in_check: bool) {
         let now = Instant::now();
-        let new = self.lock().add(port, now);
+        let new = self.lock().add(port, now, in_check);
         // This node may have to be asked again before all other unreachable nodes.
         self.changed.notify_one();
         if !new {
@@ -368,7 +368,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
     for port in due {
         let nodes = nodes.clone();
         crate::task::spawn(async move {
-            let outcome = health_check::visit(&nodes, port).await;
+            let outcome = health_check::visit(&nodes, port, false).await;
             match outcome.sign {
                 Reaction::Alive => say(&outcome, "an unreachable node answers again"),
                 Reaction::Dead if !outcome.removed.is_empty() => say(

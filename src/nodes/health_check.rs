@@ -115,7 +115,7 @@ fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
     });
     let mut visits = JoinSet::new();
     for port in ports {
-        visits.spawn(boxed(visit(nodes, port)));
+        visits.spawn(boxed(visit(nodes, port, true)));
     }
     visits
 }
@@ -135,16 +135,20 @@ async fn collect(mut visits: JoinSet<CheckResult>) -> HealthCheck {
 
 /// Asks the node behind `port` until its answers tell, for each node name registered there, whether that node is alive
 /// and its registrations are right.
+///
+/// Nodes whose port refuses connections are unregistered only if `in_check` is true, or if the port has already failed
+/// a health check. A port that has only refused a notification keeps its nodes, as with a bare master.
 pub(crate) fn visit(
     nodes: &Arc<Nodes>,
     port: String,
+    in_check: bool,
 ) -> impl Future<Output = CheckResult> + Send + 'static {
     let (nodes, waiting) = (nodes.clone(), Waiting::new(nodes));
     let span = tracing::debug_span!("visit", port);
-    async move { converse(&nodes, &port, waiting).await }.instrument(span)
+    async move { converse(&nodes, &port, in_check, waiting).await }.instrument(span)
 }
 
-async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResult {
+async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
     let mut outcome = CheckResult {
         sign: Reaction::Silent,
@@ -174,13 +178,15 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
         outcome.names = names.map(|name| name.node.clone()).collect();
         match interview.sign {
             Reaction::Silent => {
-                nodes.mark_unreachable(port);
+                nodes.mark_unreachable(port, in_check);
                 break;
             }
             Reaction::Dead => {
                 drop(waiting.take());
                 let calls: Vec<_> = asked.iter().flat_map(Asked::calls).collect();
-                match judge_refusal(nodes.gate.is_open(), refused.as_ref(), &calls) {
+                let may_unregister =
+                    nodes.gate.is_open() && (in_check || nodes.lock().has_failed_check(port));
+                match judge_refusal(may_unregister, refused.as_ref(), &calls) {
                     Refusal::AskAgain if question + 1 < QUESTIONS => {
                         refused = Some(calls);
                         continue;
@@ -189,7 +195,8 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
                     _ => {}
                 }
                 if outcome.removed.is_empty() {
-                    nodes.mark_unreachable(port);
+                    tracing::debug!(names = ?outcome.names, "a port refuses connections; its nodes stay registered");
+                    nodes.mark_unreachable(port, in_check);
                 } else {
                     nodes.clear(port);
                 }

@@ -162,7 +162,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             nodes.set_mute(&port, false);
         }
         if sign != Reaction::Alive {
-            nodes.mark_unreachable(&port);
+            nodes.mark_unreachable(&port, false);
             nodes.ledger.with_order(|order, _| order.drop_port(&port));
             return;
         }

@@ -209,13 +209,14 @@ pub enum Refusal {
     Dead,
 }
 
-/// Judges a port that refuses connections. `calls` are the last calls of its nodes, and `before` are their last calls
+/// Judges a port that refuses connections. `may_unregister` says that the master serves, and that the port has failed a
+/// health check and not only refused a notification: a bare master keeps such nodes. `calls` are the last calls of its nodes, and `before` are their last calls
 /// when the port refused for the first time. The nodes are dead only if the two are equal, because a node may close its
 /// port before it unregisters, as roslisp does.
-pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, calls: &C) -> Refusal {
+pub fn judge_refusal<C: PartialEq>(may_unregister: bool, before: Option<&C>, calls: &C) -> Refusal {
     match before {
         // While the master is gone, no node is declared dead. The health check after the recovery decides.
-        _ if !master_serves => Refusal::Keep,
+        _ if !may_unregister => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
     }

@@ -89,3 +89,33 @@ fn a_node_whose_port_has_no_listener_is_reported_as_dead() {
         robot.rescue.output().iter().any(said)
     });
 }
+
+/// rosrescue tells a node the state again if the master has notified it soon after an answer. A refused connection is
+/// no failed health check.
+#[test]
+fn a_node_that_refuses_a_notification_stays_registered() {
+    let robot = Robot::start_with(Mode::Core, &["--verbose", "--no-rosout"]);
+    let client = robot.client();
+    let node = FakeNode::start("/subscriber");
+    let publisher = FakeNode::start("/publisher");
+    node.subscribe(&client, "/topic", "std_msgs/String");
+    publisher.publish(&client, "/topic", "std_msgs/String");
+    eventually("the master has notified the subscriber", || {
+        !node.updates("/topic").is_empty()
+    });
+    drop(node);
+    let registered = robot.settled_state();
+    for part in [
+        "a node does not answer",
+        "a port refuses connections; its nodes stay registered",
+    ] {
+        eventually(part, || {
+            let output = robot.rescue.output();
+            output.iter().any(|line| line.contains(part))
+        });
+    }
+    assert_eq!(robot.settled_state(), registered);
+    eventually("the subscriber is reported as dead", || {
+        names(&robot.status().unwrap()["dead_nodes"]) == ["/subscriber"]
+    });
+}

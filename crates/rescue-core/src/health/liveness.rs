@@ -118,13 +118,13 @@ impl Port {
 
 impl Health {
     /// The health of a node whose port was last seen as in `seen`. `unreachable` says whether the node left a health
-    /// check or a notification unanswered.
+    /// check or a notification unanswered. That may be because its port refuses connections.
     pub fn of(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {
+            Some(Reaction::Dead) => Self::Dead,
             _ if unreachable => Self::Unreachable,
             Some(Reaction::Alive) => Self::Alive,
-            Some(Reaction::Dead) => Self::Dead,
             Some(Reaction::Silent) => Self::Unreachable,
             None => Self::Unchecked,
         }

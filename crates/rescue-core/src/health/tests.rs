@@ -238,8 +238,8 @@ fn topics_that_one_side_lacks_are_the_difference() {
 
 #[test]
 fn a_node_is_dead_if_its_port_refuses_twice_with_no_call_in_between() {
-    let refused = |master_serves, before: Option<u64>, calls| {
-        judge_refusal(master_serves, before.as_ref(), &calls)
+    let refused = |may_unregister, before: Option<u64>, calls| {
+        judge_refusal(may_unregister, before.as_ref(), &calls)
     };
     assert_eq!(refused(true, None, 7), Refusal::AskAgain);
     assert_eq!(refused(true, Some(7), 8), Refusal::AskAgain);

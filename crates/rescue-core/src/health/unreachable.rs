@@ -23,12 +23,16 @@ struct Wait {
     backoff: Backoff,
     /// Whether the question to the port is unanswered.
     asked: bool,
+    /// Whether the port has failed a health check.
+    failed_check: bool,
 }
 
 impl Unreachable {
-    /// Notes that a port has not answered. Returns whether it was reachable before.
-    pub fn add(&mut self, port: &str, now: Instant) -> bool {
+    /// Notes that a port has not answered a notification or, if `in_check` is true, a health check. Returns whether it
+    /// was reachable before.
+    pub fn add(&mut self, port: &str, now: Instant, in_check: bool) -> bool {
         if let Some(wait) = self.of.get_mut(port) {
+            wait.failed_check |= in_check;
             if std::mem::take(&mut wait.asked) {
                 wait.backoff.done(now, LONGEST_PAUSE);
             }
@@ -37,6 +41,7 @@ impl Unreachable {
         let wait = Wait {
             backoff: Backoff::new(now + FIRST_PAUSE, FIRST_PAUSE * 2),
             asked: false,
+            failed_check: in_check,
         };
         self.of.insert(port.to_owned(), wait);
         true
@@ -57,6 +62,12 @@ impl Unreachable {
     /// Removes ports at which no node is registered any more.
     pub fn retain(&mut self, registered: impl Fn(&str) -> bool) {
         self.of.retain(|port, _| registered(port));
+    }
+
+    /// Whether the port has failed a health check since it last answered. Only then may its nodes be unregistered when
+    /// it refuses connections later.
+    pub fn has_failed_check(&self, port: &str) -> bool {
+        self.of.get(port).is_some_and(|wait| wait.failed_check)
     }
 
     pub fn contains(&self, port: &str) -> bool {
@@ -94,12 +105,12 @@ mod tests {
     fn unreachable_nodes_are_asked_again_with_growing_pauses() {
         let start = Instant::now();
         let mut unreachable = Unreachable::default();
-        assert!(unreachable.add("a", start) && !unreachable.add("a", start));
+        assert!(unreachable.add("a", start, true) && !unreachable.add("a", start, true));
         let mut asked = Vec::new();
         while asked.len() < 9 {
             let next = unreachable.next().unwrap();
             assert_eq!(unreachable.due(next), ["a"]);
-            assert!(!unreachable.add("a", next));
+            assert!(!unreachable.add("a", next, true));
             asked.push((next - start).as_secs());
         }
         assert_eq!(asked, [1, 3, 7, 15, 31, 63, 123, 183, 243]);
@@ -112,12 +123,12 @@ mod tests {
     fn a_node_that_is_being_asked_is_not_asked_again() {
         let start = Instant::now();
         let mut unreachable = Unreachable::default();
-        unreachable.add("a", start);
+        unreachable.add("a", start, true);
         let late = start + Duration::from_secs(100);
         assert_eq!(unreachable.due(late), ["a"]);
         assert_eq!(unreachable.next(), None);
         assert_eq!(unreachable.due(late), Vec::<String>::new());
-        unreachable.add("a", late);
+        unreachable.add("a", late, true);
         assert_eq!(unreachable.next(), Some(late + FIRST_PAUSE * 2));
     }
 
@@ -125,24 +136,36 @@ mod tests {
     fn all_nodes_are_asked_at_once_when_a_link_is_back() {
         let start = Instant::now();
         let mut unreachable = Unreachable::default();
-        unreachable.add("a", start);
-        unreachable.add("b", start);
+        unreachable.add("a", start, true);
+        unreachable.add("b", start, true);
         let late = start + Duration::from_secs(100);
         assert_eq!(unreachable.due(late), ["a", "b"]);
-        unreachable.add("a", late);
+        unreachable.add("a", late, true);
         let back = late + Duration::from_millis(1);
         unreachable.ask_all_at(back);
         assert_eq!(unreachable.due(back), ["a"], "the other one is being asked");
-        unreachable.add("b", back);
+        unreachable.add("b", back, true);
         assert_eq!(unreachable.next(), Some(back + FIRST_PAUSE));
     }
 
     #[test]
     fn a_node_that_is_no_longer_registered_is_not_unreachable() {
         let mut unreachable = Unreachable::default();
-        unreachable.add("a", Instant::now());
-        unreachable.add("b", Instant::now());
+        unreachable.add("a", Instant::now(), true);
+        unreachable.add("b", Instant::now(), true);
         unreachable.retain(|port| port == "b");
         assert!(!unreachable.contains("a") && unreachable.contains("b"));
+    }
+    #[test]
+    fn a_port_that_refused_a_notification_has_failed_no_check() {
+        let now = Instant::now();
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", now, false);
+        assert!(!unreachable.has_failed_check("a"));
+        unreachable.add("a", now, true);
+        unreachable.add("a", now, false);
+        assert!(unreachable.has_failed_check("a"));
+        unreachable.remove("a");
+        assert!(!unreachable.has_failed_check("a"));
     }
 }
