@@ -60,7 +60,7 @@ const MUTE_MOST: usize = 1024;
 /// What rosrescue knows of the nodes beyond their registrations.
 pub struct Nodes {
     ledger: Arc<Ledger>,
-    gate: gate::Rx,
+    pub(crate) gate: gate::Rx,
     write_queue: WriteQueue,
     stats: &'static Stats,
     /// How long a node may take to answer.

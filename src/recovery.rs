@@ -29,6 +29,7 @@ use crate::{
     limit::{Pair, alarm, all_clear, rarely},
     nodes::Nodes,
     process::{self, ProcessError, effort, listeners::Holder},
+    replay::{RUN_ID_AFTER, lacks_run_id},
     status::{
         Board,
         report::{AWAY, RecoveryOutcome, STARTED},
@@ -531,10 +532,31 @@ impl Driver {
     fn open_gate(&mut self) {
         self.said = None;
         self.examiner.open_gate();
+        self.set_run_id_later();
         if let Some(number) = self.restored.take() {
             // This comes last, so that calls do not wait while the state is copied.
             self.rescues.keep(number, Instant::now());
         }
+    }
+
+    /// Sets the run id that the present master has not been given, once it has served for [`RUN_ID_AFTER`].
+    fn set_run_id_later(&self) {
+        if self.examiner.lock_run_id().is_none() {
+            return;
+        }
+        let (examiner, nodes) = (self.examiner.clone(), self.nodes.clone());
+        let (write_queue, incarnation) = (self.write_queue.clone(), examiner.ledger.incarnation());
+        crate::task::spawn(async move {
+            tokio::time::sleep(RUN_ID_AFTER).await;
+            // Otherwise the next opening of the gate begins the wait again.
+            if !nodes.gate.is_open() || examiner.ledger.incarnation() != incarnation {
+                return;
+            }
+            let set = examiner.lock_run_id().take();
+            if let Some(set) = set.filter(|_| examiner.ledger.with_mirror(lacks_run_id)) {
+                write_queue.call(set).await;
+            }
+        });
     }
 
     async fn spawn(&mut self) -> Option<Input> {

@@ -19,6 +19,7 @@ use crate::{
     limit::{Pair, alarm, all_clear},
     master::{self, CALLER_ID, Method, Request},
     process::{self, Rosout},
+    replay::ROSOUT,
     write_queue::WriteQueue,
     xmlrpc::{Reply, Value},
 };
@@ -29,7 +30,6 @@ const VERSION_TIME: Duration = Duration::from_secs(20);
 /// has run for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
-const ROSOUT: &str = "/rosout";
 
 pub(crate) struct Roscore {
     /// The ledger, which knows whether the parameters are set already.

@@ -57,6 +57,7 @@ impl Context {
                 supervision: self.supervision,
                 probing: self.probing,
                 probe_timeout: self.probe_timeout,
+                run_id: Arc::default(),
                 stats: self.stats,
             },
             self.write_queue.clone(),

@@ -2,23 +2,27 @@
 
 use std::{
     net::SocketAddr,
-    sync::Arc,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use crate::status::{report::RecoveryOutcome, software};
 use crate::{
     gate::{State, Tx},
+    health::port_of,
     ledger::{Basis, Ledger, late::CatchUp},
     lifecycle::{Input, Probing, Supervision},
     limit::rarely,
-    master::{Counts, Master, Method, Request},
-    process::listeners,
-    replay::{self, Authority, Bears, Inspection, KnownMaster, Plan, Token, Treatment},
-    status::stats::Stats,
+    master::{self, Counts, Master, Method, Request},
+    nodes::client::{self, Reaction},
+    process::{self, listeners},
+    replay::{
+        self, Authority, Bears, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
+        withheld_run_id,
+    },
+    status::{report::RecoveryOutcome, software, stats::Stats},
     upstream::{
         CallError, ConnectError, Connection, RawReply, Upstream,
         inspect::{self, InspectError},
@@ -32,6 +36,8 @@ use crate::{
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
 /// Time limit for each step in which a late master catches up. Writes wait meanwhile.
 const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
+/// Longest time for rosout to show that it lives. Calls wait meanwhile.
+const ROSOUT_LIMIT: Duration = Duration::from_millis(100);
 /// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 /// Time limit for calls of closed connections to end. A `setParam` of 60,000 keys takes some 10 s.
@@ -167,6 +173,8 @@ pub(crate) struct Examiner {
     pub probing: Probing,
     /// Longest time for the master to answer a probe.
     pub probe_timeout: Duration,
+    /// The call that sets `/run_id` in the present master, if the master gets it later ([`withheld_run_id`]).
+    pub run_id: Arc<Mutex<Option<Request>>>,
     pub stats: &'static Stats,
 }
 
@@ -180,6 +188,10 @@ impl Examiner {
             (Some(true), None) => KnownMaster::ServedIfPresent,
             (Some(false), None) => KnownMaster::InjectedIfPresent,
         }
+    }
+
+    pub(super) fn lock_run_id(&self) -> MutexGuard<'_, Option<Request>> {
+        self.run_id.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Lets calls pass to the present master.
@@ -224,8 +236,17 @@ impl Examiner {
             injection: Duration::ZERO,
         };
         if !resumed {
-            self.inject(connection, first, manner, start, &mut examination)
-                .await?;
+            let may_be_roscores = self.supervision == Supervision::Theirs
+                && may_be_of_roscore(examination.pid, sentinel).await;
+            self.inject(
+                connection,
+                first,
+                manner,
+                may_be_roscores,
+                start,
+                &mut examination,
+            )
+            .await?;
         }
         // All masters that rosrescue starts have the same version.
         if !is_new || self.ledger.with_mirror(Master::is_old).is_none() {
@@ -308,6 +329,7 @@ impl Examiner {
         connection: &mut Connection,
         first: Inspection,
         manner: Manner,
+        may_be_roscores: bool,
         start: Instant,
         examination: &mut Examination,
     ) -> Result<(), ExamineError> {
@@ -317,7 +339,7 @@ impl Examiner {
             self.ledger.catch_up(number);
         }
         let fresh = bears == Bears::Nothing && empty;
-        let ready = match manner.prepared {
+        let mut ready = match manner.prepared {
             Some(prepared) if fresh => prepared.await.ok(),
             _ => None,
         };
@@ -333,17 +355,26 @@ impl Examiner {
                     .await?
             }
         };
+        self.remove_dead_rosout(may_be_roscores, bears, &found)
+            .await;
         examination.look = start.elapsed();
         // From here until the gate opens the mirror must not change, because the master is compared
         // with the mirror.
         self.gate.set(State::Injecting);
         let Basis {
-            mirror,
+            mut mirror,
             version,
             pending,
         } = self.ledger.begin_injection();
         let before = self.ledger.token();
         let treatment = replay::treatment(bears, manner.known, mirror.is_empty(), found.is_empty());
+        let withheld = withheld_run_id(may_be_roscores, treatment, &mirror, &found);
+        if let Some((remove, set)) = withheld {
+            ready = None;
+            mirror.apply(&remove);
+            self.ledger.seed(&remove);
+            *self.lock_run_id() = Some(set);
+        }
         examination.outcome = match treatment {
             Treatment::Begin => RecoveryOutcome::Begun,
             Treatment::TakeOver => RecoveryOutcome::Adopted,
@@ -402,6 +433,25 @@ impl Examiner {
         let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
         self.bring(connection, &target, &token, ready, examination)
             .await
+    }
+
+    /// Removes a rosout from the mirror that must not be restored in a master with this state, because it has ended.
+    async fn remove_dead_rosout(&self, may_be_roscores: bool, bears: Bears, found: &Master) {
+        let to_ask = |mirror: &Master| {
+            let api = replay::rosout_to_ask(may_be_roscores, bears, mirror, found)?;
+            Some(port_of(api).to_owned())
+        };
+        let Some(port) = self.ledger.with_mirror(to_ask) else {
+            return;
+        };
+        if client::ask(&port, &master::get_pid(), ROSOUT_LIMIT).await == Reaction::Dead {
+            for call in self
+                .ledger
+                .with_mirror(|mirror| mirror.unregister_calls(ROSOUT))
+            {
+                self.ledger.seed(&call);
+            }
+        }
     }
 
     /// Brings the master to `target`, reads it back, and sets `token` in it.
@@ -512,6 +562,22 @@ async fn may_run_a_call(master: SocketAddr) -> bool {
 async fn listens(pid: i32, master: SocketAddr) -> bool {
     let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
     crate::task::spawn_blocking(look).await.unwrap_or(false)
+}
+
+/// Whether a roscore, or a roslaunch, may have started the master `pid`. A master whose process is hidden, in a
+/// container or on another computer, may be a roscore's.
+async fn may_be_of_roscore(pid: i32, sentinel: &Sentinel) -> bool {
+    let (local, master) = (sentinel.is_local(), sentinel.peer());
+    let look = move || {
+        let pid = u32::try_from(pid).ok().filter(|_| local)?;
+        let sockets = sockets::accepting(&sockets::listening(), master);
+        let open = listeners::open_sockets(pid);
+        let is_master = sockets.iter().any(|socket| open.contains(socket));
+        let parent = process::parent_of(pid).filter(|_| is_master)?;
+        Some(process::runs(parent, "roscore") || process::runs(parent, "roslaunch"))
+    };
+    let seen = crate::task::spawn_blocking(look).await;
+    seen.ok().flatten().unwrap_or(true)
 }
 
 /// Logs the differences between the master and the mirror.

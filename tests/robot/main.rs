@@ -54,6 +54,7 @@ mod master {
     mod returns;
     mod stranger;
     mod unreturnable_values;
+    mod vendors_roscore;
 }
 
 /// A new master gets the state, and the health check examines the nodes.

@@ -6,6 +6,7 @@
 //! * [`Plan`] is the one call that brings a new master to the mirror's state, and verifies the answer.
 //! * [`treatment`] decides what to do with a master, by its token and by what is known about the master.
 //! * [`reconcile`] computes the state for a master that has missed writes because it was unreachable.
+//! * [`withheld_run_id`] and [`rosout_to_ask`] leave a new roscore what it does itself.
 //! * [`accepted`] tells from a master's reply which parts of a call the master has executed.
 //! * [`difference`] describes how two states differ.
 
@@ -16,6 +17,7 @@ mod order;
 mod plan;
 mod reconcile;
 mod restore;
+mod roscore;
 #[cfg(test)]
 mod tests;
 mod token;
@@ -26,5 +28,6 @@ pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
+pub use roscore::{ROSOUT, RUN_ID_AFTER, lacks_run_id, rosout_to_ask, withheld_run_id};
 pub use token::{Bears, Token};
 pub use treatment::{KnownMaster, Treatment, treatment};
