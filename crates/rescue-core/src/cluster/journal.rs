@@ -4,10 +4,13 @@
 //! ROBOT/leader, ROBOT/alive           see `machine`
 //! ROBOT/journal/N                     the records up to number N; or a reference to a blob, if they are large; or
 //!                                     one to a snapshot, if record N replaced the whole state
-//! ROBOT/values/blob/N/PART            a blob's records, in parts, written before the journal names them
+//! ROBOT/values/blob/N/CRC/PART        a blob's records, in parts, written before the journal names them
 //! ROBOT/snapshot                      a reference to the last complete snapshot: its last record, size and checksum
-//! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
+//! ROBOT/values/snapshot/N/CRC/PART    a snapshot of the state after record N, in the checkpoint's form
 //! ```
+//!
+//! CRC is the checksum of the whole value. A request that the network has held up may write the parts of an earlier
+//! value for the same N, and must not touch those that a reference names.
 
 use std::ops::Range;
 
@@ -140,10 +143,7 @@ impl Keys {
 
     /// The keys of the parts that a manifest names.
     pub fn parts(&self, manifest: &Manifest) -> Range<String> {
-        let folder = match manifest.kind {
-            Kind::Blob => self.blob(manifest.seq),
-            Kind::Snapshot => self.snapshots(manifest.seq),
-        };
+        let folder = manifest.folder(self);
         format!("{folder}0")..format!("{folder}:")
     }
 }
@@ -187,10 +187,7 @@ impl Manifest {
             bytes: bytes.len(),
             crc: crc32c::crc32c(bytes),
         };
-        let folder = match kind {
-            Kind::Blob => keys.blob(seq),
-            Kind::Snapshot => keys.snapshots(seq),
-        };
+        let folder = manifest.folder(keys);
         let parts = bytes
             .chunks(PART_BYTES)
             .enumerate()
@@ -199,6 +196,15 @@ impl Manifest {
                 value: part.to_vec(),
             });
         (manifest, parts.collect())
+    }
+
+    /// What the keys of all parts begin with.
+    fn folder(&self, keys: &Keys) -> String {
+        let of = match self.kind {
+            Kind::Blob => keys.blob(self.seq),
+            Kind::Snapshot => keys.snapshots(self.seq),
+        };
+        format!("{of}{:08x}/", self.crc)
     }
 
     fn text(&self) -> Vec<u8> {

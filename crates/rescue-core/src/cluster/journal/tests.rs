@@ -164,6 +164,16 @@ fn a_snapshot_is_the_checkpoint_in_parts() {
     assert_eq!(format::decode(&whole).unwrap().checkpoint, Ok(state));
 }
 
+/// Seed 30851209: the parts of the first state arrived after those of the second one.
+#[test]
+fn two_values_with_one_number_share_no_part() {
+    let keys = Keys::new("robot");
+    let [first, second] = [b"first", b"other"].map(|bytes| snapshot(&keys, 10, bytes));
+    let range = keys.parts(&Manifest::read(&second.1.value).unwrap());
+    assert!(first.0.iter().all(|part| !range.contains(&part.key)));
+    assert!(second.0.iter().all(|part| range.contains(&part.key)));
+}
+
 #[test]
 fn what_another_program_wrote_is_said_so() {
     for value in [
