@@ -71,6 +71,12 @@ impl Params {
         self.find(read_path(key)).is_some()
     }
 
+    /// Whether there is something under `key` that [`Self::delete`] could delete. Unlike reads, deletions do not
+    /// require a leading slash.
+    pub(crate) fn holds(&self, key: &str) -> bool {
+        self.find(names::parts(key)).is_some()
+    }
+
     fn find<'k>(&self, path: impl Iterator<Item = &'k str>) -> Option<Found<'_>> {
         let mut found = Found::Tree(&self.tree);
         for part in path {

@@ -64,7 +64,7 @@ impl Master {
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }
-            Method::DeleteParam => !self.is_set(&name(1)?),
+            Method::DeleteParam => !self.params.holds(&key(1)?),
             // A read changes nothing. A write that is not listed above might.
             method => !method.kind().mutates(),
         })

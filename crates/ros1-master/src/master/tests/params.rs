@@ -13,6 +13,16 @@ fn a_value_in_the_way_becomes_a_namespace_and_empty_namespaces_stay() {
     assert_eq!((code, value), (1, tree([("b", tree([]))])));
 }
 
+/// A caller without a leading slash has private keys without one. Reads do not find them, but deletions do.
+#[test]
+fn deleting_a_private_key_of_a_caller_without_a_slash_is_a_change() {
+    let mut master = after([call("setParam", &["plain", "~p", "/a"])]);
+    let delete = call("deleteParam", &["plain", "~p"]);
+    assert!(master.would_change(&delete));
+    assert_eq!(message(&mut master, &delete).0, 1);
+    assert!(!master.would_change(&delete));
+}
+
 #[test]
 fn deleting_a_key_below_a_value_changes_nothing() {
     let texts = |texts: [&str; 2]| Value::from(texts.to_vec());
