@@ -210,12 +210,14 @@ pub enum Refusal {
 }
 
 /// Judges a port that refuses connections. `may_unregister` says that the master serves, and that the port has failed a
-/// health check and not only refused a notification: a bare master keeps such nodes. `calls` are the last calls of its nodes, and `before` are their last calls
-/// when the port refused for the first time. The nodes are dead only if the two are equal, because a node may close its
-/// port before it unregisters, as roslisp does.
+/// health check. If it has only refused a notification, its nodes stay registered, as with a bare master.
+///
+/// `calls` are the last calls of its nodes, and `before` are their last calls when the port refused for the first time.
+/// The nodes are dead only if the two are equal, because a node may close its port before it unregisters, as roslisp
+/// does.
 pub fn judge_refusal<C: PartialEq>(may_unregister: bool, before: Option<&C>, calls: &C) -> Refusal {
     match before {
-        // While the master is gone, no node is declared dead. The health check after the recovery decides.
+        // While the master is gone, the health check after the recovery decides.
         _ if !may_unregister => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
