@@ -1,18 +1,15 @@
-//! A complete ROS 1 master. Run it with `cargo run --example master 11311`. Nodes find it by `ROS_MASTER_URI`, as
-//! usual.
+//! A complete ROS 1 master. Run it with `cargo run --example master 11311`. Nodes find it by `ROS_MASTER_URI`.
 
 #![allow(clippy::disallowed_methods, clippy::disallowed_types)]
 
 use ros1_master::master::{Master, Request};
 use ros1_master::xmlrpc::{encode_call, encode_reply};
-use std::collections::HashMap;
 use std::io::{self, BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Mutex, PoisonError, mpsc};
-use std::{env, process, thread};
+use std::{collections::HashMap, env, process, thread};
 
-/// The master's state, and a queue of encoded calls for each node's address. A node gets its calls in order, and a slow
-/// node delays no other node.
+/// The master, and a queue of calls for each node's address: they stay in order, and a slow node delays no other.
 type State = Mutex<(Master, HashMap<String, mpsc::SyncSender<Vec<u8>>>)>;
 
 fn main() -> io::Result<()> {
@@ -48,6 +45,7 @@ fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
         let to = notice.to().to_owned();
         let queue = queues.entry(to.clone()).or_insert_with(|| {
             let (queue, calls) = mpsc::sync_channel(1000);
+            // The node may be gone.
             thread::spawn(move || calls.iter().for_each(|call| drop(notify(&to, call))));
             queue
         });
@@ -56,8 +54,7 @@ fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
     applied.reply
 }
 
-/// Sends `call` to the node at the address `node`, such as `http://robot:40123/`. Errors are ignored: the node may be
-/// gone.
+/// Sends `call` to the node at the address `node`, such as `http://robot:40123/`.
 fn notify(node: &str, call: Vec<u8>) -> io::Result<()> {
     let at = node.trim_start_matches("http://").trim_end_matches('/');
     let length = call.len();
