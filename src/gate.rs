@@ -1,9 +1,10 @@
-//! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. Only the recovery and,
-//! with several computers, `app::cluster` change the gate, through the [`Tx`].
+//! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. The start, the recovery
+//! and, with several computers, `app::cluster` change the gate, through the [`Tx`].
 //!
 //! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], the driver [`State::Late`],
 //! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets
-//! [`State::Open`]. Between two of this computer's terms as leader, `app::cluster` sets [`State::Elsewhere`].
+//! [`State::Open`]. A start with a checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does
+//! not lead, `app::cluster` sets [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].
 
 use std::time::Duration;
 

@@ -1,6 +1,6 @@
 //! The guardian: the parent process that keeps the listening sockets and restarts the worker.
 //!
-//! An interactive `rosrescue` is two processes. The guardian binds the sockets, starts the worker, which is
+//! An interactive `rosrescue` is two processes. The guardian has the sockets, starts the worker, which is
 //! the same program with the sockets passed on ([`handover`]), and restarts it when it dies ([`restart`]).
 //! Connections that arrive meanwhile wait in the kernel's queue and are not refused. The guardian does nothing
 //! else, so that little can kill it: it has no runtime and reads nothing from the network.

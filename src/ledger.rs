@@ -180,9 +180,9 @@ impl Ledger {
         self.lock().token()
     }
 
-    /// Like [`Self::record_from`], for calls that were made on this computer.
+    /// Like [`Self::record`], for calls that were made on this computer.
     #[cfg(test)]
-    pub(crate) fn record(
+    pub(crate) fn record_here(
         &self,
         now: Instant,
         incarnation: u64,
@@ -192,12 +192,12 @@ impl Ledger {
             .iter()
             .map(|(call, reply)| (*call, *reply, &Source::Here, Origin::Rosrescue))
             .collect();
-        self.record_from(now, incarnation, &batch)
+        self.record(now, incarnation, &batch)
     }
 
     /// Records and applies the calls in `batch`, which the master ran in this order and has answered. `incarnation` is
     /// the number in the [`Token`] of that master.
-    pub(crate) fn record_from(
+    pub(crate) fn record(
         &self,
         now: Instant,
         incarnation: u64,

@@ -91,9 +91,9 @@ impl LeaderLease {
         Self(watch::Sender::new(None))
     }
 
-    /// Sets until when no other computer can lead. `None` if there is no limit. After that time no call goes to this
+    /// Sets until when no other computer can lead. `None` if there is no limit. After that time no write goes to this
     /// computer's master and no node is notified: another leader may have acknowledged newer writes while this process
-    /// stood still.
+    /// stood still. Reads go on until the gate is shut: what they return, this computer's clients have seen before.
     pub(crate) fn set(&self, until: Option<Instant>) {
         self.0.send_if_modified(|lease| {
             // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease.
@@ -210,7 +210,7 @@ mod tests {
         ledger.leave();
         assert!(ledger.stand_in(Instant::now(), &set(1)).is_none());
         let reply = Reply::Value(vec![Value::from(1), "".into(), 0.into()].into());
-        let recorded = ledger.record(Instant::now(), 0, &[(&set(1), &reply)]);
+        let recorded = ledger.record_here(Instant::now(), 0, &[(&set(1), &reply)]);
         assert!(recorded.is_err());
         let before = ledger.version();
         assert!(ledger.adopt_if(0, before, state_of([set(1)])).is_err());
@@ -348,7 +348,7 @@ mod tests {
             .map(|(call, source)| (call, &reply, source, Origin::Unknown))
             .collect();
         ledger
-            .record_from(Instant::now(), ledger.incarnation(), &batch)
+            .record(Instant::now(), ledger.incarnation(), &batch)
             .unwrap();
         let of = |seq| judged(&ledger, seq, &keys);
         assert_eq!(of(6), None);

@@ -46,10 +46,10 @@ fn a_reply_of_a_master_that_was_succeeded_does_not_count() {
     let publish = publish("/t");
     let reply = answered(&publish, &mut Master::default());
     let now = Instant::now();
-    assert!(ledger.record(now, 1, &[(&publish, &reply)]).is_ok());
+    assert!(ledger.record_here(now, 1, &[(&publish, &reply)]).is_ok());
     ledger.succeed();
     let late = self::publish("/late");
-    assert!(ledger.record(now, 1, &[(&late, &reply)]).is_err());
+    assert!(ledger.record_here(now, 1, &[(&late, &reply)]).is_err());
     assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
 }
 
@@ -59,7 +59,7 @@ fn a_different_answer_of_the_master_puts_the_mirror_in_doubt() {
     let publish = publish("/t");
     let now = Instant::now();
     let right = answered(&publish, &mut Master::default());
-    let recorded = ledger.record(now, 0, &[(&publish, &right)]).unwrap();
+    let recorded = ledger.record_here(now, 0, &[(&publish, &right)]).unwrap();
     assert!(!recorded.doubtful);
     let strange: Value = vec![
         Value::from(1),
@@ -68,7 +68,7 @@ fn a_different_answer_of_the_master_puts_the_mirror_in_doubt() {
     ]
     .into();
     let recorded = ledger
-        .record(now, 0, &[(&publish, &Reply::Value(strange))])
+        .record_here(now, 0, &[(&publish, &Reply::Value(strange))])
         .unwrap();
     assert!(recorded.doubtful);
     assert_eq!(ledger.stats.divergences.value(), 1);
@@ -163,7 +163,7 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert_eq!(ledger.stand_in(now, &bye), None);
     let publish = publish("/t");
     let reply = answered(&publish, &mut Master::default());
-    assert!(ledger.record(now, 0, &[(&publish, &reply)]).is_err());
+    assert!(ledger.record_here(now, 0, &[(&publish, &reply)]).is_err());
     ledger.end_injection();
     assert!(ledger.stand_in(now, &bye).is_some());
 }
@@ -236,13 +236,13 @@ fn what_the_master_refuses_and_the_mirror_would_do_casts_doubt() {
     let now = Instant::now();
     let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), 1.into()]);
     let reply = answered(&set, &mut Master::default());
-    ledger.record(now, 0, &[(&set, &reply)]).unwrap();
+    ledger.record_here(now, 0, &[(&set, &reply)]).unwrap();
     let delete = call("deleteParam", &["/n", "/a"]);
     let refusal = answered(&delete, &mut Master::default());
-    let recorded = ledger.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    let recorded = ledger.record_here(now, 0, &[(&delete, &refusal)]).unwrap();
     assert!(recorded.doubtful && ledger.checkpoint_due());
     assert_eq!(ledger.stats.divergences.value(), 1);
-    let recorded = ledger.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    let recorded = ledger.record_here(now, 0, &[(&delete, &refusal)]).unwrap();
     assert!(!recorded.doubtful, "it is gone from both");
 }
 
@@ -254,7 +254,7 @@ fn a_write_behind_a_subscription_is_no_divergence() {
     let call = Request::multicall([set("/a/x"), subscribe, set("/a/y")]);
     let reply = answered(&call, &mut Master::default());
     let recorded = ledger
-        .record(Instant::now(), 0, &[(&call, &reply)])
+        .record_here(Instant::now(), 0, &[(&call, &reply)])
         .unwrap();
     assert!(!recorded.doubtful);
 }
@@ -281,7 +281,7 @@ fn what_takes_nothing_away_is_pending_within_limits() {
     assert_eq!(pending(&ledger).len(), UNCHANGED_PENDING_MAX);
     let publish = publish("/late");
     let reply = ledger.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
-    ledger.record(now, 0, &[(&publish, &reply)]).unwrap();
+    ledger.record_here(now, 0, &[(&publish, &reply)]).unwrap();
     let last = call("unregisterPublisher", &["/n", "/late", "http://n:1/"]);
     ledger.stand_in(now, &last);
     assert_eq!(pending(&ledger).last(), Some(&last));
@@ -308,7 +308,7 @@ fn reads_are_answered_together_within_limits() {
     let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), text]);
     for call in [&set, &publish("/t")] {
         let reply = ledger.with_mirror(|mirror| answered(call, &mut mirror.clone()));
-        ledger.record(now, 0, &[(call, &reply)]).unwrap();
+        ledger.record_here(now, 0, &[(call, &reply)]).unwrap();
     }
     let read = || call("getParam", &["/n", "/"]);
     let reads = |count| (0..count).map(|_| read());
@@ -419,7 +419,7 @@ fn topics_are_remembered_while_a_dead_master_may_owe_notifications() {
     );
     for call in [&subscribe, &publish("/t"), &publish("/unheard")] {
         let reply = ledger.with_mirror(|mirror| answered(call, &mut mirror.clone()));
-        ledger.record(start, 0, &[(call, &reply)]).unwrap();
+        ledger.record_here(start, 0, &[(call, &reply)]).unwrap();
     }
     let owed = |now| ledger.with_activity(|_, activity| activity.take_owed(now).topics);
     assert_eq!(owed(start + NOTICE_MEMORY), Vec::<String>::new());
@@ -434,7 +434,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     for api in ["http://n:1/", "http://n:2/"] {
         let publish = call("registerPublisher", &["/n", "/t", "x/Y", api]);
         let reply = answered(&publish, &mut Master::default());
-        ledger.record(now, 0, &[(&publish, &reply)]).unwrap();
+        ledger.record_here(now, 0, &[(&publish, &reply)]).unwrap();
     }
     let checkpoint = format::Checkpoint {
         follows: false,

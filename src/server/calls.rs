@@ -198,7 +198,7 @@ impl Calls {
         }
     }
 
-    /// The answer to a `getUri`, and also to a `getPid` while there is no master.
+    /// The answer to a `getUri`, and to a `getPid` without a master or with several computers.
     pub(super) fn identity(&self, call: &Request) -> Result<HttpReply, Closed> {
         let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
         Ok(xml(&reply))

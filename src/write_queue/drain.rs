@@ -437,7 +437,7 @@ impl Drain {
         let Ok(recorded) = self
             .link
             .ledger
-            .record_from(Instant::now(), incarnation, &answered)
+            .record(Instant::now(), incarnation, &answered)
         else {
             // The gate is about to open for another master.
             self.lost = true;

@@ -415,7 +415,7 @@ impl World {
         let calls: Vec<_> = calls.collect();
         let answered: Vec<_> = calls.iter().map(|call| &**call).zip(&replies).collect();
         let now = self.instant();
-        let recorded = self.ledger.record(now, self.incarnation, &answered);
+        let recorded = self.ledger.record_here(now, self.incarnation, &answered);
         assert!(!recorded.unwrap().doubtful, "the model is the master here");
         for (item, reply) in items.into_iter().zip(replies) {
             item.reply(CallAnswer::Made(reply));

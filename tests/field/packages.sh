@@ -2,7 +2,8 @@
 # packages.sh FOLDER [RELEASE/PROCESSOR]...: tries the Debian packages in FOLDER (of packaging/build-all.sh) in new
 # installations of these releases, or of all. Each package is installed, runs the release's rosmaster through its death,
 # is upgraded from the version before with the state in place, removed and purged. Prints one row of Markdown for each.
-# Where the release has no rosmaster, the package is only installed, upgraded and purged.
+# Where the release has no rosmaster, the package is only installed, upgraded and purged. On amd64 the release's systemd
+# also runs the service through deaths, an upgrade and a second installation.
 #
 # Needs root, debootstrap, dpkg-dev, and for ARM qemu-user-static with binfmt_misc. Takes one to three minutes for each,
 # with ARM ten. Installations are kept in target/field/packages.
@@ -36,7 +37,7 @@ make() { # SUITE PROCESSOR
     # A caller that asks whether it worked has switched off `set -e`.
     debootstrap --arch="$2" --variant=minbase "$check" --components="$components" "$1" "$root.new" "$archive" \
         "/usr/share/debootstrap/scripts/$like" >&2 || return 1
-    in_root "$root.new" apt-get install -y --no-install-recommends "$rosmaster" procps >&2 || return 1
+    in_root "$root.new" apt-get install -y --no-install-recommends "$rosmaster" procps systemd-sysv dbus >&2 || return 1
     rm -rf "$root.new"/var/cache/apt/archives/*.deb
     echo "127.0.0.1 localhost" >"$root.new/etc/hosts"
     mv "$root.new" "$root"
@@ -56,6 +57,31 @@ in_root() { # FOLDER COMMAND...
     ' sh "$@"
 }
 
+# Boots an installation with its own systemd and runs a script there. Nothing survives it.
+booted() { # FOLDER SCRIPT
+    computer=$roots/booted-$$/computer
+    mkdir -p "$computer"
+    unshare --mount --pid --net --uts --ipc --fork --kill-child \
+        "$checkout/tests/support/boot_systemd.sh" "$computer" /bin/true "$1/given" "$1" &
+    unshare=$!
+    status=1 waited=0
+    until first=$(cat "/proc/$unshare/task/$unshare/children") && [ "$(cat "/proc/${first% }/comm")" = systemd ]; do
+        [ $((waited += 1)) -lt 100 ] && kill -0 $unshare || break
+        sleep 0.1
+    done
+    nsenter -t "${first% }" -m -p -n -u -i -C -r -w env -i HOME=/root DEBIAN_FRONTEND=noninteractive LC_ALL=C.UTF-8 \
+        PATH=/usr/sbin:/usr/bin:/sbin:/bin sh -euc "$2" && status=0
+    kill -KILL $unshare
+    wait $unshare || true
+    # Its processes take a moment to end.
+    until unshare --mount "$checkout/tests/support/boot_systemd.sh" --forget "$computer" 2>/dev/null; do
+        [ $((waited += 1)) -lt 200 ] || break
+        sleep 0.1
+    done
+    rm -r "$roots/booted-$$"
+    return $status
+}
+
 # The same package as an earlier version.
 earlier() { # PACKAGE NEW_PACKAGE
     parts=$(mktemp -d)
@@ -63,6 +89,62 @@ earlier() { # PACKAGE NEW_PACKAGE
     sed -i 's/^Version: .*/Version: 0.1.9-1/' "$parts/DEBIAN/control"
     dpkg-deb -Zgzip -z1 -b "$parts" "$2" >&2
     rm -rf "$parts"
+}
+
+# Runs the service of a release's systemd, and prints the result.
+service() { # FOLDER
+    # shellcheck disable=SC2016 # in the installation
+    if booted "$1" '
+        waited=0
+        until systemctl is-system-running | grep -Ex "running|degraded"; do
+            [ $((waited += 1)) -lt 300 ]
+            sleep 0.1
+        done 2>/dev/null
+        python=$(command -v python3 || command -v python)
+        call() { "$python" -c "
+try: from xmlrpc.client import ServerProxy
+except ImportError: from xmlrpclib import ServerProxy
+print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
+        main() { systemctl show --property=MainPID rosrescue.service | cut -d= -f2; }
+        kept() {
+            call "getParam(\"/test\", \"/kept\")" | grep " 7]"
+            until rosrescue status --json | grep -q "\"open\": true"; do sleep 0.1; done
+        }
+        install() {
+            dpkg -i "$1" 2>&1 | tee /tmp/said
+            ! grep -i error /tmp/said
+        }
+        useradd --create-home robot
+        # Twice: the first removal must leave nothing that disturbs the second installation.
+        for round in 1 2; do
+            install /given/old.deb
+            rosrescue install --yes --run-as robot
+            systemctl is-active rosrescue.service
+            call "setParam(\"/test\", \"/kept\", 7)"
+            kept
+            before=$(main)
+            kill -KILL "$before"
+            kept
+            test "$(main)" != "$before"
+            kill -KILL $(pgrep -f "bin[/]rosmaster")
+            kept
+            install /given/new.deb
+            before=$(pgrep -f "bin[/]rosmaster")
+            systemctl kill --signal=KILL --kill-who=main rosrescue.service
+            kept
+            test "$(pgrep -f "bin[/]rosmaster")" = "$before"
+            dpkg -r rosrescue
+            test -z "$(pgrep -x rosrescue)$(pgrep -f "bin[/]rosmaster")"
+            test -z "$(find /etc/systemd /run/systemd/system -name "*rosrescue*")"
+            rm -rf /home/robot/.ros
+        done
+        dpkg -P rosrescue
+    ' >"$1.service.log" 2>&1; then
+        echo "service passed with $(chroot "$1" systemctl --version | head -n 1)"
+    else
+        tail -n 20 "$1.service.log" >&2
+        echo "service failed, see $1.service.log"
+    fi
 }
 
 if command -v lintian >/dev/null; then
@@ -127,6 +209,11 @@ print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         diff /tmp/before /tmp/after
     ' >"$root.log" 2>&1; then
         how=$(grep -o "running after .*" "$root.log") || how="installed, upgraded and purged without a rosmaster"
+        # systemd 229 of Ubuntu 16.04 does not boot with control groups of version 2.
+        case $place in
+        xenial/* | noble/* | */arm*) ;;
+        *) how="$how, $(service "$root")" ;;
+        esac
         echo "| $suite | $processor | $how, $(grep "^rosrescue " "$root.log" | tail -n 1) |"
     else
         tail -n 20 "$root.log" >&2

@@ -1,6 +1,7 @@
 #!/bin/sh
-# boot_systemd.sh FOLDER PROGRAM GIVEN: becomes a systemd that is process 1 in its own namespaces, over a copy of this
-# computer's files that vanishes with it. PROGRAM appears there as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
+# boot_systemd.sh FOLDER PROGRAM GIVEN [SYSTEM]: becomes a systemd that is process 1 in its own namespaces, over a copy of
+# the files of SYSTEM, an installed Debian or Ubuntu (default: this computer's), that vanishes with it. PROGRAM appears there
+# as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
 # Needs root. Its control group, named after the folder of FOLDER, stays until `boot_systemd.sh --forget FOLDER`.
 #
 #     unshare --mount --pid --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM GIVEN
@@ -26,12 +27,12 @@ given=$3
 mkdir "$group"
 echo 0 >"$group/cgroup.procs"
 mkdir "$folder/upper" "$folder/work" "$folder/root"
-mount -t overlay -o "lowerdir=/,upperdir=$folder/upper,workdir=$folder/work" overlay "$folder/root"
+mount -t overlay -o "lowerdir=${4:-/},upperdir=$folder/upper,workdir=$folder/work" overlay "$folder/root"
 root=$folder/root
 mkdir -p "$root/opt/rosrescue"
 : >"$root/opt/rosrescue/rosrescue"
 mount --bind "$program" "$root/opt/rosrescue/rosrescue"
-mkdir "$root/given"
+mkdir -p "$root/given"
 mount --bind "$given" "$root/given"
 mount -t proc proc "$root/proc"
 mount -o bind,ro "$root/proc/sys" "$root/proc/sys"
