@@ -151,16 +151,24 @@ impl Member {
         self.drive(now, machine::Input::View(view));
     }
 
-    /// Gives up this computer's own state if another computer leads. After etcd has lost its data, that computer's state
-    /// must be in the journal first.
+    /// Gives up this computer's own state if another computer leads, or if the journal has more. After etcd has lost its
+    /// data, the other computer's state must be in the journal first.
     fn yield_to_others(&mut self) {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
         let leads = other.is_some_and(|leader| !self.was_self(leader));
-        if self.own_wins && leads && !self.lost.waits_for(self.journal.progress) {
+        let leads = leads && !self.lost.waits_for(self.journal.progress);
+        // A request of this computer's earlier process may reach the journal after the first read.
+        let has_more = !self.is_whole(self.journal.progress.seq) && self.lost.since().is_none();
+        if self.own_wins && (leads || has_more) {
             self.own_wins = false;
             self.adopt();
         }
+    }
+
+    /// Whether the checkpoint holds all of a journal that ends with the record `seq`.
+    fn is_whole(&self, seq: u64) -> bool {
+        self.own.seq >= seq || Mutant::OwnDiskWins.lives()
     }
 
     /// Applies new records of the journal.
@@ -222,7 +230,7 @@ impl Member {
             }
             // etcd's journal is the truth. The checkpoint counts only if it continues that journal in the same term.
             let leader = read.view.leader.as_ref();
-            let whole = self.own.seq >= read.view.seq() || Mutant::OwnDiskWins.lives();
+            let whole = self.is_whole(read.view.seq());
             let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
             self.own_wins = own || self.lost.since().is_some();
         } else {

@@ -185,3 +185,54 @@ fn the_end_of_a_merge_keeps_the_file_of_writes_that_the_journal_lacks() {
     member.chores.keep_until(5);
     assert!(!keeps_nothing(&mut member));
 }
+
+/// A leader restarts and finds that its checkpoint holds the whole journal. Then etcd carries out its earlier process's
+/// last request. The checkpoint must not replace that.
+#[test]
+fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_checkpoint() {
+    let own_view = |seq| {
+        let mut view = led(seq);
+        let leader = view.leader.as_mut().unwrap();
+        (leader.name, leader.id) = ("a".to_owned(), "a-0".to_owned());
+        view
+    };
+    let records = |seq| vec![record(seq)];
+    let mut progress = Progress::default();
+    progress.take(records(1), 1).unwrap();
+    let mut state = Master::default();
+    state.apply(&set(1));
+    let own = Own {
+        state,
+        seq: 1,
+        term: 1,
+        restored: true,
+    };
+    let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
+    let mut member = Member::new(settings, keys, own, CutOff::default(), "a-1".to_owned());
+    let now = Instant::now();
+    let mut followed = |input| {
+        let mut actions = member.on(now, input).into_iter();
+        actions.find_map(|action| match action {
+            Action::FollowState(state) => state.params().get("k").cloned(),
+            _ => None,
+        })
+    };
+    assert_eq!(followed(Input::Begin), None);
+    let loaded = Input::Loaded(Some(Read {
+        view: own_view(1),
+        state: None,
+        records: records(1),
+        progress,
+        heard: Vec::new(),
+    }));
+    assert_eq!(followed(loaded), None);
+    let late = Input::Watched {
+        view: own_view(2),
+        entries: vec![Entry::Records {
+            records: records(2),
+            bytes: 1,
+        }],
+        heard: Vec::new(),
+    };
+    assert_eq!(followed(late), Some(2.into()));
+}
