@@ -10,7 +10,7 @@ use std::{
 use tokio::sync::{mpsc, watch};
 use tracing::Instrument;
 
-use super::batch::{self, CallAnswer, Item};
+use super::batch::{self, Batch, CallAnswer, Item};
 use super::{
     Link, Signals, evict, merge,
     outdated::is_outdated,
@@ -255,7 +255,7 @@ impl Drain {
         let inspects = self.resync.begin(tokio::time::Instant::now());
         let items = match inspects {
             true => Vec::new(),
-            false => self.pack(),
+            false => self.next_batch(),
         };
         if items.is_empty() && self.queue.is_empty() {
             // No call is left: the callers of lost calls have gone.
@@ -397,6 +397,53 @@ impl Drain {
             item.delivery = None;
             self.queue.push_front(item);
         }
+    }
+
+    /// Takes the next batch. A call that registers the port of another node is the first of its batch. The eviction,
+    /// which unregisters that node, goes before it.
+    fn next_batch(&mut self) -> Vec<Item> {
+        let ledger = self.link.ledger.clone();
+        let mut items = loop {
+            let Batch { items, until } = ledger.with_order(|order, _| {
+                let delivery = |number| Delivery::new(&ledger, number);
+                batch::pack(&mut self.queue, order, Instant::now(), delivery)
+            });
+            self.held_until = until.map(Into::into);
+            let any = !items.is_empty();
+            let items: Vec<_> = items
+                .into_iter()
+                .filter_map(|item| merge::judged(&ledger, item))
+                .collect();
+            // If all these calls were answered without the master, the next ones are taken.
+            if !any || !items.is_empty() {
+                break items;
+            }
+        };
+        let Some(first) = items.first_mut() else {
+            return items;
+        };
+        let mut length = 1;
+        if first.raw.is_some() && !first.way_made {
+            if let Some(call) = first.call.as_deref()
+                && let Some(eviction) = self.link.judge.judge(&ledger, call)
+            {
+                first.way_made = true;
+                if let Some(eviction) = eviction {
+                    let by = call.caller().unwrap_or_default().to_owned();
+                    self.take_back(items);
+                    return vec![evict::unregistration(eviction, by)];
+                }
+            } else {
+                let calls = items.iter().map_while(|item| item.call.as_deref());
+                let calls: Vec<_> = calls.collect();
+                let judge = &self.link.judge;
+                let apart = ledger.with_mirror(|mirror| judge.first_apart(mirror, &calls));
+                length = apart.unwrap_or(items.len()).max(1);
+            }
+        }
+        let rest = items.split_off(length);
+        self.take_back(rest);
+        items
     }
 
     /// Records what the master answered, then answers the clients.

@@ -4,14 +4,10 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::{
-    batch::{self, Batch, CallAnswer, Item},
-    drain::Drain,
-    merge,
-};
+use super::batch::{CallAnswer, Item};
 use crate::{
     health::Eviction,
-    ledger::{Ledger, delivery::Delivery},
+    ledger::Ledger,
     master::{Master, Request},
 };
 
@@ -41,55 +37,6 @@ pub(crate) trait MoveJudge: Send + Sync {
 #[cfg(test)]
 impl MoveJudge for () {}
 
-impl Drain {
-    /// Takes the next batch. A call that registers the port of another node is the first of its batch. The eviction,
-    /// which unregisters that node, goes before it.
-    pub(super) fn pack(&mut self) -> Vec<Item> {
-        let ledger = self.link.ledger.clone();
-        let mut items = loop {
-            let Batch { items, until } = ledger.with_order(|order, _| {
-                let delivery = |number| Delivery::new(&ledger, number);
-                batch::pack(&mut self.queue, order, Instant::now(), delivery)
-            });
-            self.held_until = until.map(Into::into);
-            let any = !items.is_empty();
-            let items: Vec<_> = items
-                .into_iter()
-                .filter_map(|item| merge::judged(&ledger, item))
-                .collect();
-            // If all these calls were answered without the master, the next ones are taken.
-            if !any || !items.is_empty() {
-                break items;
-            }
-        };
-        let Some(first) = items.first_mut() else {
-            return items;
-        };
-        let mut length = 1;
-        if first.raw.is_some() && !first.way_made {
-            if let Some(call) = first.call.as_deref()
-                && let Some(eviction) = self.link.judge.judge(&ledger, call)
-            {
-                first.way_made = true;
-                if let Some(eviction) = eviction {
-                    let by = call.caller().unwrap_or_default().to_owned();
-                    self.take_back(items);
-                    return vec![own(eviction, by)];
-                }
-            } else {
-                let calls = items.iter().map_while(|item| item.call.as_deref());
-                let calls: Vec<_> = calls.collect();
-                let judge = &self.link.judge;
-                let apart = ledger.with_mirror(|mirror| judge.first_apart(mirror, &calls));
-                length = apart.unwrap_or(items.len()).max(1);
-            }
-        }
-        let rest = items.split_off(length);
-        self.take_back(rest);
-        items
-    }
-}
-
 /// Unregisters the nodes whose port `call` takes, while the mirror answers in a master's place.
 pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     let eviction = ledger.with_mirror(|mirror| Eviction::before(mirror, call));
@@ -100,7 +47,8 @@ pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     }
 }
 
-fn own(eviction: Eviction, by: String) -> Item {
+/// The call that unregisters the nodes of `eviction`. `by` is the node that takes their port or name.
+pub(super) fn unregistration(eviction: Eviction, by: String) -> Item {
     let (item, answered) = Item::new(None, Some(Arc::new(eviction.call)));
     crate::task::spawn(async move {
         if let Ok((CallAnswer::Raw(_) | CallAnswer::Made(_), _)) = answered.await {
