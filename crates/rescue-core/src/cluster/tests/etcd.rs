@@ -110,6 +110,11 @@ impl Etcd {
         value_of(&state, number)
     }
 
+    /// When the entry at this place of the log was added. 0 if there is none yet.
+    pub(super) fn added(&self, place: usize) -> u64 {
+        self.log.get(place).map_or(0, |(at, _)| *at)
+    }
+
     pub(super) fn view(&self) -> &View {
         &self.view
     }

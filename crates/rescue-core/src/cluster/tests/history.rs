@@ -374,10 +374,9 @@ impl History {
         Ok(())
     }
 
-    /// Whether a computer that was cut off at `cut` compared two states before its writes were merged at `moment`, because
-    /// it had not read each change of the others.
-    fn compared(&self, computer: usize, cut: usize, moment: u64, etcd: &Etcd) -> bool {
-        let since = etcd.log.get(cut).map_or(0, |(since, _)| *since);
+    /// Whether a computer compared two states between `since` and `moment`, because it had not read each change of the
+    /// others.
+    fn compared(&self, computer: usize, since: u64, moment: u64) -> bool {
         let mut skipped = self.skipped.iter();
         skipped.any(|(of, at)| *of == computer && (since..=moment).contains(at))
     }
@@ -414,7 +413,7 @@ impl History {
             let own = of.computer == call.computer || of.by == Some(call.computer);
             own && of.key == call.key && Some(of.value) == before
         });
-        (back || own) && self.compared(call.computer, cut, moment, etcd)
+        (back || own) && self.compared(call.computer, etcd.added(cut), moment)
     }
 
     /// Checks that no write made while cut off has replaced a write that others made meanwhile.
@@ -475,7 +474,11 @@ impl History {
             // A later write may have taken the place of this one when the writes were kept, and may be lost.
             // Until a restart, it may have counted as lost, and after it a comparison of states found no change.
             let revived = match (call.alone, call.merged.last()) {
-                (Some(cut), Some((moment, _))) => self.compared(computer, cut, *moment, etcd),
+                // The others' changes may be older than the period of being cut off.
+                (Some(cut), Some((moment, _))) => {
+                    let since = etcd.added(cut).min(heard);
+                    self.compared(computer, since, *moment)
+                }
                 _ => false,
             };
             if call.alone.is_some() && !call.held || revived || brought_back(call) {
