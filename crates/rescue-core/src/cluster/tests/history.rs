@@ -488,7 +488,12 @@ impl History {
             let same = self.calls.iter();
             let same = same.filter(|of| (of.key, of.value) == (key, call.value));
             let in_state = places.of[number].first().filter(|_| same.count() == 1);
-            if let Some(first) = places.changed[number].first().or(in_state) {
+            // With `interval`, a leader may die before the journal has what it answered. The next one runs the call again.
+            let first = places.changed[number].first().or(in_state);
+            let first = first.filter(|first| {
+                commit != Commit::Interval || call.by == etcd.writers.get(**first / 1000).copied()
+            });
+            if let Some(first) = first {
                 floors.push(Floor {
                     shown: heard,
                     since: heard,
