@@ -93,7 +93,7 @@ impl LeaderLease {
 
     /// Sets until when no other computer can lead. `None` if there is no limit. After that time no write goes to this
     /// computer's master and no node is notified: another leader may have acknowledged newer writes while this process
-    /// stood still. Reads go on until the gate is shut: what they return, this computer's clients have seen before.
+    /// stood still. Reads go on until the gate is shut, and show nothing older than this computer has shown before.
     pub(crate) fn set(&self, until: Option<Instant>) {
         self.0.send_if_modified(|lease| {
             // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease.

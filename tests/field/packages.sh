@@ -57,6 +57,14 @@ in_root() { # FOLDER COMMAND...
     ' sh "$@"
 }
 
+# Makes a call to the master, in an installation.
+# shellcheck disable=SC2016 # in the installation
+call='python=$(command -v python3 || command -v python)
+call() { "$python" -c "
+try: from xmlrpc.client import ServerProxy
+except ImportError: from xmlrpclib import ServerProxy
+print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }'
+
 # Boots an installation with its own systemd and runs a script there. Nothing survives it.
 booted() { # FOLDER SCRIPT
     computer=$roots/booted-$$/computer
@@ -94,17 +102,12 @@ earlier() { # PACKAGE NEW_PACKAGE
 # Runs the service of a release's systemd, and prints the result.
 service() { # FOLDER
     # shellcheck disable=SC2016 # in the installation
-    if booted "$1" '
+    if booted "$1" "$call"'
         waited=0
         until systemctl is-system-running | grep -Ex "running|degraded"; do
             [ $((waited += 1)) -lt 300 ]
             sleep 0.1
         done 2>/dev/null
-        python=$(command -v python3 || command -v python)
-        call() { "$python" -c "
-try: from xmlrpc.client import ServerProxy
-except ImportError: from xmlrpclib import ServerProxy
-print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         main() { systemctl show --property=MainPID rosrescue.service | cut -d= -f2; }
         kept() {
             call "getParam(\"/test\", \"/kept\")" | grep " 7]"
@@ -159,13 +162,8 @@ for place in "$@"; do
     cp "$packages"/*_"$processor".deb "$root/given/new.deb"
     earlier "$root/given/new.deb" "$root/given/old.deb"
     # shellcheck disable=SC2016 # in the installation
-    if in_root "$root" sh -euc '
+    if in_root "$root" sh -euc "$call"'
         list() { find / -xdev \( -path /proc -o -path /dev -o -path /given -o -path /tmp -o -path /root -o -path /var/lib/dpkg -o -path /var/log -o -path /var/cache \) -prune -o -print | sort; }
-        python=$(command -v python3 || command -v python)
-        call() { "$python" -c "
-try: from xmlrpc.client import ServerProxy
-except ImportError: from xmlrpclib import ServerProxy
-print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         start() {
             ROS_IP=127.0.0.1 ROS_LOG_DIR=/tmp/log rosrescue core --no-rosout >>/tmp/said 2>&1 &
             rosrescue wait --timeout 150 || { cat /tmp/said; exit 1; }
@@ -209,7 +207,7 @@ print(ServerProxy(\"http://127.0.0.1:11311\").$1)"; }
         diff /tmp/before /tmp/after
     ' >"$root.log" 2>&1; then
         how=$(grep -o "running after .*" "$root.log") || how="installed, upgraded and purged without a rosmaster"
-        # systemd 229 of Ubuntu 16.04 does not boot with control groups of version 2.
+        # systemd 229 of Ubuntu 16.04 does not boot with control groups of version 2. Ubuntu 24.04 has no rosmaster.
         case $place in
         xenial/* | noble/* | */arm*) ;;
         *) how="$how, $(service "$root")" ;;

@@ -139,7 +139,7 @@ impl Member {
             }
         }
         self.follow(now, &records);
-        self.yield_to_others();
+        self.yield_own_state();
     }
 
     /// Passes the keys `leader` and `alive` to the machine.
@@ -147,13 +147,13 @@ impl Member {
         if view.revision >= self.reading.view.revision {
             self.reading.view = view.clone();
         }
-        self.yield_to_others();
+        self.yield_own_state();
         self.drive(now, machine::Input::View(view));
     }
 
     /// Gives up this computer's own state if another computer leads, or if the journal has more. After etcd has lost its
     /// data, the other computer's state must be in the journal first.
-    fn yield_to_others(&mut self) {
+    fn yield_own_state(&mut self) {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
         let leads = other.is_some_and(|leader| !self.was_self(leader));
@@ -279,7 +279,7 @@ impl Member {
             }
             self.see(now, read.view);
         }
-        self.yield_to_others();
+        self.yield_own_state();
     }
 
     /// Starts the machine, unless it has started already.
