@@ -237,6 +237,7 @@ impl Member {
             self.see(now, read.view.clone());
         }
         let journal = &mut self.journal;
+        let mut is_new_state = first;
         if let Some((state, displaced)) = read.state
             && read.progress.seq >= journal.progress.seq
         {
@@ -253,22 +254,23 @@ impl Member {
             journal.displaced.add(now, displaced);
             journal.apply(now, &read.records);
             journal.progress = read.progress;
-            self.adopt();
-        } else if let Ok(new) = journal.progress.take(read.records, 0) {
-            match first {
-                // The ledger's state may differ.
-                true => {
-                    self.journal.apply(now, &new);
-                    self.adopt();
-                }
-                false => self.follow(now, &new),
+            is_new_state = true;
+        } else {
+            match journal.progress.take(read.records, 0) {
+                Ok(new) if first => self.journal.apply(now, &new),
+                Ok(new) => self.follow(now, &new),
+                Err(_) => is_new_state = false,
             }
         }
+        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. An empty
+        // journal after a loss says nothing of what others have changed.
+        if first && (!self.is_starting_over() || self.journal.progress.seq > 0) {
+            self.cut_off.note_difference(None, &self.journal.state);
+        }
+        if is_new_state {
+            self.adopt();
+        }
         if first {
-            // An empty journal after a loss says nothing of what others have changed.
-            if !self.is_starting_over() || self.journal.progress.seq > 0 {
-                self.cut_off.note_difference(None, &self.journal.state);
-            }
             if self
                 .namesake
                 .watch
