@@ -9,9 +9,13 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 const STEP: Duration = Duration::from_millis(10);
 
+/// Longest pause between two looks at a condition that comes true at some time. Looks are calls to rosrescue and its
+/// master, which other tests need the cores for.
+const LONGEST_STEP: Duration = Duration::from_millis(50);
+
 /// Waits until `condition` holds. Returns false after [`PATIENCE`].
 pub(crate) fn comes_true(condition: impl Fn() -> bool) -> bool {
-    !holds(PATIENCE, || !condition())
+    look_until(PATIENCE, || condition().then_some(())).is_some()
 }
 
 /// Waits until `condition` holds. Panics with `what` after [`PATIENCE`].
@@ -22,18 +26,23 @@ pub(crate) fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
 
 /// Waits until `look` finds something, and returns it. Panics with `what` after [`PATIENCE`].
 #[track_caller]
-pub(crate) fn eventually_some<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+pub(crate) fn eventually_some<T>(what: &str, look: impl FnMut() -> Option<T>) -> T {
+    let Some(found) = look_until(PATIENCE, look) else {
+        panic!("did not happen within {PATIENCE:?}: {what}");
+    };
+    found
+}
+
+/// What `look` finds within `span`.
+fn look_until<T>(span: Duration, mut look: impl FnMut() -> Option<T>) -> Option<T> {
     let start = Instant::now();
-    loop {
-        if let Some(found) = look() {
+    while start.elapsed() < span {
+        if let found @ Some(_) = look() {
             return found;
         }
-        assert!(
-            start.elapsed() < PATIENCE,
-            "did not happen within {PATIENCE:?}: {what}"
-        );
-        sleep(STEP);
+        sleep((start.elapsed() / 20).clamp(STEP, LONGEST_STEP));
     }
+    None
 }
 
 /// Whether `condition` holds during all of `span`. Used for events that must *not* happen.
