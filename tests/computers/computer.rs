@@ -28,6 +28,8 @@ pub(crate) struct Seen {
     pub(crate) role: String,
     pub(crate) leader: Option<String>,
     pub(crate) behind: u64,
+    /// How many computers it knows, with itself.
+    pub(crate) known: usize,
 }
 
 impl Seen {
@@ -39,6 +41,7 @@ impl Seen {
             role: cluster["role"].as_str()?.to_owned(),
             leader: leader.map(str::to_owned),
             behind: cluster["behind"].as_u64()?,
+            known: cluster["computers"].as_array()?.len(),
         })
     }
 }

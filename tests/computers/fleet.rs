@@ -128,8 +128,8 @@ impl Fleet {
         eventually_some("one of the computers leads", || self.leader_of(those))
     }
 
-    /// Waits until one computer leads, and the others follow it and are not behind. Returns the leader; panics with
-    /// what each computer reports.
+    /// Waits until one computer leads, the others follow it and are not behind, and all know each other. Returns the
+    /// leader; panics with what each computer reports.
     #[track_caller]
     pub(crate) fn await_whole(&self) -> usize {
         let start = Instant::now();
@@ -148,6 +148,7 @@ impl Fleet {
                 seen.role == role
                     && seen.leader.as_deref() == Some(NAMES[leader])
                     && seen.behind == 0
+                    && seen.known >= COUNT
             };
             if let Some(leader) = leader.filter(|_| (0..COUNT).all(agrees)) {
                 return leader;

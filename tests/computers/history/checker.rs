@@ -1,7 +1,8 @@
 //! Checks a recorded history against the promises. Times are microseconds from the start.
 //!
 //! * The final state has each acknowledged write, or a later one. The exception is a write that a computer acknowledged
-//!   while it was cut off: it may lose against others' writes, and then a warning names both values.
+//!   while it was cut off: it may lose against others' writes, and then a warning names both values. If the computer
+//!   started again and reached no other computer's node, it may be in a file, and a warning names the file.
 //! * On one computer no read goes back, and none misses a write that was acknowledged there before, except while the
 //!   computer is cut off. The value of a write that was not acknowledged may disappear again.
 //! * Each value that is read was written.
@@ -36,7 +37,7 @@ pub(crate) struct Op {
     pub(crate) end: Option<Time>,
 }
 
-/// A warning about a lost write, which this computer acknowledged while it was cut off.
+/// A warning about a write that is lost or in a file. This computer acknowledged it while it was cut off.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Loss {
     pub(crate) computer: usize,

@@ -1,6 +1,7 @@
 //! Writers, readers, subscribers and publishers on each computer. They record what they see.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -394,20 +395,34 @@ fn trail<'a>(updates: impl Iterator<Item = &'a &'a Heard>) -> String {
     updates.map(line).collect()
 }
 
-/// The warnings of all computers about lost writes of these parameters.
+/// The writes of these parameters of which a computer has reported that they are lost, or are in a file and not sent.
 fn losses(fleet: &Fleet, keys: &[String]) -> Vec<Loss> {
     let mut losses = Vec::new();
     for computer in &fleet.computers {
+        let mut lose = |key: &String, value| {
+            losses.push(Loss {
+                computer: computer.index,
+                key: key.clone(),
+                value,
+            });
+        };
         for line in computer.ever_logged("while this computer was cut off") {
             let key = keys.iter().find(|key| line.contains(&format!("`{key}`")));
             let value = line.split("alone=").nth(1);
             let value = value.and_then(|rest| rest.split_whitespace().next()?.parse().ok());
             if let (Some(key), Some(value), true) = (key, value, line.contains("others=")) {
-                losses.push(Loss {
-                    computer: computer.index,
-                    key: key.clone(),
-                    value,
-                });
+                lose(key, value);
+            }
+        }
+        // After a start at which it reached no other computer's node.
+        for line in computer.ever_logged("they are kept in a file, not sent") {
+            let file = line.split("kept=").nth(1).expect("the file's path");
+            let records = fs::read_to_string(file.trim()).unwrap();
+            for key in keys {
+                let set = format!("\"/writer\", \"{key}\", ");
+                let values = records.split(&set).skip(1);
+                let values = values.map(|rest| rest.split(']').next()?.parse().ok());
+                values.for_each(|value| lose(key, value.expect("the value of a write")));
             }
         }
     }
