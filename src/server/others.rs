@@ -323,8 +323,9 @@ impl Others {
                                 Some(Instant::now() + RETRY_PAUSE)
                             }
                         },
-                        // When the leader changes, the old leader's answer never comes or no longer counts.
-                        _ = standing.changed(), if call.kind != Kind::Read => {
+                        // When the leader changes, the old leader's answer never comes or no longer counts. A computer
+                        // that is alone answers reads itself.
+                        _ = standing.changed() => {
                             deleted = deleted.or(deletes);
                             continue;
                         }

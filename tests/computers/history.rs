@@ -8,6 +8,7 @@ use std::fs;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use crate::alone;
 use crate::chance::Chance;
 use crate::fleet::Fleet;
 use crate::network::COUNT;
@@ -34,6 +35,7 @@ const LATE: Duration = Duration::from_secs(2);
 
 #[test]
 fn every_promise_is_kept_under_random_failures() {
+    let _alone = alone();
     let mut chance = Chance::new();
     let all = std::env::var("ROSRESCUE_FAULTS");
     let all = all.map_or(FAULTS, |all| {

@@ -1,5 +1,5 @@
 //! Tests with three simulated computers, each with an etcd, a rosrescue and nodes: network namespaces on one switch.
-//! Computers are killed and cut off. They need root.
+//! Computers are killed and cut off. The tests run one at a time, because each keeps the machine busy. They need root.
 
 #![allow(
     clippy::unwrap_used,
@@ -7,6 +7,8 @@
     clippy::indexing_slicing,
     reason = "a test"
 )]
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 #[path = "../support/mod.rs"]
 mod support;
@@ -44,6 +46,13 @@ mod pauses;
 mod starts;
 /// Tests of the simulated computers themselves.
 mod wiring;
+
+/// Lock for tests that must not run side by side. A test takes it first, so that it is released after everything that
+/// the test started has ended.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.
 fn rounds() -> usize {

@@ -1,5 +1,6 @@
 use std::time::Instant;
 
+use crate::alone;
 use crate::computer::{NAMES, PORT};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
 use crate::support::eventually;
@@ -50,6 +51,7 @@ fn without_each_other(
 
 #[test]
 fn two_computers_that_do_not_reach_each_other_both_serve() {
+    let _alone = alone();
     // With its defaults, etcd 3.4 elects for up to 3 s when the pair is mended, which is longer than the time to live.
     let mut fleet = Fleet::quick(&[]);
     without_each_other(
@@ -68,6 +70,7 @@ fn two_computers_that_do_not_reach_each_other_both_serve() {
 
 #[test]
 fn a_leader_without_etcd_stops_leading_although_all_reach_it() {
+    let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     let leader = fleet.await_whole();

@@ -9,9 +9,9 @@ use rustix::process::Signal;
 use crate::computer::{Computer, NAMES, PORT};
 use crate::fleet::Fleet;
 use crate::network::enter;
-use crate::rounds;
 use crate::support::{Client, FakeNode, eventually, holds, params, signal};
 use crate::traffic::Named;
+use crate::{alone, rounds};
 
 /// Number of parameters, each with its own writer.
 const KEYS: usize = 8;
@@ -56,6 +56,7 @@ fn watch(computer: &Computer) -> Named {
 /// leader answers these and newer calls.
 #[test]
 fn a_leader_that_was_paused_sends_no_old_notifications() {
+    let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let (mut first, mut watcher) = (0, None);
     for round in 0..rounds() {
@@ -125,6 +126,7 @@ fn a_leader_that_was_paused_sends_no_old_notifications() {
 /// values, however long the leader is stopped.
 #[test]
 fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
+    let _alone = alone();
     // The leader is stopped for less than this time to live.
     let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);
     let leader = fleet.await_whole();

@@ -16,6 +16,8 @@ use super::{
 
 /// Longest message, in bytes. etcd splits messages at 2 MiB, which is 2.7 MiB in base64.
 const MESSAGE_BYTES_MAX: usize = 8 << 20;
+/// How often an open watch looks whether requests go to another endpoint by now, because its own did not answer them.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// Pause before a watch is opened again.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -82,7 +84,10 @@ impl Watch {
     pub async fn next(&mut self) -> Result<Vec<KeyChange>, WatchEnd> {
         loop {
             let read = match &mut self.open {
-                Some(open) => tokio::time::timeout_at(open.until, open.message()).await,
+                Some(open) => {
+                    let look = open.until.min(Instant::now() + LOOK_EVERY);
+                    tokio::time::timeout_at(look, open.message()).await
+                }
                 None => {
                     self.open().await?;
                     continue;
@@ -102,7 +107,7 @@ impl Watch {
                     continue;
                 }
                 Err(_) => {
-                    self.close("etcd was silent");
+                    self.look();
                     continue;
                 }
             };
@@ -118,6 +123,15 @@ impl Watch {
                 // The stream reports an error when the member stops.
                 Err(error) => self.close(&error.to_string()),
             }
+        }
+    }
+
+    /// Closes the silent stream if its endpoint does not answer requests, or if the stream has been silent for long.
+    fn look(&mut self) {
+        match &self.open {
+            Some(open) if open.until <= Instant::now() => self.close("etcd was silent"),
+            Some(open) if open.endpoint != self.client.preferred() => self.open = None,
+            _ => {}
         }
     }
 

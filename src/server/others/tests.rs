@@ -26,6 +26,7 @@ const TERM: u64 = 7;
 /// A following computer, and what the test controls.
 struct Computer {
     calls: Calls,
+    gate: gate::Tx,
     standing: watch::Sender<Standing>,
     /// How much of the journal this computer's mirror holds.
     followed: watch::Sender<Place>,
@@ -108,6 +109,7 @@ impl Computer {
         };
         Self {
             calls,
+            gate: gate_tx,
             standing,
             followed: tell_followed,
             handovers,
@@ -416,6 +418,24 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     }
     shown(TERM + 1, 9);
     assert!(computer.ask("/", &get).await.is_err(), "it is never fresh");
+}
+
+/// The cable to the leader is cut, and its last record does not arrive. When this computer is alone, it answers.
+#[tokio::test]
+async fn a_read_waits_for_a_silent_leader_only_until_this_computer_is_alone() {
+    let computer = Computer::new(leader(None).await);
+    let others = computer.calls.others.as_ref().unwrap();
+    others.shown.raise(place(TERM, 7));
+    let get = get();
+    let alone = async {
+        tokio::time::sleep(2 * PATIENCE).await;
+        computer.gate.set(gate::State::StandingIn);
+        computer.standing.send_replace(Standing::Alone);
+    };
+    let start = Instant::now();
+    let (answer, ()) = tokio::join!(computer.ask("/RPC2", &get), alone);
+    assert_eq!(reply(answer.unwrap()).await, made_by(&get));
+    assert!(start.elapsed() < others.hold, "{:?}", start.elapsed());
 }
 
 /// `rospy.loginfo` and `get_param_cached` call `subscribeParam` each time.
