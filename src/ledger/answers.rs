@@ -154,6 +154,7 @@ impl Ledger {
         let heard = concern.heard();
         let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
+        let before = call.ends_early().then(|| inner.mirror.clone());
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
             // The answer cannot be encoded, so it does not show which writes were accepted. All count as accepted,
@@ -163,7 +164,8 @@ impl Ledger {
                 writes.filter(|call| call.kind().mutates()).collect()
             }
             Reply::Value(_) => {
-                let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
+                let before = before.as_ref().unwrap_or(&inner.mirror);
+                let accepted = replay::accepted(before, call, &reply).calls;
                 // A master that is newer than the mirror may hold parameters that the mirror lacks.
                 let may_be_set =
                     |call: &Request| inner.unconfirmed && *call.method() == Method::DeleteParam;

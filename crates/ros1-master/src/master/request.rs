@@ -191,6 +191,15 @@ impl Request {
         found
     }
 
+    /// Whether this multicall, or one within it, ends at a malformed entry. Its answer does not show which of its calls ran.
+    pub fn ends_early(&self) -> bool {
+        self.entries.iter().any(|entry| match entry {
+            Entry::Request(request) => request.ends_early(),
+            Entry::Malformed(_) => true,
+            Entry::Refused(_) => false,
+        })
+    }
+
     pub fn kind(&self) -> Kind {
         if self.method != Method::Multicall {
             return self.method.kind();
