@@ -70,6 +70,21 @@ async fn a_watch_continues_at_another_member_and_misses_nothing() {
     assert_eq!(seen, 100);
 }
 
+/// A client that sends no requests of its own does not notice otherwise that its member is silent.
+#[tokio::test]
+async fn a_watch_leaves_a_member_that_answers_nothing_before_its_silence_is_too_long() {
+    let servers = Servers::new(3).await;
+    let (writer, keys) = (servers.client_of(1, Credentials::default()), keys());
+    let mut watch = servers.client().watch(keys.small(), 0, 10 * LIMIT);
+    let (mut seen, first, second) = (0, [entry(1)], [entry(2)]);
+    assert!(writer.put(&keys, 0, &first, LIMIT).await.unwrap());
+    follow(&mut watch, &mut seen, 1).await;
+    servers.stop(0);
+    assert!(writer.put(&keys, 0, &second, LIMIT).await.unwrap());
+    follow(&mut watch, &mut seen, 2).await;
+    servers.go_on(0);
+}
+
 #[tokio::test]
 async fn a_watch_reports_that_etcd_has_discarded_older_changes() {
     let servers = Servers::new(1).await;

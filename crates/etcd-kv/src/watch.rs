@@ -16,8 +16,9 @@ use super::{
 
 /// Longest message, in bytes. etcd splits messages at 2 MiB, which is 2.7 MiB in base64.
 const MESSAGE_BYTES_MAX: usize = 8 << 20;
-/// How often an open watch looks whether requests go to another endpoint by now, because its own did not answer them.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+/// After this silence, and again each time, an open watch sends a request. If another endpoint answers it, the watch goes
+/// there: a member that has lost its cluster says nothing and answers nothing.
+const ASK_EVERY: Duration = Duration::from_millis(500);
 /// Pause before a watch is opened again.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -41,12 +42,18 @@ pub enum WatchEnd {
 
 struct Open {
     endpoint: usize,
-    body: Incoming,
-    buffer: BytesMut,
-    /// When the watch is closed if etcd stays silent.
-    until: Instant,
+    lines: Lines,
+    silence: Silence,
 }
 
+/// The lines of an answer.
+struct Lines {
+    body: Incoming,
+    buffer: BytesMut,
+}
+
+/// Ends when the stream must be left because of its silence. Its value is whether another endpoint answers requests.
+type Silence = Pin<Box<dyn Future<Output = bool> + Send>>;
 type Opening = Pin<Box<dyn Future<Output = Result<Incoming, EtcdError>> + Send>>;
 
 /// A watch. Changes arrive in order. After a lost connection some may arrive twice.
@@ -57,7 +64,7 @@ pub struct Watch {
     next: u64,
     quiet: Duration,
     open: Option<Open>,
-    /// The stream that is being opened, and the index of its endpoint. It is kept here, like [`Open::until`], because
+    /// The stream that is being opened, and the index of its endpoint. It is kept here, like [`Open::silence`], because
     /// [`Self::next`] may be cancelled and called again at any time. A silent member must be noticed even then.
     opening: Option<(usize, Opening)>,
     failures: usize,
@@ -83,31 +90,32 @@ impl Watch {
     /// [`WatchEnd`] if no more changes will come.
     pub async fn next(&mut self) -> Result<Vec<KeyChange>, WatchEnd> {
         loop {
-            let read = match &mut self.open {
-                Some(open) => {
-                    let look = open.until.min(Instant::now() + LOOK_EVERY);
-                    tokio::time::timeout_at(look, open.message()).await
-                }
-                None => {
-                    self.open().await?;
-                    continue;
+            let Some(open) = &mut self.open else {
+                self.open().await?;
+                continue;
+            };
+            let read = tokio::select! {
+                biased;
+                read = open.lines.next() => read,
+                is_elsewhere = &mut open.silence => {
+                    if is_elsewhere {
+                        self.open = None;
+                        continue;
+                    }
+                    Err("etcd was silent".to_owned())
                 }
             };
-            if let (Ok(Ok(Some(_))), Some(open)) = (&read, &mut self.open) {
-                open.until = Instant::now() + self.quiet;
-            }
             let answer = match read {
-                Ok(Ok(Some(line))) => wire::parse::<Streamed<WatchAnswer>>(&line),
-                Ok(Ok(None)) => {
+                Ok(Some(line)) => {
+                    open.silence = silence(&self.client, &self.range, self.quiet, open.endpoint);
+                    wire::parse::<Streamed<WatchAnswer>>(&line)
+                }
+                Ok(None) => {
                     self.close("the stream has ended");
                     continue;
                 }
-                Ok(Err(why)) => {
+                Err(why) => {
                     self.close(&why);
-                    continue;
-                }
-                Err(_) => {
-                    self.look();
                     continue;
                 }
             };
@@ -123,15 +131,6 @@ impl Watch {
                 // The stream reports an error when the member stops.
                 Err(error) => self.close(&error.to_string()),
             }
-        }
-    }
-
-    /// Closes the silent stream if its endpoint does not answer requests, or if the stream has been silent for long.
-    fn look(&mut self) {
-        match &self.open {
-            Some(open) if open.until <= Instant::now() => self.close("etcd was silent"),
-            Some(open) if open.endpoint != self.client.preferred() => self.open = None,
-            _ => {}
         }
     }
 
@@ -181,9 +180,11 @@ impl Watch {
             Ok(body) => {
                 self.open = Some(Open {
                     endpoint: index,
-                    body,
-                    buffer: BytesMut::new(),
-                    until: Instant::now() + self.quiet,
+                    lines: Lines {
+                        body,
+                        buffer: BytesMut::new(),
+                    },
+                    silence: silence(&self.client, &self.range, self.quiet, index),
                 });
             }
             Err(error) if error.is_final() => return Err(WatchEnd::Failed(error)),
@@ -229,9 +230,25 @@ impl Watch {
     }
 }
 
-impl Open {
-    /// Reads the next message, which is one line.
-    async fn message(&mut self) -> Result<Option<Bytes>, String> {
+/// A silence that begins now, on a stream from `endpoint`.
+fn silence(client: &Client, range: &Range<String>, quiet: Duration, endpoint: usize) -> Silence {
+    let (client, range) = (client.clone(), range.clone());
+    let end = Instant::now() + quiet;
+    let asks = async move {
+        loop {
+            tokio::time::sleep(ASK_EVERY).await;
+            let answer = client.first_key(&range, quiet).await;
+            if answer.is_ok() && client.preferred() != endpoint {
+                return;
+            }
+        }
+    };
+    Box::pin(async move { tokio::time::timeout_at(end, asks).await.is_ok() })
+}
+
+impl Lines {
+    /// Reads the next line, which is one message. Cancel safe.
+    async fn next(&mut self) -> Result<Option<Bytes>, String> {
         loop {
             if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
                 let line = self.buffer.split_to(end + 1);
