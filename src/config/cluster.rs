@@ -120,7 +120,7 @@ impl ClusterConfig {
             None => usual.clone(),
         };
         let mut far = members.endpoints.iter();
-        let far = far.find(|endpoint| !is_on_loopback(endpoint));
+        let far = far.find(|endpoint| !is_at(endpoint, is_loopback));
         if let Some(endpoint) = far.filter(|_| is_loopback(&advertised.host)) {
             return Err(ClusterError::Loopback {
                 address: advertised.host,
@@ -201,22 +201,19 @@ fn is_loopback(host: &str) -> bool {
     }
 }
 
-/// The endpoints, with those on this computer, `own`, first. Through the etcd of another computer, this one would lack
-/// that computer's last records for some seconds after a cut between them, and its reads would wait.
+/// The endpoints, with those on this computer, `own`, first: a cut between this computer and another one then does not
+/// interrupt the watch, unless the other one runs etcd's leader.
 fn own_first(endpoints: &[String], own: &str) -> Vec<String> {
-    let is_own = |endpoint: &String| {
-        let host = |host: &str| is_loopback(host) || host.trim_matches(['[', ']']) == own;
-        let uri = endpoint.parse::<Uri>();
-        uri.is_ok_and(|uri| uri.host().is_some_and(host))
-    };
-    let (mut first, rest): (Vec<_>, Vec<_>) = endpoints.iter().cloned().partition(is_own);
-    first.extend(rest);
-    first
+    let is_own = |host: &str| is_loopback(host) || host.trim_matches(['[', ']']) == own;
+    let mut endpoints = endpoints.to_vec();
+    endpoints.sort_by_key(|endpoint| !is_at(endpoint, is_own));
+    endpoints
 }
 
-fn is_on_loopback(endpoint: &str) -> bool {
+/// Whether the endpoint's host is one that `is_it` accepts.
+fn is_at(endpoint: &str, is_it: impl Fn(&str) -> bool) -> bool {
     let uri = endpoint.parse::<Uri>();
-    uri.is_ok_and(|uri| uri.host().is_some_and(is_loopback))
+    uri.is_ok_and(|uri| uri.host().is_some_and(is_it))
 }
 
 /// Parses `HOST:PORT`, or `HOST`, to which it adds `port`.
