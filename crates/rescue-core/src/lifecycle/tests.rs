@@ -10,6 +10,16 @@ const PROBING: Probing = Probing {
     start_limit: START_LIMIT,
 };
 const START_LIMIT: Duration = Duration::from_secs(30);
+/// A start without a master of an earlier rosrescue.
+const FIRST: Input = Input::Start {
+    left: false,
+    restored: false,
+};
+/// A start after an earlier rosrescue has left its master running.
+const LEFT: Input = Input::Start {
+    left: true,
+    restored: false,
+};
 
 /// Runs the state machine on a virtual clock.
 struct Script {
@@ -61,21 +71,9 @@ impl Script {
         let mut script = Self::new(supervision);
         match supervision {
             Supervision::Ours => script
-                .feed(
-                    Input::Start {
-                        left: false,
-                        restored: false,
-                    },
-                    &[Action::Spawn],
-                )
+                .feed(FIRST, &[Action::Spawn])
                 .feed(Input::Spawned, &[Action::Connect]),
-            Supervision::Theirs => script.feed(
-                Input::Start {
-                    left: false,
-                    restored: false,
-                },
-                &[Action::Connect],
-            ),
+            Supervision::Theirs => script.feed(FIRST, &[Action::Connect]),
         };
         script.serve(true);
         script
@@ -163,13 +161,7 @@ fn a_closed_idle_connection_does_not_count_as_a_death() {
 fn a_master_that_was_left_is_taken_over_and_replaced_when_it_ends() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(
-            Input::Start {
-                left: true,
-                restored: false,
-            },
-            &[Action::Connect],
-        )
+        .feed(LEFT, &[Action::Connect])
         .feed(Input::Refused, &[])
         .wake(Duration::from_millis(1), &[Action::Connect])
         .serve(false)
@@ -182,13 +174,7 @@ fn a_master_that_was_left_is_taken_over_and_replaced_when_it_ends() {
 fn a_master_that_was_left_hanging_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(
-            Input::Start {
-                left: true,
-                restored: false,
-            },
-            &[Action::Connect],
-        )
+        .feed(LEFT, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::Unreachable, &[Action::Kill])
         .feed(Input::Exited, &[Action::Spawn]);
@@ -199,13 +185,7 @@ fn a_master_that_was_left_hanging_is_killed() {
 fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(
-            Input::Start {
-                left: true,
-                restored: false,
-            },
-            &[Action::Connect],
-        )
+        .feed(LEFT, &[Action::Connect])
         .feed(Input::Unreachable, &[]);
     script.now += START_LIMIT + Duration::from_secs(1);
     script
@@ -214,13 +194,7 @@ fn a_master_that_was_left_and_takes_no_connection_is_killed() {
         .feed(Input::Exited, &[Action::Spawn]);
     // External masters are waited for.
     let mut script = Script::new(Supervision::Theirs);
-    script.feed(
-        Input::Start {
-            left: false,
-            restored: false,
-        },
-        &[Action::Connect],
-    );
+    script.feed(FIRST, &[Action::Connect]);
     script.now += START_LIMIT * 2;
     script.feed(Input::Unreachable, &[]);
 }
@@ -231,13 +205,7 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
     for answer in [Input::NotAMaster, Input::ConnectionLost] {
         let mut script = Script::new(Supervision::Ours);
         script
-            .feed(
-                Input::Start {
-                    left: false,
-                    restored: false,
-                },
-                &[Action::Spawn],
-            )
+            .feed(FIRST, &[Action::Spawn])
             .feed(Input::Spawned, &[Action::Connect])
             .feed(Input::Connected, &[Action::Examine])
             .feed(answer, &[]);
@@ -249,13 +217,7 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
             .feed(Input::Exited, &[Action::Spawn]);
         // External masters are never replaced.
         let mut script = Script::new(Supervision::Theirs);
-        script.feed(
-            Input::Start {
-                left: false,
-                restored: false,
-            },
-            &[Action::Connect],
-        );
+        script.feed(FIRST, &[Action::Connect]);
         script.now += START_LIMIT * 2;
         script.feed(Input::Connected, &[Action::Examine]);
         let actions = script.machine.on(script.now, answer);
@@ -316,13 +278,7 @@ fn a_hung_external_master_is_asked_again_and_never_killed() {
 fn a_child_that_never_listens_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(
-            Input::Start {
-                left: false,
-                restored: false,
-            },
-            &[Action::Spawn],
-        )
+        .feed(FIRST, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect]);
     script.now += START_LIMIT + Duration::from_secs(1);
     script
@@ -333,10 +289,7 @@ fn a_child_that_never_listens_is_killed() {
 #[test]
 fn a_child_whose_port_was_taken_is_replaced_at_once_without_counting_as_a_death() {
     let mut script = Script::new(Supervision::Ours);
-    let start = Input::Start {
-        left: false,
-        restored: false,
-    };
+    let start = FIRST;
     script.feed(start, &[Action::Spawn]);
     let take = |script: &mut Script, spawned: &[Action]| {
         script
@@ -360,13 +313,7 @@ fn a_child_whose_port_was_taken_is_replaced_at_once_without_counting_as_a_death(
 fn a_master_that_dies_while_it_is_examined_is_replaced_without_a_rush() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(
-            Input::Start {
-                left: false,
-                restored: false,
-            },
-            &[Action::Spawn],
-        )
+        .feed(FIRST, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[])

@@ -195,10 +195,7 @@ fn a_master_that_hangs_at_last_is_killed_at_last() {
 #[test]
 fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
     let mut script = Script::new(Supervision::Ours);
-    let start = Input::Start {
-        left: false,
-        restored: false,
-    };
+    let start = FIRST;
     script
         .feed(start, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect]);
