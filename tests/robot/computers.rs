@@ -1,9 +1,9 @@
 //! The instructions in `docs/several-computers.md` work on three computers, which
 //! `tests/support/computers.sh` provides with real etcd servers and a real keepalived.
 
-use std::{fs, path::Path, process::Command};
+use std::{fs, path::Path};
 
-use super::support::{Scratch, blocks};
+use super::{documents::run_on_a_computer, support::blocks};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 const COMPUTERS: [(&str, &str); 3] = [
@@ -55,35 +55,12 @@ fn on(computers: &[&str], text: &str) -> String {
     scripts.collect()
 }
 
-/// Runs `script` in new namespaces, which end with the shell and everything that it has started.
+/// Runs `script` with the functions of `tests/support/computers.sh`.
 #[track_caller]
 fn run(script: &str) -> String {
-    let scratch = Scratch::new();
-    let mut command = Command::new("unshare");
-    scratch.prepare(&mut command);
-    let output = command
-        .args([
-            "--net",
-            "--mount",
-            "--pid",
-            "--fork",
-            "--mount-proc",
-            "--kill-child",
-        ])
-        .args(["timeout", "--kill-after=5", "100", "bash", "-euc"])
-        .arg(format!("exec 2>&1\n. tests/support/computers.sh\n{script}"))
-        .env("REPOSITORY", ROOT)
-        .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
-        .current_dir(ROOT)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(
-        output.status.success(),
-        "{} (namespaces need root; tests/run.sh installs etcd and keepalived):\n{script}\n{said}",
-        output.status,
-    );
-    said
+    run_on_a_computer(&format!(
+        "exec 2>&1\n. tests/support/computers.sh\n{script}"
+    ))
 }
 
 /// A script for steps 1 to 3, which then waits until a majority has formed.

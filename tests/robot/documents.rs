@@ -32,14 +32,14 @@ fn run(document: &str) {
             )
             .unwrap();
         }
-        run_section(&script);
+        run_on_a_computer(&script);
     }
 }
 
 /// Runs a script in new namespaces: its ports are free, `pkill` finds no other processes, and everything ends with the
 /// shell.
 #[track_caller]
-fn run_section(script: &str) -> String {
+pub(super) fn run_on_a_computer(script: &str) -> String {
     let scratch = Scratch::new();
     let mut command = Command::new("unshare");
     scratch.prepare(&mut command);
@@ -60,7 +60,7 @@ fn run_section(script: &str) -> String {
         .unwrap();
     assert!(
         output.status.success(),
-        "{} (namespaces need root):\n{script}\n{}{}",
+        "{} (namespaces need root; tests/run.sh installs what the documents use):\n{script}\n{}{}",
         output.status,
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr)
@@ -108,7 +108,7 @@ fn lines(picture: &str) -> Vec<String> {
 #[test]
 fn the_recording_matches_the_output_of_its_script() {
     let ours = fs::read_to_string(Path::new(ROOT).join("docs/rescue.svg")).unwrap();
-    let made = run_section(". tests/support/documents.sh\nexamples/record.sh");
+    let made = run_on_a_computer(". tests/support/documents.sh\nexamples/record.sh");
     assert!(lines(&made).len() > 10, "{made}");
     assert_eq!(
         lines(&ours),
