@@ -103,6 +103,12 @@ impl Ledger {
         is_success(&reply).then_some(reply)
     }
 
+    /// The master's predicted answer to a call that changes the state. `None` for any other call.
+    pub(crate) fn answer_if_changing(&self, call: &Request) -> Option<Reply> {
+        let changes = self.with_mirror(|mirror| mirror.would_change(call));
+        changes.then(|| self.predict(call))
+    }
+
     /// The master's predicted answer to this call.
     pub fn predict(&self, call: &Request) -> Reply {
         let mut model = self.with_mirror(Clone::clone);

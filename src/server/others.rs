@@ -29,7 +29,7 @@ use crate::{
         sharing::Source,
         standing::{Pass, Place, Standing},
     },
-    master::{CALLER_ID, Kind, Method, Request, names},
+    master::{CALLER_ID, Kind, Method, Request},
     nodes::served::Served,
     order::ANSWER_LIMIT,
     ros_env::MasterUri,
@@ -229,15 +229,11 @@ impl Others {
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
-        // The parameter that a leader which gave no answer may have deleted for this call.
-        let mut deleted: Option<String> = None;
+        // A leader that has not answered may have run this call. If the call removes something, the next leader then
+        // finds nothing to remove, and this is the answer.
+        let mut removed: Option<Reply> = None;
         let mut unanswered = None;
         loop {
-            // A leader has run this deletion but died before its answer. The next leader would refuse to delete the
-            // parameter again.
-            if let Some(key) = deleted.take_if(|_| call.deletes().is_none()) {
-                return Ok(was_deleted(&key));
-            }
             let now = standing.borrow_and_update().clone();
             if let Some(term) = asked_term
                 && !now.answers_others(term)
@@ -293,7 +289,7 @@ impl Others {
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
                         }
-                        answered => return Ok(answered?),
+                        answered => return Ok(instead(answered?, removed)),
                     }
                 }
                 Standing::Follows { uri, term } => {
@@ -307,7 +303,7 @@ impl Others {
                             .await
                             .unwrap_or_else(|_| silent()));
                     }
-                    let deletes = call.deletes();
+                    let removes = call.removes().await;
                     if unanswered.is_none() && call.kind.mutates() {
                         unanswered = call
                             .call
@@ -316,17 +312,16 @@ impl Others {
                     }
                     tokio::select! {
                         answered = call.forward(&leader, term) => match answered {
-                            Ok(reply) => return Ok(reply),
+                            Ok(reply) => return Ok(instead(reply, removed)),
                             Err(may_have_run) => {
-                                let deletes = deletes.filter(|_| may_have_run);
-                                deleted = deleted.or(deletes);
+                                removed = removed.or_else(|| removes.filter(|_| may_have_run));
                                 Some(Instant::now() + RETRY_PAUSE)
                             }
                         },
                         // When the leader changes, the old leader's answer never comes or no longer counts. A computer
                         // that is alone answers reads itself.
                         _ = standing.changed() => {
-                            deleted = deleted.or(deletes);
+                            removed = removed.or(removes);
                             continue;
                         }
                     }
@@ -497,19 +492,15 @@ impl Call<'_> {
         }
     }
 
-    /// The parameter that the call deletes, if the mirror has it.
-    fn deletes(&self) -> Option<String> {
+    /// The leader's predicted answer, if the call removes something that the mirror has. Waits for the mirror, because
+    /// it may lack the last write that was answered here.
+    async fn removes(&self) -> Option<Reply> {
         let call = self.call.as_ref()?;
-        let (caller, key) = (call.caller()?, call.text(1)?);
-        if *call.method() != Method::DeleteParam {
+        if self.kind != Kind::Unregister && *call.method() != Method::DeleteParam {
             return None;
         }
-        let has = Request::new(Method::HasParam, [caller, key]);
-        let Some(Reply::Value(Value::Array(answer))) = self.calls.ledger.answer(&has) else {
-            return None;
-        };
-        let there = answer.get(2) == Some(&Value::Bool(true));
-        there.then(|| names::resolve(key, caller))
+        let _ = tokio::time::timeout(PATIENCE, self.mirror_is_fresh()).await;
+        self.calls.ledger.answer_if_changing(call)
     }
 
     /// Whether the call is a `subscribeParam` whose subscription already exists. Nodes repeat such calls whenever they
@@ -538,18 +529,26 @@ impl Call<'_> {
         if self.kind != Kind::Read && !self.is_subscribed() {
             return None;
         }
+        self.mirror_is_fresh().await?;
+        self.by_mirror().await
+    }
+
+    /// Waits until the mirror has reached the leader's earlier answers. `None` if rosrescue is stopping.
+    async fn mirror_is_fresh(&self) -> Option<()> {
         let mut followed = self.others.followed.clone();
         let fresh = followed.wait_for(|followed| followed.shows(self.others.shown.get()));
-        fresh.await.ok()?;
-        self.by_mirror().await
+        fresh.await.ok().map(drop)
     }
 }
 
-/// A master's answer to the deletion of `key`.
-fn was_deleted(key: &str) -> HttpReply {
-    let text = format!("parameter {key} deleted");
-    let reply: [Value; 3] = [1.into(), text.as_str().into(), 0.into()];
-    xml(&Reply::Value(reply.to_vec().into()))
+/// `reply`, with `removed` in its place if there is one.
+fn instead(mut reply: HttpReply, removed: Option<Reply>) -> HttpReply {
+    let Some(removed) = removed else {
+        return reply;
+    };
+    let mut told = xml(&removed);
+    std::mem::swap(told.extensions_mut(), reply.extensions_mut());
+    told
 }
 
 fn passed_on() -> HttpReply {

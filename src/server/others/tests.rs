@@ -17,7 +17,7 @@ use crate::{
     ros_env::MasterUri,
     upstream::{Upstream, pool::Pool},
     write_queue::write_queue,
-    xmlrpc::{decode_reply, encode_call},
+    xmlrpc::{decode_reply, encode_call, encode_reply},
 };
 
 const OWN: &str = "http://127.0.0.1:11311/";
@@ -140,23 +140,39 @@ fn made_by(call: &Request) -> Reply {
     model.apply(call).reply
 }
 
+/// The answer that a leader gives to a call, if it gives one.
+type Says = Option<(StatusCode, Vec<u8>)>;
+
 /// A leader that says 421 to each call, or nothing at all.
 async fn leader(says: Option<StatusCode>) -> Standing {
+    leader_with(vec![says.map(|code| (code, Vec::new()))])
+        .await
+        .0
+}
+
+/// A leader that gives one of these answers after the other, and the last one to all later calls. Also returns how many
+/// calls it has got.
+async fn leader_with(answers: Vec<Says>) -> (Standing, watch::Receiver<usize>) {
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
+    let (count, calls) = watch::channel(0);
     tokio::spawn(async move {
         let mut open = Vec::new();
         while let Ok((mut stream, _)) = listener.accept().await {
-            if let Some(code) = says {
-                request_body(&mut stream).await.unwrap();
-                let answer = format!("HTTP/1.1 {code}\r\nContent-Length: 0\r\n\r\n");
-                stream.write_all(answer.as_bytes()).await.unwrap();
+            request_body(&mut stream).await.unwrap();
+            let nth = *count.borrow();
+            count.send_replace(nth + 1);
+            if let Some((code, body)) = &answers[nth.min(answers.len() - 1)] {
+                let length = body.len();
+                let head = format!("HTTP/1.1 {code}\r\nContent-Length: {length}\r\n\r\n");
+                stream.write_all(head.as_bytes()).await.unwrap();
+                stream.write_all(body).await.unwrap();
             }
             open.push(stream);
         }
     });
     let uri = format!("http://127.0.0.1:{port}/");
-    Standing::Follows { uri, term: TERM }
+    (Standing::Follows { uri, term: TERM }, calls)
 }
 
 #[tokio::test]
@@ -215,24 +231,40 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
     assert_eq!(reply(answer).await, made_by(&get()));
 }
 
-/// The next leader refuses to delete a parameter that is not there any more. The caller must not be told so if its own
-/// call has deleted it, and must be told so if another call has.
+/// The next leader finds nothing to remove. The caller must not be told so if its own call has removed it, and must be
+/// told so if another call has.
 #[tokio::test]
-async fn a_deletion_counts_as_done_only_if_a_leader_may_have_run_it() {
+async fn a_removal_counts_as_done_only_if_a_leader_may_have_run_it() {
+    let api = "http://127.0.0.1:2/";
+    let register = Request::new(Method::RegisterSubscriber, ["/n", "/t", "*", api]);
+    let unregister = Request::new(Method::UnregisterSubscriber, ["/n", "/t", api]);
     let delete = Request::new(Method::DeleteParam, ["/n", "/a"]);
-    for (says, done) in [(None, true), (Some(StatusCode::MISDIRECTED_REQUEST), false)] {
-        let computer = Computer::new(leader(says).await);
-        let another = leader(says).await;
-        // The call is on its way when the parameter disappears.
-        let deleted_by_somebody = async {
-            let nothing = Master::default();
-            computer.calls.ledger.follow_state(nothing).unwrap();
-            if done {
-                computer.standing.send_replace(another);
-            }
+    let mut mirror = Master::default();
+    mirror.apply(&set(1));
+    mirror.apply(&register);
+    for remove in [&delete, &unregister] {
+        let mut after = mirror.clone();
+        let done = after.apply(remove).reply;
+        let nothing = after.apply(remove).reply;
+        assert_ne!(done, nothing);
+        let found_nothing = || Some((StatusCode::OK, encode_reply(&nothing)));
+        let (silent, mut calls) = leader_with(vec![None]).await;
+        let (next, _) = leader_with(vec![found_nothing()]).await;
+        let refuses = Some((StatusCode::MISDIRECTED_REQUEST, Vec::new()));
+        let (refusing, _) = leader_with(vec![refuses, found_nothing()]).await;
+
+        let computer = Computer::new(silent);
+        computer.calls.ledger.follow_state(mirror.clone()).unwrap();
+        let takeover = async {
+            calls.wait_for(|count| *count > 0).await.unwrap();
+            computer.standing.send_replace(next);
         };
-        let (answer, ()) = tokio::join!(computer.ask("/RPC2", &delete), deleted_by_somebody);
-        assert_eq!(answer.is_ok(), done);
+        let (answer, ()) = tokio::join!(computer.ask("/RPC2", remove), takeover);
+        assert_eq!(reply(answer.unwrap()).await, done);
+
+        computer.standing.send_replace(refusing);
+        let answer = computer.ask("/RPC2", remove).await.unwrap();
+        assert_eq!(reply(answer).await, nothing);
     }
 }
 
@@ -349,7 +381,7 @@ async fn a_follower_tells_its_leader_when_the_caller_has_the_answer() {
             tokio::spawn(async move {
                 while let Some(body) = request_body(&mut stream).await {
                     let _ = tell.send(body).await;
-                    let reply = xmlrpc::encode_reply(&made_by(&get()));
+                    let reply = encode_reply(&made_by(&get()));
                     let head = format!(
                         "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n{}: 42\r\nContent-Length: {}\r\n\r\n",
                         peer::ANSWER_HEADER,
