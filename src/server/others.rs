@@ -42,6 +42,8 @@ use crate::{
 
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
+/// How long a removal waits for the mirror. It is 3 ms behind the leader, but 200 ms with `--cluster-sync interval`.
+const CATCH_UP: Duration = Duration::from_millis(20);
 /// The error if the leader's address in etcd is unusable.
 const NO_ADDRESS: &str = "the leader's address cannot be used";
 /// The method by which `rosrescue handover` asks the leader to give up leadership.
@@ -495,11 +497,14 @@ impl Call<'_> {
     /// The leader's predicted answer, if the call removes something that the mirror has. Waits for the mirror, because
     /// it may lack the last write that was answered here.
     async fn removes(&self) -> Option<Reply> {
-        let call = self.call.as_ref()?;
-        if self.kind != Kind::Unregister && *call.method() != Method::DeleteParam {
+        let call = self.call.as_ref().filter(|_| self.kind.mutates())?;
+        let is_removal = |call: &Request| {
+            call.kind() == Kind::Unregister || *call.method() == Method::DeleteParam
+        };
+        if !call.calls().into_iter().any(is_removal) {
             return None;
         }
-        let _ = tokio::time::timeout(PATIENCE, self.mirror_is_fresh()).await;
+        let _ = tokio::time::timeout(CATCH_UP, self.mirror_is_fresh()).await;
         self.calls.ledger.answer_if_changing(call)
     }
 

@@ -239,10 +239,11 @@ async fn a_removal_counts_as_done_only_if_a_leader_may_have_run_it() {
     let register = Request::new(Method::RegisterSubscriber, ["/n", "/t", "*", api]);
     let unregister = Request::new(Method::UnregisterSubscriber, ["/n", "/t", api]);
     let delete = Request::new(Method::DeleteParam, ["/n", "/a"]);
+    let both = Request::multicall([get(), delete.clone()]);
     let mut mirror = Master::default();
     mirror.apply(&set(1));
     mirror.apply(&register);
-    for remove in [&delete, &unregister] {
+    for remove in [&delete, &unregister, &both] {
         let mut after = mirror.clone();
         let done = after.apply(remove).reply;
         let nothing = after.apply(remove).reply;
