@@ -34,6 +34,7 @@ mod pid_file;
 pub(crate) mod pidfd;
 mod rosout;
 mod stat;
+pub(crate) mod unsent;
 mod usage;
 
 use log_config::LogConfig;

@@ -12,9 +12,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use rustix::process::{PidfdFlags, Signal};
+use rustix::process::PidfdFlags;
 
-use super::{Rosmaster, listeners, output, pid_file::Last, pidfd, runs, signal_process};
+use super::{Rosmaster, listeners, output, pid_file::Last, pidfd, runs, unsent};
 use crate::wait;
 
 /// Environment variable that names the checkpoint of the rosrescue that started the process.
@@ -86,7 +86,7 @@ impl Rosmaster {
                 pid,
                 "killing a rosmaster that an earlier rosrescue left running: it does not listen at the port of this session's last master"
             );
-            signal_process(pid, Signal::KILL);
+            unsent::kill(pid);
         }
         None
     }
@@ -221,7 +221,7 @@ mod tests {
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
         let end = crate::task::spawn(ended(orphan));
-        signal_process(orphan, Signal::KILL);
+        unsent::kill(orphan);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is reported").unwrap().unwrap();
         assert_eq!(find(&owner), Vec::<u32>::new());

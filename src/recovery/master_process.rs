@@ -189,7 +189,7 @@ impl MasterProcess {
                     "the master does not answer; killing it and starting a new one"
                 );
             }
-            process::signal_process(pid, rustix::process::Signal::KILL);
+            process::unsent::kill(pid);
             self.killed = true;
         }
     }
@@ -206,7 +206,7 @@ impl MasterProcess {
     pub(crate) fn kill_and_wait(mut self) -> impl Future<Output = ()> + Send + 'static {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
-            process::signal_process(pid, rustix::process::Signal::KILL);
+            process::unsent::kill(pid);
         }
         async move {
             if self.current.is_some() {

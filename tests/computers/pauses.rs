@@ -1,4 +1,5 @@
 use std::collections::BTreeMap;
+use std::fs;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::scope;
 use std::time::Duration;
@@ -153,5 +154,57 @@ fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
     }
     fleet.computers[follower].start_etcd();
     fleet.await_same_state();
+    fleet.assert_nodes_live();
+}
+
+/// Whether a connection from this computer to `port` of another one has unsent data.
+fn is_sending_to(computer: &Computer, port: u16) -> bool {
+    let table = computer.within(|| fs::read_to_string("/proc/thread-self/net/tcp").unwrap());
+    table.lines().skip(1).any(|line| {
+        let columns: Vec<_> = line.split_whitespace().collect();
+        columns[2].ends_with(&format!(":{port:04X}")) && !columns[4].starts_with("00000000:")
+    })
+}
+
+/// A rosmaster notifies a node whose cable is cut, and is killed. Its kernel would send the notification again and again
+/// until the cable is mended, and then the node would get it after the next leader's.
+#[test]
+fn a_notification_that_a_cut_cable_held_up_does_not_come_after_a_later_one() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    let (first, cut, next) = (
+        &fleet.computers[leader],
+        &fleet.computers[rest[0]],
+        &fleet.computers[rest[1]],
+    );
+    let watcher = watch(cut);
+    let last = || {
+        told(watcher.it())
+            .get(&key(0))
+            .and_then(|of| of.last().copied())
+    };
+    // Each thread of rosmaster has its own connection to the node. Soon all of them exist.
+    for value in -50..=1 {
+        first.set_param(&key(0), value);
+        eventually("the node is told", || last() == Some(value));
+    }
+    fleet.network.cut_cable(rest[0]);
+    first.set_param(&key(0), 2);
+    eventually("rosmaster has notified the node", || {
+        is_sending_to(first, watcher.it().port())
+    });
+    let (status, said) = first.rosrescue(&["handover", "--to", next.name]);
+    assert_eq!(status, Some(0), "{said}");
+    fleet.await_leader_of(&[rest[1]]);
+    next.set_param(&key(0), 3);
+    eventually("the computer is alone", || cut.role_is("alone"));
+    fleet.network.mend_cable(rest[0]);
+    eventually("the node is told 3", || last() == Some(3));
+    // The kernel doubles its pause each time, so it sends once more within the time for which the cable was cut.
+    holds(Duration::from_secs(8), || last() == Some(3));
+    assert_eq!(last(), Some(3), "{:?}", told(watcher.it()));
+    fleet.await_whole();
     fleet.assert_nodes_live();
 }
