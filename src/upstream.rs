@@ -374,7 +374,7 @@ struct Silence {
 
 impl Silence {
     fn bound(self, stream: &TcpStream) -> io::Result<()> {
-        if is_local(stream)? {
+        if is_local(stream.peer_addr()?, stream.local_addr()?) {
             return Ok(());
         }
         let probes = TcpKeepalive::new()
@@ -402,9 +402,8 @@ async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
 }
 
 /// Whether the other end seems to be on this computer. A tunnel's near end also counts.
-fn is_local(stream: &TcpStream) -> io::Result<bool> {
-    let peer = stream.peer_addr()?.ip();
-    Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
+pub(crate) fn is_local(peer: SocketAddr, own: SocketAddr) -> bool {
+    peer.ip().to_canonical().is_loopback() || peer.ip() == own.ip()
 }
 
 /// Listens like a master, and connects to that listener. Returns the listener, the accepted end of the sentinel, the

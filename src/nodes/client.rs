@@ -6,6 +6,7 @@ use std::{
 };
 
 use hyper::header::HeaderValue;
+use socket2::SockRef;
 use tokio::{net::TcpStream, time::timeout};
 
 pub(crate) use crate::health::Reaction;
@@ -32,7 +33,7 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Reactio
         return (Reaction::Silent, None);
     };
     let question = async {
-        let mut connection = match connect(&address).await {
+        let mut connection = match connect(&address, limit).await {
             Ok(connection) => connection,
             Err(sign) => return (sign, None),
         };
@@ -92,12 +93,16 @@ pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
     interview
 }
 
-async fn connect(address: &MasterUri) -> Result<Connection, Reaction> {
+/// Connects to a node. If it does not receive what is sent within `limit`, the kernel ends the connection. Otherwise it
+/// would go on sending a call that was given up, and the node might get it after newer ones.
+async fn connect(address: &MasterUri, limit: Duration) -> Result<Connection, Reaction> {
     let found = resolver::addresses(&address.host, address.port).await;
     let mut refused = false;
     for socket in found.map_err(|_| Reaction::Silent)? {
         match TcpStream::connect(socket).await {
             Ok(stream) => {
+                // This fails only if the connection has ended.
+                let _ = SockRef::from(&stream).set_tcp_user_timeout(Some(limit));
                 let name = HeaderValue::from_static("to-a-node");
                 let connection = Connection::over(stream, address, name, MAX_REPLY);
                 return connection.await.map_err(|_| Reaction::Silent);

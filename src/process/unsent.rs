@@ -9,23 +9,27 @@ use rustix::process::{PidfdFlags, PidfdGetfdFlags, Signal, pidfd_getfd, pidfd_op
 use socket2::SockRef;
 
 use super::{raw_pid, signal_process};
+use crate::upstream::is_local;
 
-/// Kills the process `pid`. What it has written to other computers and they have not received is discarded.
+/// A connection ends when it would have to send again after this time. The kernel's unit, and 0 means no limit.
+const AT_ONCE: Duration = Duration::from_millis(1);
+
+/// Kills the process `pid`. What other computers have not received of it by then is not sent again.
 ///
-/// Discarding needs Linux 5.6, and if Yama restricts `ptrace`, the process must be a descendant of this one. Otherwise
+/// That needs Linux 5.6, and if Yama restricts `ptrace`, the process must be a descendant of this one. Otherwise
 /// the process is only killed.
 pub(crate) fn kill(pid: u32) {
     // A process that is stopped writes nothing more.
     signal_process(pid, Signal::STOP);
-    if let Err(error) = discard(pid) {
-        tracing::debug!(pid, %error, "what the killed process has not sent yet cannot be discarded");
+    if let Err(error) = send_no_more(pid) {
+        tracing::debug!(pid, %error, "what the killed process has written may still be sent");
     }
     signal_process(pid, Signal::KILL);
 }
 
-/// Makes the kernel reset the process's connections to other computers when they are closed, instead of sending the
-/// rest.
-fn discard(pid: u32) -> io::Result<()> {
+/// Makes the kernel give up the process's connections to other computers if they lack something that was sent. A reset
+/// would do the same, but roscpp prints an error for each.
+fn send_no_more(pid: u32) -> io::Result<()> {
     let id = raw_pid(pid).ok_or(io::ErrorKind::InvalidInput)?;
     let process = pidfd_open(id, PidfdFlags::empty())?;
     for entry in fs::read_dir(format!("/proc/{pid}/fd"))? {
@@ -38,17 +42,12 @@ fn discard(pid: u32) -> io::Result<()> {
         };
         let socket = pidfd_getfd(&process, number, PidfdGetfdFlags::empty())?;
         let socket = SockRef::from(&socket);
-        if is_to_another_computer(&socket) {
-            socket.set_linger(Some(Duration::ZERO))?;
+        let ends = [socket.peer_addr(), socket.local_addr()];
+        if let [Some(peer), Some(own)] = ends.map(|end| end.ok()?.as_socket())
+            && !is_local(peer, own)
+        {
+            socket.set_tcp_user_timeout(Some(AT_ONCE))?;
         }
     }
     Ok(())
-}
-
-fn is_to_another_computer(socket: &SockRef<'_>) -> bool {
-    let peer = socket.peer_addr().ok().and_then(|peer| peer.as_socket());
-    let own = socket.local_addr().ok().and_then(|own| own.as_socket());
-    peer.is_some_and(|peer| {
-        !peer.ip().to_canonical().is_loopback() && own.is_some_and(|own| own.ip() != peer.ip())
-    })
 }

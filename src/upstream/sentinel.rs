@@ -25,7 +25,7 @@ pub(crate) struct Sentinel {
 impl Sentinel {
     pub(super) fn new(stream: TcpStream) -> io::Result<Self> {
         Ok(Self {
-            local: is_local(&stream)?,
+            local: is_local(stream.peer_addr()?, stream.local_addr()?),
             peer: stream.peer_addr()?,
             stream: watch::Sender::new(Arc::new(stream)),
         })

@@ -169,7 +169,7 @@ fn is_sending_to(computer: &Computer, port: u16) -> bool {
 /// A rosmaster notifies a node whose cable is cut, and is killed. Its kernel would send the notification again and again
 /// until the cable is mended, and then the node would get it after the next leader's.
 #[test]
-fn a_notification_that_a_cut_cable_held_up_does_not_come_after_a_later_one() {
+fn no_old_notification_arrives_after_a_cut() {
     let _alone = alone();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
