@@ -103,10 +103,15 @@ impl Ledger {
         is_success(&reply).then_some(reply)
     }
 
-    /// The master's predicted answer to a call that changes the state. `None` for any other call.
+    /// The master's predicted answer to a call that changes the state. `None` for any other call, and for a multicall
+    /// with too large an answer.
     pub(crate) fn answer_if_changing(&self, call: &Request) -> Option<Reply> {
-        let changes = self.with_mirror(|mirror| mirror.would_change(call));
-        changes.then(|| self.predict(call))
+        let mut model = {
+            let mirror = &mut self.lock().mirror;
+            let answers = mirror.would_change(call) && mirror.fits(call, ANSWER_MOST);
+            answers.then(|| mirror.clone())?
+        };
+        Some(model.apply_telling(call, &mut ()))
     }
 
     /// The master's predicted answer to this call.

@@ -497,14 +497,8 @@ impl Call<'_> {
     /// The leader's predicted answer, if the call removes something that the mirror has. Waits for the mirror, because
     /// it may lack the last write that was answered here.
     async fn removes(&self) -> Option<Reply> {
-        let call = self.call.as_ref().filter(|_| self.kind.mutates())?;
-        let is_removal = |call: &Request| {
-            call.kind() == Kind::Unregister || *call.method() == Method::DeleteParam
-        };
-        if !call.calls().into_iter().any(is_removal) {
-            return None;
-        }
-        let _ = tokio::time::timeout(CATCH_UP, self.mirror_is_fresh()).await;
+        let call = self.call.as_ref().filter(|call| call.removes())?;
+        let _ = tokio::time::timeout(CATCH_UP, self.wait_for_mirror()).await;
         self.calls.ledger.answer_if_changing(call)
     }
 
@@ -534,12 +528,12 @@ impl Call<'_> {
         if self.kind != Kind::Read && !self.is_subscribed() {
             return None;
         }
-        self.mirror_is_fresh().await?;
+        self.wait_for_mirror().await?;
         self.by_mirror().await
     }
 
     /// Waits until the mirror has reached the leader's earlier answers. `None` if rosrescue is stopping.
-    async fn mirror_is_fresh(&self) -> Option<()> {
+    async fn wait_for_mirror(&self) -> Option<()> {
         let mut followed = self.others.followed.clone();
         let fresh = followed.wait_for(|followed| followed.shows(self.others.shown.get()));
         fresh.await.ok().map(drop)

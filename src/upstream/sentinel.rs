@@ -24,9 +24,10 @@ pub(crate) struct Sentinel {
 
 impl Sentinel {
     pub(super) fn new(stream: TcpStream) -> io::Result<Self> {
+        let peer = stream.peer_addr()?;
         Ok(Self {
-            local: is_local(stream.peer_addr()?, stream.local_addr()?),
-            peer: stream.peer_addr()?,
+            local: is_local(peer, stream.local_addr()?),
+            peer,
             stream: watch::Sender::new(Arc::new(stream)),
         })
     }

@@ -289,8 +289,7 @@ fn a_child_that_never_listens_is_killed() {
 #[test]
 fn a_child_whose_port_was_taken_is_replaced_at_once_without_counting_as_a_death() {
     let mut script = Script::new(Supervision::Ours);
-    let start = FIRST;
-    script.feed(start, &[Action::Spawn]);
+    script.feed(FIRST, &[Action::Spawn]);
     let take = |script: &mut Script, spawned: &[Action]| {
         script
             .feed(Input::Spawned, &[Action::Connect])

@@ -200,6 +200,14 @@ impl Request {
         })
     }
 
+    /// Whether this call, or one within it, unregisters something or deletes a parameter. If it runs twice, the second
+    /// answer says that there was nothing to remove.
+    pub fn removes(&self) -> bool {
+        let removes =
+            |call: &Self| call.method == Method::DeleteParam || call.kind() == Kind::Unregister;
+        self.calls().into_iter().any(removes)
+    }
+
     pub fn kind(&self) -> Kind {
         if self.method != Method::Multicall {
             return self.method.kind();

@@ -195,9 +195,8 @@ fn a_master_that_hangs_at_last_is_killed_at_last() {
 #[test]
 fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
     let mut script = Script::new(Supervision::Ours);
-    let start = FIRST;
     script
-        .feed(start, &[Action::Spawn])
+        .feed(FIRST, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect]);
     let refuse = |script: &mut Script, does: Does, seconds: u64| {
         let mut actions = Vec::new();
