@@ -71,10 +71,10 @@ impl Params {
         self.find(read_path(key)).is_some()
     }
 
-    /// Whether there is something under `key` that [`Self::delete`] could delete. Unlike reads, deletions do not
-    /// require a leading slash.
-    pub(crate) fn holds(&self, key: &str) -> bool {
-        self.find(names::parts(key)).is_some()
+    /// The value that [`Self::set`] would replace and [`Self::delete`] delete. Unlike reads, they do not require a
+    /// leading slash.
+    pub(crate) fn written(&self, key: &str) -> Option<Value> {
+        Some(self.find(names::parts(key))?.to_value())
     }
 
     fn find<'k>(&self, path: impl Iterator<Item = &'k str>) -> Option<Found<'_>> {

@@ -62,9 +62,9 @@ impl Master {
                 let value = call.params().get(2)?;
                 // A struct with its members in another order is a different state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
-                plain && self.params.get(&key(1)?).as_ref() == Some(value)
+                plain && self.params.written(&key(1)?).as_ref() == Some(value)
             }
-            Method::DeleteParam => !self.params.holds(&key(1)?),
+            Method::DeleteParam => self.params.written(&key(1)?).is_none(),
             // A read changes nothing. A write that is not listed above might.
             method => !method.kind().mutates(),
         })

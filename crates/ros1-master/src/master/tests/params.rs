@@ -23,6 +23,17 @@ fn deleting_a_private_key_of_a_caller_without_a_slash_is_a_change() {
     assert!(!master.would_change(&delete));
 }
 
+/// A read of `a/k` finds `/k`, but a write of it changes `/a/k`.
+#[test]
+fn setting_a_key_of_a_caller_without_a_slash_is_a_change_although_a_read_finds_the_value() {
+    let mut master = after([set("/k", 1)]);
+    let params = [Value::from("a/n"), "k".into(), 1.into()];
+    let set = Request::new(Method::SetParam, params);
+    assert!(master.would_change(&set));
+    master.apply(&set);
+    assert!(!master.would_change(&set));
+}
+
 #[test]
 fn deleting_a_key_below_a_value_changes_nothing() {
     let texts = |texts: [&str; 2]| Value::from(texts.to_vec());
