@@ -4,8 +4,10 @@ use std::{
     ffi::{OsStr, OsString},
     io,
     net::{Ipv4Addr, SocketAddrV4},
+    panic::resume_unwind,
     path::{Path, PathBuf},
     process::{ExitStatus, Stdio},
+    thread,
     time::Duration,
 };
 
@@ -16,6 +18,7 @@ use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::{
     process::{Child, Command},
+    runtime::Handle,
     task::block_in_place,
 };
 
@@ -229,14 +232,26 @@ const ROSMASTER_NICE: i32 = -10;
 /// Starts `command`, with this nice value if rosrescue runs with [`guardian::NICE`]. The program may be on a slow disk,
 /// so other tasks continue meanwhile. A stop of rosrescue does not interrupt the start, because the process id of the
 /// new process would be lost.
+///
+/// The new process inherits the nice value of the thread that starts it. If rosrescue set it afterwards, a worker that
+/// dies in between would leave a process with its own.
 fn start(mut command: Command, nice: i32) -> io::Result<Child> {
-    let child = block_in_place(|| command.spawn())?;
-    if getpriority_process(None).is_ok_and(|own| own == guardian::NICE)
-        && let Some(pid) = child.id().and_then(raw_pid)
-    {
-        let _ = setpriority_process(Some(pid), nice);
-    }
-    Ok(child)
+    let runtime = Handle::current();
+    let start = || {
+        if getpriority_process(None).is_ok_and(|own| own == guardian::NICE) {
+            // On Linux this concerns this thread alone.
+            let _ = setpriority_process(None, nice);
+        }
+        let _runtime = runtime.enter();
+        command.spawn()
+    };
+    block_in_place(|| {
+        thread::scope(|scope| {
+            let starter = thread::Builder::new().name("start".to_owned());
+            let child = starter.spawn_scoped(scope, start)?.join();
+            child.unwrap_or_else(|panic| resume_unwind(panic))
+        })
+    })
 }
 
 fn raw_pid(pid: u32) -> Option<Pid> {
@@ -454,7 +469,7 @@ mod tests {
         drop(socket);
         // A process that another test is starting holds the socket until it runs its program.
         while !is_free(port) {
-            std::thread::sleep(Duration::from_millis(1));
+            thread::sleep(Duration::from_millis(1));
         }
     }
 
