@@ -95,6 +95,7 @@ impl Inner {
         outbox_changed: &Notify,
     ) -> Reply {
         let mut noticed = Noticed::new(standing_in.is_some());
+        noticed.late = self.behind.is_some();
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
         self.activity.note_lost(&self.mirror, call);
         let reply = self.mirror.apply_telling(call, &mut noticed);
@@ -102,7 +103,11 @@ impl Inner {
         match noticed.take_calls() {
             Some(calls) => {
                 for (api, subject, call) in calls {
-                    self.order.notify(port_of(&api), subject, call);
+                    let port = port_of(&api);
+                    match noticed.late {
+                        true => self.order.notify_for_late(now, port, subject, call),
+                        false => self.order.notify(port, subject, call),
+                    }
                     outbox_changed.notify_one();
                 }
             }

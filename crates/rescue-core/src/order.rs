@@ -204,6 +204,15 @@ impl Order {
             .add(port, subject, content.unwrap_or(Payload::State));
     }
 
+    /// Like [`Self::notify`], while the master is late. If it may still have notifications about `subject` to send, they
+    /// come first: either the master then also sends the newer one, or the node is told the state.
+    pub fn notify_for_late(&mut self, now: Instant, port: &str, subject: Subject, call: Arc<Call>) {
+        match self.told.until(now, &subject) {
+            Some(until) => self.repeats.add(until, port.to_owned(), subject),
+            None => self.notify(port, subject, call),
+        }
+    }
+
     /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
     pub fn tell_state(&mut self, port: &str, subject: Subject) {
         self.outbox.add(port, subject, Payload::State);

@@ -241,6 +241,26 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
 }
 
 #[test]
+fn what_a_late_master_still_has_to_send_comes_first() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    order.told_by_master(now, &topic("/t"), 1);
+    let until = now + MASTER_TAKES + REPEAT_AFTER;
+    mirror.apply(&publish("/b", "/t"));
+    let update = Arc::new(mirror.publisher_update("/t"));
+    order.notify_for_late(now, A, topic("/t"), update.clone());
+    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    assert_eq!(order.next_repeat(), Some(until));
+    order.repeat(until);
+    let (list, number) = sent(order.next(until, A, &mirror));
+    assert_eq!(list, update.params[2]);
+    order.taken(number);
+    // A master that has sent everything holds up nothing.
+    order.notify_for_late(until, A, topic("/t"), update.clone());
+    assert_eq!(sent(order.next(until, A, &mirror)).0, update.params[2]);
+}
+
+#[test]
 fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     let (mut order, now) = (Order::default(), Instant::now());
     let number = begin(&mut order, now, &subscribe("/a", "/t"));
