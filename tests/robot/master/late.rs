@@ -125,33 +125,36 @@ fn a_master_that_was_only_late_is_not_injected() {
 }
 
 /// A master that is stopped keeps the notifications that wait for a slow node. It sends them when it continues, so a
-/// newer value does not come before them.
+/// newer value does not come before them, whether the master itself sends it or rosrescue.
 #[test]
 fn a_node_hears_what_a_stopped_master_still_has_to_send_before_newer_values() {
-    let robot = Robot::start_with(Mode::Core, &NO_VERDICT);
-    let client = robot.client();
-    let watcher = FakeNode::start("/watcher");
-    watcher.watch_param(&client, "/watched");
-    watcher.hold();
-    client.set_param("/watched", 1);
-    eventually("the node has its first value", || {
-        told(&watcher) == [(1, false)]
-    });
-    client.set_param("/watched", 2);
-    let pid = robot.master_pid();
-    stop(pid);
-    // This write is under way in the master.
-    client.set_param("/other", 1);
-    // The master misses this write.
-    client.set_param("/watched", 3);
-    signal(pid, Signal::CONT);
-    robot.await_gate();
-    watcher.release();
-    eventually("the master sends the last value", || {
-        told(&watcher).contains(&(3, false))
-    });
-    let values = told(&watcher);
-    assert!(values.is_sorted_by_key(|(value, _)| *value), "{values:?}");
+    for under_way in ["/other", "/watched"] {
+        let robot = Robot::start_with(Mode::Core, &NO_VERDICT);
+        let client = robot.client();
+        let watcher = FakeNode::start("/watcher");
+        watcher.watch_param(&client, "/watched");
+        watcher.hold();
+        client.set_param("/watched", 1);
+        eventually("the node has its first value", || {
+            told(&watcher) == [(1, false)]
+        });
+        client.set_param("/watched", 2);
+        let pid = robot.master_pid();
+        stop(pid);
+        // This write is under way in the master. If it is of the same parameter, the state is injected.
+        client.set_param(under_way, 3);
+        // The master misses this write.
+        client.set_param("/watched", 4);
+        signal(pid, Signal::CONT);
+        robot.await_gate();
+        watcher.release();
+        eventually("the node has the last value", || {
+            let values = told(&watcher);
+            values.contains(&(2, false)) && values.last().is_some_and(|(value, _)| *value == 4)
+        });
+        let values = told(&watcher);
+        assert!(values.is_sorted_by_key(|(value, _)| *value), "{values:?}");
+    }
 }
 
 /// The master gets five percent of the processor time that it needs.
