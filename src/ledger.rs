@@ -520,6 +520,7 @@ impl Ledger {
         let mut inner = self.lock();
         inner.injecting = false;
         inner.unconfirmed = false;
+        inner.order.is_no_longer_late();
         let incarnation = inner.session.incarnation;
         inner.served = Some(incarnation);
         incarnation
@@ -541,6 +542,7 @@ impl Ledger {
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
+        inner.order.is_no_longer_late();
     }
 
     /// Notes that the present master can no longer be running a batch of an ended connection.
@@ -559,8 +561,9 @@ impl Ledger {
 
     /// Notes that the mirror has answered the calls that the present master is late with, and no later calls. `tells`
     /// are the topics, parameters and node names about which these calls may make the master notify nodes.
-    pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
+    pub(crate) fn fall_behind(&self, now: Instant, tells: Vec<Subject>) {
         let mut inner = self.lock();
+        inner.order.master_is_late(now);
         inner.behind = Some(LateState {
             state: inner.mirror.clone(),
             ran: inner.pending.calls().len(),
@@ -583,6 +586,7 @@ impl Ledger {
             return;
         };
         behind.answered = true;
+        order.late_answered(now);
         for subject in &behind.tells {
             let nodes = match subject {
                 Subject::Topic(topic) => mirror.subscribers_of(topic).len(),

@@ -261,9 +261,12 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
                 _ => {}
             },
             () = wait::until(owed_at) => {
-                (owed_at, owed_told) = (None, true);
-                nodes.ledger.with_order(|order, _| order.master_is_gone());
-                notify_owed(&nodes, Instant::now());
+                let now = Instant::now();
+                let again = nodes.ledger.with_order(|order, _| order.master_is_away(now));
+                (owed_at, owed_told) = (again.map(Into::into), again.is_none());
+                if owed_told {
+                    notify_owed(&nodes, now);
+                }
             }
             () = wait::until(next) => ask_unreachable(&nodes),
             () = wait::until(repeats.next().map(Into::into)) => {

@@ -95,7 +95,7 @@ impl Inner {
         outbox_changed: &Notify,
     ) -> Reply {
         let mut noticed = Noticed::new(standing_in.is_some());
-        noticed.late = self.behind.is_some();
+        noticed.late = self.order.is_late();
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
         self.activity.note_lost(&self.mirror, call);
         let reply = self.mirror.apply_telling(call, &mut noticed);
@@ -104,10 +104,7 @@ impl Inner {
             Some(calls) => {
                 for (api, subject, call) in calls {
                     let port = port_of(&api);
-                    match noticed.late {
-                        true => self.order.notify_for_late(now, port, subject, call),
-                        false => self.order.notify(port, subject, call),
-                    }
+                    self.order.notify(now, port, subject, call);
                     outbox_changed.notify_one();
                 }
             }

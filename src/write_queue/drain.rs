@@ -583,13 +583,13 @@ impl Drain {
                         self.queue.push_front(item);
                     }
                 }
-                ledger.fall_behind(tells);
+                ledger.fall_behind(Instant::now(), tells);
                 self.stats.calls_without_master.add(answers.count());
                 self.answer(answers.mark, None, answers.made);
             }
             // The master has answered the batch just now.
             None if !self.late_over => {
-                ledger.fall_behind(Vec::new());
+                ledger.fall_behind(Instant::now(), Vec::new());
                 self.late_done(Ok(()));
             }
             None => {}

@@ -77,6 +77,8 @@ enum Event {
     Revives,
     /// rosrescue sends the notifications that a master, which is still away, may not have sent.
     OwedInOutage,
+    /// The master with this number, which was late, has been examined and gets the mirror's state.
+    Examined(u64),
     /// rosrescue sends, after a recovery, the notifications that the dead master may not have sent.
     Owed,
     /// A deadline of the queue or of the notifications has passed.
@@ -116,6 +118,10 @@ struct World {
     batch: u64,
     /// Whether the mirror has answered the batch in flight.
     late: bool,
+    /// Whether a master that was late is being examined, so that no calls pass to it.
+    examined: bool,
+    /// Until when the master does nothing.
+    stopped: u64,
     /// The master. `None` while it is dead.
     master: Option<Master>,
     /// Number of the master.
@@ -164,6 +170,8 @@ impl World {
             in_flight: None,
             batch: 0,
             late: false,
+            examined: false,
+            stopped: 0,
             master: Some(Master::default()),
             life: 0,
             incarnation,
@@ -323,7 +331,11 @@ impl World {
         self.batch += 1;
         if self.dice.one_in(8) {
             // The master is stopped, or busy.
-            let time = self.dice.below(2 * PATIENCE);
+            let time = match self.dice.one_in(4) {
+                true => self.dice.below(10 * PATIENCE),
+                false => self.dice.below(2 * PATIENCE),
+            };
+            self.stopped = self.now + time;
             self.after(time, Event::RunsLate(self.life, calls));
             self.after(PATIENCE, Event::Late(self.batch));
             return;
@@ -381,7 +393,7 @@ impl World {
             tells.extend_from_slice(item.concern().tells());
             self.answer_item(item);
         }
-        self.ledger.fall_behind(tells);
+        self.ledger.fall_behind(self.instant(), tells);
     }
 
     /// The late master has answered, and gets the writes that it missed.
@@ -402,7 +414,12 @@ impl World {
             }
             // The master is examined and injected, and still sends the notifications that it had
             // begun.
-            None => return self.is_injected(),
+            None => {
+                self.examined = true;
+                self.after(OWED_AFTER, Event::OwedInOutage);
+                let time = self.dice.below(3 * PATIENCE);
+                return self.after(time, Event::Examined(self.life));
+            }
         }
         self.incarnation = self.ledger.serve();
     }
@@ -456,6 +473,7 @@ impl World {
 
     fn dies(&mut self) {
         self.master = None;
+        (self.examined, self.stopped) = (false, 0);
         self.notices.clear();
         if std::mem::take(&mut self.late) {
             self.ledger.abandon_batch();
@@ -592,6 +610,10 @@ impl World {
                     None => {}
                 }
             }
+            Event::MasterNotifies(of, port) if self.is_master(of) && self.now < self.stopped => {
+                let time = self.stopped - self.now + self.scheduled();
+                self.after(time, Event::MasterNotifies(of, port));
+            }
             Event::MasterNotifies(of, port) if self.is_master(of) => {
                 let call = self.notices[&port].front().unwrap().call();
                 let time = self.tell(&call, &port, 0);
@@ -614,14 +636,26 @@ impl World {
                 self.life += 1;
                 self.revives();
             }
-            Event::OwedInOutage if self.master.is_none() => {
-                self.ledger.with_order(|order, _| order.master_is_gone());
-                self.owed();
+            Event::Examined(of) if self.is_master(of) => {
+                self.examined = false;
+                self.is_injected();
+            }
+            Event::OwedInOutage if self.master.is_none() || self.examined => {
+                let now = self.instant();
+                let again = self.ledger.with_order(|order, _| order.master_is_away(now));
+                match again {
+                    Some(at) => {
+                        let wait = at.duration_since(now).as_micros();
+                        self.after(u64::try_from(wait).unwrap() + 1, Event::OwedInOutage);
+                    }
+                    None => self.owed(),
+                }
             }
             Event::Owed => self.owed(),
             Event::OwedInOutage
             | Event::Replied(..)
             | Event::RunsLate(..)
+            | Event::Examined(..)
             | Event::Late(..)
             | Event::MasterNotifies(..)
             | Event::TakenFromMaster(..)
@@ -629,7 +663,7 @@ impl World {
         }
         self.collect();
         match self.master {
-            Some(_) if !self.late => self.send(),
+            Some(_) if !self.late && !self.examined => self.send(),
             _ => self.stand_in(),
         }
         self.collect();

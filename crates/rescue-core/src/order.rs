@@ -71,6 +71,9 @@ pub struct Order {
     in_flight: InFlight,
     /// The topics, parameters and names about which the master has recently notified nodes.
     told: Told,
+    /// Whether the master was late and has neither got calls again nor gone since. Then it may still be sending
+    /// notifications while the mirror answers.
+    is_late: bool,
     repeats: Repeats,
     /// Whether a call or a notification waits until an answer or a notification has arrived, or until the master has
     /// answered its calls.
@@ -189,28 +192,57 @@ impl Order {
         self.told.pace = per_call.max(self.told.pace * 7 / 8);
     }
 
+    /// Notes that the master has not answered for a while, so the mirror answers. Until [`Self::late_answered`], the
+    /// master's notifications make no progress either.
+    pub fn master_is_late(&mut self, now: Instant) {
+        self.is_late = true;
+        self.told.stop(now);
+    }
+
+    /// Notes that the late master has answered its calls.
+    pub fn late_answered(&mut self, now: Instant) {
+        self.told.go_on(now);
+    }
+
+    /// Notes that calls pass to the master again, or that the late master may be gone.
+    pub fn is_no_longer_late(&mut self) {
+        (self.is_late, self.told.stopped) = (false, None);
+    }
+
+    /// Whether the master is late, or is still being examined since it was.
+    pub fn is_late(&self) -> bool {
+        self.is_late
+    }
+
+    /// Notes that the master has been away for a while, so it is taken for gone. Returns when to ask again if it was
+    /// only late and may still be sending notifications.
+    pub fn master_is_away(&mut self, now: Instant) -> Option<Instant> {
+        let until = self.told.last(now).filter(|_| self.is_late);
+        if until.is_none() {
+            self.master_is_gone();
+        }
+        until
+    }
+
     /// Notes that the master is gone and sends no more notifications.
     pub fn master_is_gone(&mut self) {
-        self.told = Told::default();
+        (self.told, self.is_late) = Default::default();
     }
 
     /// Queues `call`, which a master would send now, for the node at `port`. If a master that is gone may already have
     /// run a write about `subject`, it may have sent something newer than `call`. In that case, the node is told the
-    /// present state instead.
-    pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
+    /// present state instead. If the master is only late and may still have notifications about `subject` to send, they
+    /// come first: either the master then also sends the newer one, or the node is told the state.
+    pub fn notify(&mut self, now: Instant, port: &str, subject: Subject, call: Arc<Call>) {
+        let told = self.told.until(now, &subject).filter(|_| self.is_late);
+        if let Some(until) = told {
+            self.repeats.add(until, port.to_owned(), subject);
+            return;
+        }
         let is_news = !self.in_flight.tells.has(&subject);
         let content = is_news.then_some(Payload::Call(call));
         self.outbox
             .add(port, subject, content.unwrap_or(Payload::State));
-    }
-
-    /// Like [`Self::notify`], while the master is late. If it may still have notifications about `subject` to send, they
-    /// come first: either the master then also sends the newer one, or the node is told the state.
-    pub fn notify_for_late(&mut self, now: Instant, port: &str, subject: Subject, call: Arc<Call>) {
-        match self.told.until(now, &subject) {
-            Some(until) => self.repeats.add(until, port.to_owned(), subject),
-            None => self.notify(port, subject, call),
-        }
     }
 
     /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
@@ -345,9 +377,31 @@ struct Told {
     busy: Option<Instant>,
     /// How long the master recently took for a call.
     pace: Duration,
+    /// Since when the master does not answer, so its notifications make no progress.
+    stopped: Option<Instant>,
 }
 
 impl Told {
+    fn stop(&mut self, now: Instant) {
+        self.forget(now);
+        self.stopped.get_or_insert(now);
+    }
+
+    /// Gives the master the time that it has lost since [`Self::stop`].
+    fn go_on(&mut self, now: Instant) {
+        self.forget(now);
+        let Some(since) = self.stopped.take() else {
+            return;
+        };
+        let lost = now.duration_since(since).min(BACKLOG_MAX);
+        self.busy = self.busy.map(|busy| busy + lost);
+        for (subject, until) in std::mem::take(&mut self.ends).at {
+            self.until.remove(&subject, until);
+            self.until.add(&subject, until + lost);
+            self.ends.set(subject, until + lost);
+        }
+    }
+
     /// Notes that the master has begun to notify `nodes` nodes of `subject`. Returns when the master will certainly
     /// have sent all these notifications.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
@@ -366,10 +420,24 @@ impl Told {
 
     fn until(&mut self, now: Instant, subject: &Subject) -> Option<Instant> {
         self.forget(now);
-        self.until.about(subject).max()
+        let until = self.until.about(subject).max()?;
+        // How long the master stays stopped is not known.
+        let again = self.stopped.map(|_| now + REPEAT_AFTER);
+        Some(again.map_or(until, |again| again.max(until)))
+    }
+
+    /// When the master will certainly have sent all notifications.
+    fn last(&mut self, now: Instant) -> Option<Instant> {
+        self.forget(now);
+        self.ends.queue.last().map(|(until, _)| *until)
     }
 
     fn forget(&mut self, now: Instant) {
+        // While the master is stopped, its time stands still, but not for ever.
+        let now = self.stopped.map_or(now, |since| {
+            let earliest = now.checked_sub(BACKLOG_MAX);
+            earliest.map_or(since, |earliest| earliest.max(since))
+        });
         while let Some((until, subject)) = self.ends.take_due(now) {
             self.until.remove(&subject, until);
         }

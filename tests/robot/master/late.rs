@@ -124,7 +124,7 @@ fn a_master_that_was_only_late_is_not_injected() {
     }
 }
 
-/// A master that is stopped keeps the notifications that wait for a slow node. It sends them when it continues, so a
+/// A master that is stopped keeps the notifications that waited for a slow node. It sends them when it continues, so a
 /// newer value does not come before them, whether the master itself sends it or rosrescue.
 #[test]
 fn a_node_hears_what_a_stopped_master_still_has_to_send_before_newer_values() {
@@ -145,9 +145,14 @@ fn a_node_hears_what_a_stopped_master_still_has_to_send_before_newer_values() {
         client.set_param(under_way, 3);
         // The master misses this write.
         client.set_param("/watched", 4);
+        watcher.release();
+        let stopped = Instant::now();
+        while stopped.elapsed() < Duration::from_millis(600) {
+            assert_eq!(told(&watcher), [(1, false)], "the master is stopped");
+            thread::sleep(Duration::from_millis(10));
+        }
         signal(pid, Signal::CONT);
         robot.await_gate();
-        watcher.release();
         eventually("the node has the last value", || {
             let values = told(&watcher);
             values.contains(&(2, false)) && values.last().is_some_and(|(value, _)| *value == 4)

@@ -117,7 +117,7 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     mirror.apply(&subscribe("/a", "/t"));
     mirror.apply(&publish("/b", "/t"));
     let update = Arc::new(mirror.publisher_update("/t"));
-    order.notify(A, topic("/t"), update.clone());
+    order.notify(start, A, topic("/t"), update.clone());
     assert_eq!(order.take_idle_ports(), [A]);
     assert_eq!(
         order.next(start, A, &mirror),
@@ -163,7 +163,7 @@ fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
         mirror.apply(&publish(node, "/t"));
         let update = Arc::new(mirror.publisher_update("/t"));
         lists.push(update.params[2].clone());
-        order.notify(A, topic("/t"), update);
+        order.notify(now, A, topic("/t"), update);
     }
     // The notifications are sent one by one, as a master would send them.
     let (first, number) = sent(order.next(now, A, &mirror));
@@ -200,7 +200,7 @@ fn notifications_that_pile_up_are_reduced_to_one_per_subject() {
         );
         mirror.apply(&set);
         let update = Arc::new(mirror.param_update("/k/").unwrap());
-        order.notify(A, param("/k/"), update);
+        order.notify(now, A, param("/k/"), update);
     }
     let mut values = Vec::new();
     while let NextNotification::Send { call, number } = order.next(now, A, &mirror) {
@@ -216,7 +216,7 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
     let old = Arc::new(mirror.publisher_update("/t"));
-    order.notify(A, topic("/t"), old);
+    order.notify(now, A, topic("/t"), old);
     order.sent(&[topic("/t")], Vec::new());
     assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
     mirror.apply(&publish("/b", "/t"));
@@ -234,7 +234,8 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     // After the master's death, rosrescue's notification is sent at once. It is repeated, because the node may read the
     // master's notification later.
     order.told_by_master(later, &topic("/t"), 1);
-    order.notify(A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
+    let update = Arc::new(mirror.publisher_update("/t"));
+    order.notify(later, A, topic("/t"), update);
     let (_, number) = sent(order.next(later, A, &mirror));
     order.taken(number);
     assert_eq!(order.next_repeat(), Some(later + REPEAT_AFTER));
@@ -245,19 +246,58 @@ fn what_a_late_master_still_has_to_send_comes_first() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
     order.told_by_master(now, &topic("/t"), 1);
-    let until = now + MASTER_TAKES + REPEAT_AFTER;
+    let takes = MASTER_TAKES + REPEAT_AFTER;
+    order.master_is_late(now);
     mirror.apply(&publish("/b", "/t"));
     let update = Arc::new(mirror.publisher_update("/t"));
-    order.notify_for_late(now, A, topic("/t"), update.clone());
+    order.notify(now, A, topic("/t"), update.clone());
     assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    // The master's notifications make no progress before it answers.
+    let answered = now + 4 * takes;
+    order.repeat(answered);
+    assert_eq!(order.next(answered, A, &mirror), NextNotification::Idle);
+    order.late_answered(answered);
+    // It is examined. It is not gone before it must have sent them.
+    let until = answered + takes;
+    assert_eq!(order.master_is_away(answered), Some(until));
+    order.notify(answered, A, topic("/t"), update.clone());
     assert_eq!(order.next_repeat(), Some(until));
     order.repeat(until);
     let (list, number) = sent(order.next(until, A, &mirror));
     assert_eq!(list, update.params[2]);
     order.taken(number);
     // A master that has sent everything holds up nothing.
-    order.notify_for_late(until, A, topic("/t"), update.clone());
+    assert!(order.is_late());
+    order.notify(until, A, topic("/t"), update.clone());
     assert_eq!(sent(order.next(until, A, &mirror)).0, update.params[2]);
+    assert_eq!(order.master_is_away(until), None);
+    assert!(!order.is_late());
+}
+
+#[test]
+fn a_master_that_stays_late_is_not_waited_for_for_ever() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    order.told_by_master(now, &topic("/t"), 1);
+    order.master_is_late(now);
+    let update = Arc::new(mirror.publisher_update("/t"));
+    order.notify(now, A, topic("/t"), update.clone());
+    let mut at = now;
+    while let Some(next) = order.next_repeat() {
+        assert!(next > at && next < now + 2 * BACKLOG_MAX);
+        at = next;
+        order.repeat(at);
+        if let NextNotification::Send { call, number } = order.next(at, A, &mirror) {
+            assert_eq!(call, update);
+            order.taken(number);
+        }
+    }
+    assert!(at >= now + BACKLOG_MAX);
+    // A master that dies holds up nothing either.
+    order.told_by_master(at, &topic("/t"), 1);
+    order.master_is_gone();
+    order.notify(at, A, topic("/t"), update.clone());
+    assert_eq!(sent(order.next(at, A, &mirror)).0, update.params[2]);
 }
 
 #[test]
