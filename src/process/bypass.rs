@@ -20,7 +20,7 @@ use crate::{
     status::Board,
     upstream::{
         Upstream,
-        sockets::{self, Established},
+        sockets::{self, Socket},
     },
 };
 
@@ -129,13 +129,13 @@ impl MasterAddresses {
 pub(crate) struct Bypass {
     /// When each client's last connection was seen.
     seen: BTreeMap<Who, Instant>,
-    /// The owners of the sockets in the last read of the table.
+    /// The owners of the sockets at the last look.
     sockets: HashMap<u64, Who>,
 }
 
 impl Bypass {
-    /// Reads the table once, and returns the new clients. Blocks for a millisecond per some hundred sockets of this
-    /// computer, and longer if it has to search for the owner of a new socket.
+    /// Looks at the sockets of this computer once, and returns the new clients. Blocks for milliseconds if it has to search
+    /// for the owner of a new socket.
     pub(crate) fn look(&mut self, place: &MasterAddresses) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
@@ -198,17 +198,18 @@ impl Bypass {
 /// The clients of the master at `place`: inode and user of each socket on this computer, except those in `own`, and the
 /// addresses of other computers.
 fn split(
-    table: Vec<Established>,
+    table: Vec<Socket>,
     place: &MasterAddresses,
     own: &HashSet<u64>,
     is_own: impl Fn(IpAddr) -> bool,
 ) -> (HashMap<u64, u32>, HashSet<IpAddr>) {
     let (mut clients, mut hosts) = (HashMap::new(), HashSet::new());
-    for Established {
+    for Socket {
         local,
         remote,
         user,
         inode,
+        ..
     } in table
     {
         if remote.port() == place.port && place.is_at(remote) {
@@ -267,9 +268,10 @@ mod tests {
             addresses: vec!["127.0.0.1".parse().unwrap()],
             is_here: true,
         };
-        let line = |local: &str, remote: &str, inode| Established {
+        let line = |local: &str, remote: &str, inode| Socket {
             local: local.parse().unwrap(),
             remote: remote.parse().unwrap(),
+            state: 1,
             user: 7,
             inode,
         };

@@ -2,16 +2,14 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet},
-    fs::{self, File},
-    io::{BufRead, BufReader},
-    path::PathBuf,
+    fs,
 };
 
 use super::Stat;
-use crate::health::{Owner, Process};
-
-/// State of a listening socket in the kernel's tables.
-const LISTENING: &str = "0A";
+use crate::{
+    health::{Owner, Process},
+    upstream::sockets,
+};
 
 /// The program that listens at the port of a master that rosrescue started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,53 +72,32 @@ pub(crate) fn listens(pid: u32, port: u16) -> bool {
 
 /// The ports at which the process `pid` listens.
 pub(crate) fn ports(pid: u32) -> Vec<u16> {
-    let open: HashSet<_> = open_files(pid).collect();
-    let mut ports: Vec<_> = listening()
+    let open = open_sockets(pid);
+    let mut ports: Vec<_> = sockets::listening()
         .into_iter()
-        .filter(|(_, socket)| open.contains(socket))
-        .map(|(port, _)| port)
+        .filter(|(_, sockets)| sockets.iter().any(|socket| open.contains(socket)))
+        .map(|(address, _)| address.port())
         .collect();
     ports.sort_unstable();
     ports.dedup();
     ports
 }
 
-/// The listening sockets at `port`, named like the links in `/proc/PID/fd`.
-pub(super) fn sockets(port: u16) -> HashSet<PathBuf> {
-    let listening = listening().into_iter();
+/// The inodes of the listening sockets at `port`.
+pub(super) fn sockets(port: u16) -> HashSet<u64> {
+    let listening = sockets::listening().into_iter();
     listening
-        .filter_map(|(at, socket)| (at == port).then_some(socket))
+        .filter(|(address, _)| address.port() == port)
+        .flat_map(|(_, sockets)| sockets)
         .collect()
-}
-
-fn listening() -> Vec<(u16, PathBuf)> {
-    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
-    let sockets = tables.into_iter().flatten().flat_map(|table| {
-        // The kernel lists listening sockets first. Tens of thousands of others may follow, and
-        // each costs time.
-        let lines = BufReader::new(table).lines().skip(1);
-        lines.map_while(|line| socket(&line.ok()?))
-    });
-    sockets.collect()
-}
-
-/// Port and socket of a line of the table, if the socket listens.
-fn socket(line: &str) -> Option<(u16, PathBuf)> {
-    let columns: Vec<_> = line.split_whitespace().collect();
-    if *columns.get(3)? != LISTENING {
-        return None;
-    }
-    let (_, port) = columns.get(1)?.rsplit_once(':')?;
-    let inode = columns.get(9)?;
-    Some((
-        u16::from_str_radix(port, 16).ok()?,
-        format!("socket:[{inode}]").into(),
-    ))
 }
 
 /// The inodes of the process's open sockets. Empty for another user's process, unless this process runs as root.
 pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
-    let sockets = open_files(pid).filter_map(|file| {
+    let open = fs::read_dir(format!("/proc/{pid}/fd"));
+    let open = open.into_iter().flatten().flatten();
+    let sockets = open.filter_map(|entry| {
+        let file = fs::read_link(entry.path()).ok()?;
         let inode = file.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;
         inode.parse().ok()
     });
@@ -171,15 +148,9 @@ pub(crate) fn has_ended(process: Process) -> bool {
     }
 }
 
-fn open_files(pid: u32) -> impl Iterator<Item = PathBuf> {
-    let open = fs::read_dir(format!("/proc/{pid}/fd"));
-    let open = open.into_iter().flatten().flatten();
-    open.filter_map(|entry| fs::read_link(entry.path()).ok())
-}
-
 /// Whether the process `pid` has one of `sockets` open.
-pub(super) fn holds_one(pid: u32, sockets: &HashSet<PathBuf>) -> bool {
-    open_files(pid).any(|file| sockets.contains(&file))
+pub(super) fn holds_one(pid: u32, sockets: &HashSet<u64>) -> bool {
+    !open_sockets(pid).is_disjoint(sockets)
 }
 
 /// Waits until no process listens at `port`. A process that another test is starting holds a closed socket until it runs

@@ -552,7 +552,8 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, Exami
     })
 }
 
-/// Runs [`sockets::may_run_a_call`] in another thread, because with 15,000 sockets it takes 100 ms.
+/// Runs [`sockets::may_run_a_call`] in another thread: it takes 100 ms with 15,000 sockets, where a sandbox allows only
+/// the table in /proc.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = crate::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)

@@ -14,7 +14,7 @@ mod diag;
 
 use std::{
     collections::HashMap,
-    fs::{self, File},
+    fs::File,
     io::{BufRead, BufReader},
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
 };
@@ -27,35 +27,58 @@ const CLOSING: u8 = 0x0b;
 const LISTEN: u8 = 0x0a;
 const ESTABLISHED: u8 = 0x01;
 
-/// Whether the master at `master` may still be running a call of a connection that this side has closed.
-pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
-    ["tcp", "tcp6"].into_iter().any(|table| {
-        // Without the table nothing is known, and no call is assumed to run.
-        let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
-        is_in_table(&table, master)
-    })
+/// One end of a TCP connection, or a listening socket, in this network namespace. IPv4 addresses are not in their IPv6
+/// form.
+#[derive(Clone, Debug)]
+pub(crate) struct Socket {
+    pub(crate) local: SocketAddr,
+    pub(crate) remote: SocketAddr,
+    /// The state, as the kernel numbers it.
+    pub(crate) state: u8,
+    pub(crate) user: u32,
+    /// 0 if no process has the socket any more.
+    pub(crate) inode: u64,
 }
 
-/// The addresses at which processes in this network namespace listen, with the inodes of their sockets. IPv4 addresses
-/// are not in their IPv6 form. Blocks for some hundred microseconds.
+/// Whether the master at `master` may still be running a call of a connection that this side has closed.
+pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
+    // Without the table nothing is known, and no call is assumed to run.
+    let closing = in_states(&[FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, CLOSING]);
+    closing.iter().any(|socket| socket.may_run_a_call(master))
+}
+
+/// The addresses at which processes in this network namespace listen, with the inodes of their sockets. Blocks for some
+/// hundred microseconds.
 pub(crate) fn listening() -> HashMap<SocketAddr, Vec<u64>> {
     let mut all = HashMap::<_, Vec<u64>>::new();
-    // The table in /proc takes 25 ms, because the kernel looks through the connections as well.
-    for (address, inode) in diag::listening().unwrap_or_else(|_| listening_in_table()) {
-        all.entry(address).or_default().push(inode);
+    for socket in in_states(&[LISTEN]) {
+        all.entry(socket.local).or_default().push(socket.inode);
     }
     all
 }
 
-/// Like [`listening`], from the table in /proc.
-fn listening_in_table() -> Vec<(SocketAddr, u64)> {
+/// All ends of connections.
+pub(crate) fn established() -> Vec<Socket> {
+    in_states(&[ESTABLISHED])
+}
+
+fn in_states(states: &[u8]) -> Vec<Socket> {
+    diag::in_states(states).unwrap_or_else(|_| in_table(states))
+}
+
+/// Like [`in_states`], from the table in /proc, for which the kernel needs milliseconds per thousand sockets in any
+/// state.
+fn in_table(states: &[u8]) -> Vec<Socket> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
-        // The kernel lists listening sockets first. Tens of thousands of others may follow.
         let lines = BufReader::new(table).lines().skip(1);
-        lines.map_while(|line| listens_at(&line.ok()?))
+        let sockets = lines.map_while(|line| Socket::parse(&line.ok()?));
+        // The kernel lists listening sockets first.
+        sockets.take_while(|socket| states != [LISTEN] || socket.state == LISTEN)
     });
-    sockets.collect()
+    sockets
+        .filter(|socket| states.contains(&socket.state))
+        .collect()
 }
 
 /// The inodes of the sockets of `listening` that accept connections to `address`. A socket with a specific address takes
@@ -76,66 +99,27 @@ pub(crate) fn accepting(
         .collect()
 }
 
-/// One end of a connection in this network namespace.
-#[derive(Clone, Debug)]
-pub(crate) struct Established {
-    pub(crate) local: SocketAddr,
-    pub(crate) remote: SocketAddr,
-    pub(crate) user: u32,
-    /// Inode that identifies the socket.
-    pub(crate) inode: u64,
-}
-
-/// All ends of connections. IPv4 addresses are not in their IPv6 form. Blocks while the kernel generates the table.
-pub(crate) fn established() -> Vec<Established> {
-    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
-    let sockets = tables.into_iter().flatten().flat_map(|table| {
-        let lines = BufReader::new(table).lines().skip(1);
-        lines.map_while(Result::ok).filter_map(|line| end_in(&line))
-    });
-    sockets.collect()
-}
-
-/// Parses one line of the table as the end of a connection.
-fn end_in(line: &str) -> Option<Established> {
-    let mut columns = line.split_whitespace().skip(1);
-    let (local, remote, state) = (columns.next()?, columns.next()?, columns.next()?);
-    if u8::from_str_radix(state, 16).ok()? != ESTABLISHED {
-        return None;
-    }
-    Some(Established {
-        local: address(local)?,
-        remote: address(remote)?,
-        user: columns.nth(3)?.parse().ok()?,
-        inode: columns.nth(1)?.parse().ok()?,
-    })
-}
-
-/// Address and inode in one line of the table, if the socket listens.
-fn listens_at(line: &str) -> Option<(SocketAddr, u64)> {
-    let mut columns = line.split_whitespace().skip(1);
-    let (local, state) = (columns.next()?, columns.nth(1)?);
-    if u8::from_str_radix(state, 16).ok()? != LISTEN {
-        return None;
-    }
-    let inode = columns.nth(5)?.parse().ok()?;
-    Some((address(local)?, inode))
-}
-
-fn is_in_table(table: &str, master: SocketAddr) -> bool {
-    let master = SocketAddr::new(master.ip().to_canonical(), master.port());
-    let mut sockets = table.lines().skip(1).filter_map(|line| {
+impl Socket {
+    /// Parses a line of the table in /proc.
+    fn parse(line: &str) -> Option<Self> {
         let mut columns = line.split_whitespace().skip(1);
-        let (local, remote) = (columns.next()?, columns.next()?);
-        let state = u8::from_str_radix(columns.next()?, 16).ok()?;
-        Some((local, remote, state))
-    });
-    // Most sockets are in none of these states.
-    sockets.any(|(local, remote, state)| match state {
-        CLOSE_WAIT => address(local) == Some(master),
-        FIN_WAIT1 | FIN_WAIT2 | CLOSING => address(remote) == Some(master),
-        _ => false,
-    })
+        Some(Self {
+            local: address(columns.next()?)?,
+            remote: address(columns.next()?)?,
+            state: u8::from_str_radix(columns.next()?, 16).ok()?,
+            user: columns.nth(3)?.parse().ok()?,
+            inode: columns.nth(1)?.parse().ok()?,
+        })
+    }
+
+    fn may_run_a_call(&self, master: SocketAddr) -> bool {
+        let master = SocketAddr::new(master.ip().to_canonical(), master.port());
+        match self.state {
+            CLOSE_WAIT => self.local == master,
+            FIN_WAIT1 | FIN_WAIT2 | CLOSING => self.remote == master,
+            _ => false,
+        }
+    }
 }
 
 /// Parses an address of the table: 32-bit words in this computer's byte order, and the port.
@@ -196,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn both_ways_list_the_same_listening_sockets() {
+    fn both_ways_list_the_same_sockets() {
         let listeners = ["127.0.0.1:0", "0.0.0.0:0", "[::1]:0", "[::]:0"];
         let listeners: Vec<_> = listeners
             .map(TcpListener::bind)
@@ -207,26 +191,57 @@ mod tests {
             .iter()
             .map(|it| it.local_addr().unwrap())
             .collect();
-        let only_own = |mut all: Vec<(SocketAddr, u64)>| {
-            all.retain(|(address, _)| own.contains(address));
+        let mut clients: Vec<_> = own
+            .iter()
+            .map(|it| TcpStream::connect(it).unwrap())
+            .collect();
+        let only_own = |all: Vec<Socket>| {
+            let mut all: Vec<_> = all
+                .into_iter()
+                .map(|it| (it.local, it.remote, it.state, it.user, it.inode))
+                .filter(|(local, remote, ..)| {
+                    let ports = own.iter().map(SocketAddr::port);
+                    ports
+                        .into_iter()
+                        .any(|it| [local.port(), remote.port()].contains(&it))
+                })
+                .collect();
             all.sort_unstable();
             all
         };
-        let table = only_own(listening_in_table());
-        assert_eq!(table.len(), own.len());
-        assert_eq!(only_own(diag::listening().unwrap()), table);
+        let both = |states: &[u8], count: usize| {
+            let table = only_own(in_table(states));
+            assert_eq!(table.len(), count, "{states:?}: {table:?}");
+            assert_eq!(only_own(diag::in_states(states).unwrap()), table);
+        };
+        both(&[LISTEN], own.len());
+        both(&[ESTABLISHED], 2 * own.len());
+        clients.clear();
+        let closing = [FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, CLOSING];
+        eventually("the ends are closed", || {
+            only_own(in_table(&closing)).len() == 2 * own.len()
+        });
+        both(&closing, 2 * own.len());
+        both(&[LISTEN, CLOSE_WAIT], 2 * own.len());
     }
 
     #[test]
     fn addresses_of_both_families_are_read() {
-        let table = "  sl  local_address rem_address   st\n\
-             0: 0100007F:2C2F 0100007F:A001 08 00000000:00000000\n\
-             1: 0000000000000000FFFF00000200000A:A002 0000000000000000FFFF00000100000A:2C2F 05 0\n";
+        let rest = "00000000:00000000 00:00000000 00000000 7 0 9 1 0 100 0 0 10 0";
+        let may_run = |line: &str, master: &str| {
+            let socket = Socket::parse(&format!("{line} {rest}")).unwrap();
+            assert_eq!((socket.user, socket.inode), (7, 9));
+            socket.may_run_a_call(master.parse().unwrap())
+        };
+        let v4 = "0: 0100007F:2C2F 0100007F:A001 08";
+        let v6 =
+            "1: 0000000000000000FFFF00000200000A:A002 0000000000000000FFFF00000100000A:2C2F 05";
         if cfg!(target_endian = "little") {
-            assert!(is_in_table(table, "127.0.0.1:11311".parse().unwrap()));
-            assert!(is_in_table(table, "10.0.0.1:11311".parse().unwrap()));
-            assert!(!is_in_table(table, "10.0.0.2:11311".parse().unwrap()));
-            assert!(!is_in_table(table, "127.0.0.1:40961".parse().unwrap()));
+            assert!(may_run(v4, "127.0.0.1:11311"));
+            assert!(may_run(v6, "10.0.0.1:11311"));
+            assert!(may_run(v6, "[::ffff:10.0.0.1]:11311"));
+            assert!(!may_run(v6, "10.0.0.2:11311"));
+            assert!(!may_run(v4, "127.0.0.1:40961"));
         }
     }
 }

@@ -52,17 +52,20 @@ fn listening_ports(pid: u32) -> Vec<u16> {
     let files = files.into_iter().flatten().flatten();
     let files = files.filter_map(|file| std::fs::read_link(file.path()).ok());
     let open: Vec<_> = files.collect();
-    let table = std::fs::read_to_string(format!("/proc/{pid}/net/tcp")).unwrap_or_default();
-    let sockets = table.lines().filter_map(|line| {
+    let table = std::fs::File::open(format!("/proc/{pid}/net/tcp")).into_iter();
+    let lines = table.flat_map(|table| BufReader::new(table).lines().skip(1));
+    // Listening sockets come first. Tens of thousands of others may follow.
+    let sockets = lines.map_while(|line| {
+        let line = line.ok()?;
         let columns: Vec<_> = line.split_whitespace().collect();
         let [_, local, _, "0A", .., inode] = columns.get(..10)? else {
             return None;
         };
         let port = u16::from_str_radix(local.rsplit(':').next()?, 16).ok()?;
-        let socket = Path::new(&format!("socket:[{inode}]")).to_owned();
-        (port >= FIRST_OF_KERNEL && open.contains(&socket)).then_some(port)
+        Some((port, Path::new(&format!("socket:[{inode}]")).to_owned()))
     });
-    sockets.collect()
+    let own = sockets.filter(|(port, socket)| *port >= FIRST_OF_KERNEL && open.contains(socket));
+    own.map(|(port, _)| port).collect()
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,10 +1,12 @@
-//! Asks the kernel for its listening sockets (`sock_diag(7)`), which costs much less than the tables in /proc.
+//! Asks the kernel for its TCP sockets in some states (`sock_diag(7)`), which costs much less than the tables in /proc:
+//! those list every socket as text.
 
 use std::{
     io,
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
 };
 
+use super::Socket;
 use rustix::net::{
     AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, netlink, recv, send, socket_with,
 };
@@ -14,8 +16,6 @@ const BY_FAMILY: u16 = 20;
 const DONE: u16 = 3;
 const DUMP: u16 = 0x1 | 0x300;
 const TCP: u8 = 6;
-/// The state LISTEN, as a bit.
-const LISTEN: u32 = 1 << 10;
 const INET: u8 = 2;
 const INET6: u8 = 10;
 /// Length of the header of each message.
@@ -23,12 +23,12 @@ const HEADER: usize = 16;
 /// Length of the request, with its header.
 const REQUEST: u32 = 72;
 
-/// The listening TCP sockets of this network namespace, with their inodes. IPv4 addresses are not in their IPv6 form.
+/// The TCP sockets of this network namespace in these states.
 ///
 /// # Errors
 ///
 /// If the kernel or a sandbox does not offer this.
-pub(super) fn listening() -> io::Result<Vec<(SocketAddr, u64)>> {
+pub(super) fn in_states(states: &[u8]) -> io::Result<Vec<Socket>> {
     let socket = socket_with(
         AddressFamily::NETLINK,
         SocketType::DGRAM,
@@ -37,7 +37,7 @@ pub(super) fn listening() -> io::Result<Vec<(SocketAddr, u64)>> {
     )?;
     let mut all = Vec::new();
     for family in [INET, INET6] {
-        send(&socket, &request(family), SendFlags::empty())?;
+        send(&socket, &request(family, states), SendFlags::empty())?;
         let mut buffer = vec![0; 32_768];
         loop {
             let (_, length) = recv(&socket, &mut buffer[..], RecvFlags::empty())?;
@@ -49,7 +49,8 @@ pub(super) fn listening() -> io::Result<Vec<(SocketAddr, u64)>> {
     Ok(all)
 }
 
-fn request(family: u8) -> Vec<u8> {
+fn request(family: u8, states: &[u8]) -> Vec<u8> {
+    let bits: u32 = states.iter().map(|state| 1 << state).sum();
     let mut request = Vec::new();
     request.extend(REQUEST.to_ne_bytes());
     request.extend(BY_FAMILY.to_ne_bytes());
@@ -57,14 +58,14 @@ fn request(family: u8) -> Vec<u8> {
     // The sequence number and the sender.
     request.extend([0; 8]);
     request.extend([family, TCP, 0, 0]);
-    request.extend(LISTEN.to_ne_bytes());
+    request.extend(bits.to_ne_bytes());
     // Any address.
     request.resize(REQUEST as usize, 0);
     request
 }
 
 /// Reads the sockets in `messages`. Returns whether they are the last ones.
-fn read(mut messages: &[u8], all: &mut Vec<(SocketAddr, u64)>) -> io::Result<bool> {
+fn read(mut messages: &[u8], all: &mut Vec<Socket>) -> io::Result<bool> {
     while let Some((length, _)) = messages.split_first_chunk::<4>() {
         let length = u32::from_ne_bytes(*length) as usize;
         let body = messages.get(HEADER..length).unwrap_or_default();
@@ -81,20 +82,23 @@ fn read(mut messages: &[u8], all: &mut Vec<(SocketAddr, u64)>) -> io::Result<boo
     Ok(false)
 }
 
-/// Address and inode of a socket (`struct inet_diag_msg`).
-fn socket(body: &[u8]) -> Option<(SocketAddr, u64)> {
-    let port = u16::from_be_bytes(body.get(4..6)?.try_into().ok()?);
-    let address = body.get(8..24)?;
-    let address: IpAddr = match *body.first()? {
-        INET => {
-            let bytes: [u8; 4] = address.get(..4)?.try_into().ok()?;
-            Ipv4Addr::from(bytes).into()
-        }
-        _ => {
-            let bytes: [u8; 16] = address.try_into().ok()?;
-            Ipv6Addr::from(bytes).to_canonical()
-        }
+/// Reads a socket (`struct inet_diag_msg`).
+fn socket(body: &[u8]) -> Option<Socket> {
+    let number = |at: usize| Some(u32::from_ne_bytes(body.get(at..at + 4)?.try_into().ok()?));
+    let address = |ip: usize, port: usize| {
+        let port = u16::from_be_bytes(body.get(port..port + 2)?.try_into().ok()?);
+        let ip: [u8; 16] = body.get(ip..ip + 16)?.try_into().ok()?;
+        let ip: IpAddr = match (*body.first()?, ip) {
+            (INET, [a, b, c, d, ..]) => Ipv4Addr::new(a, b, c, d).into(),
+            _ => Ipv6Addr::from(ip).to_canonical(),
+        };
+        Some(SocketAddr::new(ip, port))
     };
-    let inode = u32::from_ne_bytes(body.get(68..72)?.try_into().ok()?);
-    Some((SocketAddr::new(address, port), inode.into()))
+    Some(Socket {
+        local: address(8, 4)?,
+        remote: address(24, 6)?,
+        state: *body.get(1)?,
+        user: number(64)?,
+        inode: number(68)?.into(),
+    })
 }
