@@ -1,10 +1,10 @@
-//! Finds out from the kernel's table of TCP sockets whether the master may still be running a call of a closed
-//! connection.
+//! The TCP sockets of this network namespace: who listens, who is connected, and whether the master may still be running
+//! a call of a closed connection.
 //!
 //! A rosmaster runs each connection in a thread of its own, and closes its end only after it has run what has arrived.
 //! rosrescue, or the death of an earlier rosrescue, may have closed a connection whose call still runs. Then the
 //! master's end is in the state CLOSE_WAIT, even if the master has not accepted the connection. Only a master on this
-//! computer has its end in this table. rosrescue's end, which belongs to no process any more, is in FIN_WAIT1 or
+//! computer has its end among these sockets. rosrescue's end, which belongs to no process any more, is in FIN_WAIT1 or
 //! FIN_WAIT2.
 //!
 //! Linux drops rosrescue's end a minute after the master's side has acknowledged the close. So a call in a master on
@@ -42,7 +42,7 @@ pub(crate) struct Socket {
 
 /// Whether the master at `master` may still be running a call of a connection that this side has closed.
 pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
-    // Without the table nothing is known, and no call is assumed to run.
+    // If nothing can be known, no call is assumed to run.
     let closing = in_states(&[FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, CLOSING]);
     closing.iter().any(|socket| socket.may_run_a_call(master))
 }
