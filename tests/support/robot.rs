@@ -111,8 +111,10 @@ impl Robot {
             scratch,
         };
         if mode == Mode::Core && !options.contains(&"--no-rosout") {
+            // The subscription is the last thing that rosout registers.
+            let is_ready = |state: State| !state.subscribers_of("/rosout").is_empty();
             eventually("rosout is running", || {
-                State::try_read(&robot.bare()).is_ok_and(|state| state.knows("/rosout"))
+                State::try_read(&robot.bare()).is_ok_and(is_ready)
             });
         }
         robot
