@@ -7,7 +7,6 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use rustix::process::Signal;
 
-use super::patience::eventually;
 use super::process::signal;
 use super::rescue::{Rescue, Setup};
 use super::rpc::Client;
@@ -112,10 +111,7 @@ impl Failing {
     /// The state of the real master, once the parameters of roscore are set.
     #[track_caller]
     pub(crate) fn state(&self) -> State {
-        eventually("the parameters of core are set", || {
-            let keys = ["/rosversion", "/rosdistro", "/run_id"];
-            keys.iter().all(|key| self.client().param(key).is_some())
-        });
+        self.client().await_roscore_params();
         State::read(&self.bare())
     }
 

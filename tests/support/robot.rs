@@ -110,6 +110,9 @@ impl Robot {
             away: None,
             scratch,
         };
+        if mode == Mode::Core {
+            robot.bare().await_roscore_params();
+        }
         if mode == Mode::Core && !options.contains(&"--no-rosout") {
             // The subscription is the last thing that rosout registers.
             let is_ready = |state: State| !state.subscribers_of("/rosout").is_empty();

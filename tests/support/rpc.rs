@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use rosrescue::xmlrpc::{self, Call, Reply, Value};
 
+use super::patience::eventually;
+
 /// How long a client waits for an answer: longer than rosrescue may hold any call.
 const ANSWER: Duration = Duration::from_secs(60);
 
@@ -153,6 +155,15 @@ impl Client {
     /// The value of a parameter, if it is set.
     pub(crate) fn param(&self, key: &str) -> Option<Value> {
         self.ask("getParam", vec!["/test".into(), key.into()])
+    }
+
+    /// Waits until `core` has set the parameters that a roscore sets. `rosversion` takes a while on a busy computer.
+    #[track_caller]
+    pub(crate) fn await_roscore_params(&self) {
+        eventually("roscore's parameters are set", || {
+            let keys = ["/rosversion", "/rosdistro", "/run_id"];
+            keys.iter().all(|key| self.param(key).is_some())
+        });
     }
 }
 

@@ -23,6 +23,9 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert!(robot.rescue.terminate().success());
     robot.rescue.start_again();
     robot.rescue.wait_serving();
+    if mode == Mode::Core {
+        client.await_roscore_params();
+    }
     let watcher = FakeNode::start("/watcher");
     watcher.watch_param(&client, "/gains");
     client.set_param("/gains", tree! { "p" => 3.0, "d" => 1 });

@@ -65,9 +65,7 @@ fn sockets(pid: u32) -> BTreeSet<PathBuf> {
 fn core(scratch: &Scratch) -> Rescue {
     let rescue = Setup::core(scratch, free_port()).guarded().start();
     let client = rescue.client();
-    eventually("roscore's parameters are set", || {
-        client.param("/rosdistro").is_some() && client.param("/rosversion").is_some()
-    });
+    client.await_roscore_params();
     // rosout subscribes as its last step, and makes no further calls to the master.
     eventually("rosout is running", || {
         State::try_read(&client).is_ok_and(|state| !state.subscribers_of("/rosout").is_empty())
