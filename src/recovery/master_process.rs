@@ -6,7 +6,7 @@ use tokio::sync::mpsc;
 use crate::{
     ledger::Ledger,
     limit::{Pair, alarm, all_clear, rarely},
-    process::{self, Orphan, ProcessError, Rosmaster},
+    process::{self, Orphan, ProcessError, Rosmaster, Stat},
     ros_env::MasterUri,
     upstream::Upstream,
 };
@@ -181,7 +181,9 @@ impl MasterProcess {
         // A child's process id is not reused before its end is reported. For an adopted master this also holds, except
         // for a moment between its end and the report.
         if let Some(pid) = self.current {
-            if self.port.is_some() {
+            // A master that is ending does not answer either, but did not end because of rosrescue.
+            let runs = Stat::of(pid).is_some_and(Stat::is_alive);
+            if runs && self.port.is_some() {
                 alarm!(
                     warn,
                     ENDED,
@@ -190,7 +192,7 @@ impl MasterProcess {
                 );
             }
             process::unsent::kill(pid);
-            self.killed = true;
+            self.killed |= runs;
         }
     }
 
@@ -229,6 +231,40 @@ async fn gone(ends: &mut mpsc::Receiver<End>, current: Option<u32>) -> String {
             Some(_) => {}
             // Does not happen, because the caller holds a sender.
             None => std::future::pending().await,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{path::Path, process::Command, time::Duration};
+
+    use super::*;
+    use crate::config::SupervisedConfig;
+
+    #[test]
+    fn a_master_that_was_ending_already_is_not_called_killed() {
+        let config = SupervisedConfig {
+            port: None,
+            rosmaster: Some("/bin/sleep".into()),
+            numworkers: 3,
+            timeout: 0.0,
+            rosout: true,
+        };
+        let rosmaster = Rosmaster::find(&config, Path::new("checkpoint.yaml")).unwrap();
+        let mut master = MasterProcess::new(rosmaster, Some(1), None);
+        for (has_ended, killed) in [(true, false), (false, true)] {
+            let mut child = Command::new("sleep").arg("60").spawn().unwrap();
+            if has_ended {
+                child.kill().unwrap();
+                while Stat::of(child.id()).is_some_and(Stat::is_alive) {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+            }
+            master.current = Some(child.id());
+            master.kill();
+            assert_eq!(master.killed, killed, "{has_ended}");
+            child.wait().unwrap();
         }
     }
 }
