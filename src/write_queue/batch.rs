@@ -101,6 +101,12 @@ impl Item {
         (item, answered)
     }
 
+    /// Whether the mirror can answer the call.
+    pub(super) fn is_answerable(&self) -> bool {
+        let call = self.call.as_deref();
+        call.is_some_and(Request::is_answerable)
+    }
+
     pub(super) fn concern(&self) -> &Concern {
         &self.concern
     }

@@ -87,8 +87,9 @@ pub(crate) struct Drain {
     retry_at: Option<tokio::time::Instant>,
     /// Latest time to retry calls that wait until other calls are answered.
     pub(super) held_until: Option<tokio::time::Instant>,
-    /// Successful calls that rosrescue does not understand. Their answers wait until the mirror has
-    /// been read from the master again and includes their effects.
+    /// Calls with an effect that the answer does not show: rosrescue does not understand the call or the answer, or the
+    /// answer is a fault. Their answers wait until the mirror has been read from the master again and includes their
+    /// effects.
     opaque: Opaque,
 }
 
@@ -276,11 +277,10 @@ impl Drain {
         });
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
-        let answerable = |item: &Item| item.call.as_ref().is_some_and(|call| call.is_answerable());
         self.in_flight = Some(InFlight {
             incarnation,
             version: self.link.ledger.version(),
-            answerable: items.iter().all(answerable),
+            answerable: items.iter().all(Item::is_answerable),
             told_late: false,
             late: false,
             items,
@@ -493,6 +493,8 @@ impl Drain {
         if registered {
             self.link.judge.registered();
         }
+        // A multicall that is answered with a fault may have changed something before.
+        opaque |= recorded.doubtful && matches!(replies.as_slice(), [Reply::Fault { .. }]);
         if opaque {
             self.link.ledger.doubt();
             // Answers may be waiting already: after a failed read of the state, calls are sent before the next read.
@@ -557,6 +559,10 @@ impl Drain {
             );
             self.take_back(batch.items);
         }
+        let answerable = |(item, _): &mut (Item, CallAnswer)| item.is_answerable();
+        let opaque = self.opaque.answers.extract_if(.., answerable);
+        let opaque = opaque.map(|(item, _)| item).collect();
+        self.take_back(opaque);
         self.answer_queue();
         self.link.ledger.release(Order::settled);
     }

@@ -1,7 +1,9 @@
-//! The real queue, with a master that runs a call and dies before it answers.
+//! The real queue, with a master that runs a call and dies.
 
 use bytes::Bytes;
-use tokio::io::AsyncReadExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::oneshot;
 
 use super::*;
 use crate::{
@@ -11,9 +13,10 @@ use crate::{
     health::port_of,
     lifecycle::Patience,
     order::{NextNotification as Notification, REPEAT_AFTER, Subject},
+    upstream::sentinel::Sentinel,
     upstream::{Head, test_master, verify::Verification},
-    write_queue::write_queue,
-    xmlrpc::Value,
+    write_queue::{WriteQueue, batch::AnswerAndDelivery, write_queue},
+    xmlrpc::{Value, encode_reply},
 };
 
 const SUBSCRIBER: &str = "http://a:1/";
@@ -31,6 +34,57 @@ fn told(ledger: &Ledger) -> Option<Value> {
     }
 }
 
+/// The queue of a master to which calls pass. This test is the master.
+struct Served {
+    ledger: Arc<Ledger>,
+    queue: WriteQueue,
+    gate: gate::Tx,
+    listener: TcpListener,
+    _sentinel: (TcpStream, Arc<Sentinel>),
+}
+
+impl Served {
+    async fn new(mirror: Master) -> Self {
+        let stats = Box::leak(Box::default());
+        let (session, sync) = (Session::default(), SyncPolicy::Interval);
+        let ledger = Ledger::new(mirror, session, Vec::new(), None, sync, stats);
+        let ledger = Arc::new(ledger);
+        ledger.succeed();
+        let incarnation = ledger.serve();
+
+        let (listener, accepted, upstream, sentinel) = test_master().await;
+        upstream.set_verification(Some(Verification::Sentinel(sentinel.clone())));
+        let (gate, gate_rx) = gate();
+        gate.set(State::Open { incarnation });
+        let patience = Patience::new(Duration::from_secs(60));
+        let judge = Arc::new(());
+        let (queue, drain) = write_queue(
+            ledger.clone(),
+            upstream,
+            gate_rx,
+            stats,
+            None,
+            judge,
+            patience,
+        );
+        tokio::spawn(drain.run());
+        Self {
+            ledger,
+            queue,
+            gate,
+            listener,
+            _sentinel: (accepted, sentinel),
+        }
+    }
+
+    async fn submit(&self, call: Request) -> oneshot::Receiver<AnswerAndDelivery> {
+        let raw = Some((Head::default(), Bytes::from_static(b"<methodCall/>")));
+        let (item, answered) = Item::new(raw, Some(Arc::new(call)));
+        self.queue.submit(item).await;
+        answered
+    }
+}
+
 /// The master may have notified nodes of what a lost call changed. If rosrescue sent the state before that call, the
 /// nodes would get an older list after a newer one.
 #[tokio::test]
@@ -42,44 +96,53 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     ] {
         mirror.apply(&Request::new(method, [node, "/t", "x/Y", api]));
     }
-    let stats = Box::leak(Box::default());
-    let (session, sync) = (Session::default(), SyncPolicy::Interval);
-    let ledger = Ledger::new(mirror, session, Vec::new(), None, sync, stats);
-    let ledger = Arc::new(ledger);
-    ledger.succeed();
-    let incarnation = ledger.serve();
-
-    let (listener, _sentinel, upstream, sentinel) = test_master().await;
-    upstream.set_verification(Some(Verification::Sentinel(sentinel)));
-    let (gate_tx, gate) = gate();
-    gate_tx.set(State::Open { incarnation });
-    let patience = Patience::new(Duration::from_secs(60));
-    let (queue, drain) = write_queue(
-        ledger.clone(),
-        upstream,
-        gate,
-        stats,
-        None,
-        Arc::new(()),
-        patience,
-    );
-    tokio::spawn(drain.run());
-
+    let served = Served::new(mirror).await;
     let call = Request::new(Method::UnregisterPublisher, ["/b", "/t", PUBLISHER]);
-    let raw = Some((Head::default(), Bytes::from_static(b"<methodCall/>")));
-    let (item, answered) = Item::new(raw, Some(Arc::new(call)));
-    queue.submit(item).await;
+    let answered = served.submit(call).await;
     // The master runs the call and dies before it has answered.
-    let (mut connection, _) = listener.accept().await.unwrap();
+    let (mut connection, _) = served.listener.accept().await.unwrap();
     connection.read_u8().await.unwrap();
     drop(connection);
-    queue.lost().await;
+    served.queue.lost().await;
 
+    let ledger = &served.ledger;
     let topic = Subject::Topic("/t".to_owned());
     ledger.with_order(|order, _| order.tell_state(port_of(SUBSCRIBER), topic));
-    assert_eq!(told(&ledger), None);
-    gate_tx.set(State::StandingIn);
+    assert_eq!(told(ledger), None);
+    served.gate.set(State::StandingIn);
     answered.await.unwrap();
     ledger.with_order(|order, _| order.repeat(Instant::now() + REPEAT_AFTER));
-    assert_eq!(told(&ledger), Some(Value::Array(Vec::new())));
+    assert_eq!(told(ledger), Some(Value::Array(Vec::new())));
+}
+
+/// A multicall that reads what the master cannot return, and changes something else, runs and is answered with a fault.
+/// After that answer nobody, on this or another computer, may read the state before.
+#[tokio::test]
+async fn a_fault_is_answered_when_what_ran_is_known_or_the_master_is_gone() {
+    let served = Served::new(Master::default()).await;
+    let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), 1.into()]);
+    let mut answered = served.submit(Request::multicall([set])).await;
+    let (mut connection, _) = served.listener.accept().await.unwrap();
+    let mut request = Vec::new();
+    while !request.ends_with(b"<methodCall/>") {
+        request.push(connection.read_u8().await.unwrap());
+    }
+    let fault = encode_reply(&Reply::Fault {
+        code: 1,
+        text: "cannot marshal".to_owned(),
+    });
+    let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n", fault.len());
+    connection.write_all(head.as_bytes()).await.unwrap();
+    connection.write_all(&fault).await.unwrap();
+    // The state is being read.
+    connection.read_u8().await.unwrap();
+    answered.try_recv().unwrap_err();
+
+    drop(connection);
+    served.gate.set(State::StandingIn);
+    let (answer, _) = answered.await.unwrap();
+    let CallAnswer::Made(Reply::Value(Value::Array(results))) = answer else {
+        panic!("{answer:?}");
+    };
+    assert_eq!(results.len(), 1);
 }
