@@ -72,7 +72,9 @@ fn in_table(states: &[u8]) -> Vec<Socket> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
         let lines = BufReader::new(table).lines().skip(1);
-        let sockets = lines.map_while(|line| Socket::parse(&line.ok()?));
+        let sockets = lines
+            .map_while(Result::ok)
+            .filter_map(|line| Socket::parse(&line));
         // The kernel lists listening sockets first.
         sockets.take_while(|socket| states != [LISTEN] || socket.state == LISTEN)
     });
