@@ -520,7 +520,7 @@ impl Ledger {
         let mut inner = self.lock();
         inner.injecting = false;
         inner.unconfirmed = false;
-        inner.order.is_no_longer_late();
+        inner.order.lateness_is_over();
         let incarnation = inner.session.incarnation;
         inner.served = Some(incarnation);
         incarnation
@@ -542,7 +542,7 @@ impl Ledger {
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
-        inner.order.is_no_longer_late();
+        inner.order.lateness_is_over();
     }
 
     /// Notes that the present master can no longer be running a batch of an ended connection.

@@ -205,7 +205,7 @@ impl Order {
     }
 
     /// Notes that calls pass to the master again, or that the late master may be gone.
-    pub fn is_no_longer_late(&mut self) {
+    pub fn lateness_is_over(&mut self) {
         (self.is_late, self.told.stopped) = (false, None);
     }
 
