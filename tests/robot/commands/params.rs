@@ -19,11 +19,13 @@ fn rosparam_loads_what_params_prints() {
     client.set_param("/secret", "geheim");
     let run = |arguments: &[&str]| Tool::rosrescue(&robot.scratch, robot.port(), arguments);
     let printed = run(&["params", "present"]);
-    for name in ["/kinds/no time", "/kinds/", "/kinds/with/slash", "/run_id"] {
+    let of_kinds = ["/kinds/no time", "/kinds/", "/kinds/with/slash"];
+    let of_the_session = ["/run_id", "/rosdistro", "/rosversion"];
+    for name in of_kinds.into_iter().chain(of_the_session) {
         let said = format!("rosrescue: left out {name}: ");
         assert!(printed.stderr.contains(&said), "{said}\n{}", printed.stderr);
     }
-    assert_eq!(printed.stderr.lines().count(), 4, "{}", printed.stderr);
+    assert_eq!(printed.stderr.lines().count(), 6, "{}", printed.stderr);
     let yaml = robot.scratch.path("params.yaml");
     fs::write(&yaml, printed.ended(0)).unwrap();
 
@@ -34,7 +36,13 @@ fn rosparam_loads_what_params_prints() {
     let Some(Value::Struct(mut expected)) = client.param("/") else {
         panic!("no parameters");
     };
-    expected.shift_remove("run_id");
+    for name in of_the_session {
+        assert!(
+            expected
+                .shift_remove(name.trim_start_matches('/'))
+                .is_some()
+        );
+    }
     let Some(Value::Struct(kinds)) = expected.get_mut("kinds") else {
         panic!("no kinds");
     };

@@ -6,8 +6,9 @@ use crate::{
 };
 
 /// Parameters that belong to the present session, so their values in a checkpoint are not used. roslaunch compares
-/// `/run_id` with its own, and stores its addresses below `/roslaunch`.
-pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
+/// `/run_id` with its own, and stores its addresses below `/roslaunch`. A roscore sets `/rosdistro` and `/rosversion` when
+/// it starts.
+pub const OF_THE_SESSION: [&str; 4] = ["/run_id", "/roslaunch", "/rosdistro", "/rosversion"];
 
 /// A parameter of the checkpoint that is left out, and the reason.
 pub type LeftOut = (String, String);
@@ -136,6 +137,7 @@ mod tests {
             ("was_value", 7.into()),
             ("run_id", "new".into()),
             ("roslaunch", space(&[("uris", 1.into())])),
+            ("rosdistro", "noetic".into()),
             ("other", 1.into()),
             ("emptied", space(&[("x", 1.into())])),
         ]);
