@@ -74,6 +74,8 @@ pub struct Evidence {
     stopped: Option<Sample>,
     /// Whether in any judged sample a thread needs the processor.
     runnable: bool,
+    /// Whether in any judged sample no thread needs the processor.
+    rested: bool,
     /// Whether any judged sample shows a thread that waits for a disk.
     on_disk: bool,
     /// Whether in any judged sample all threads were stopped.
@@ -88,6 +90,7 @@ impl Evidence {
         self.first.get_or_insert(sample);
         let Some(effort) = sample.master else { return };
         self.runnable |= effort.runnable;
+        self.rested |= !effort.runnable;
         self.on_disk |= effort.on_disk;
         self.was_stopped |= effort.stopped;
         let same = |before: Effort| before.stopped && before.ran == effort.ran;
@@ -119,7 +122,8 @@ impl Evidence {
         {
             self.first = Some(last);
             let effort = last.master.unwrap_or_default();
-            (self.runnable, self.on_disk) = (effort.runnable, effort.on_disk);
+            (self.runnable, self.rested) = (effort.runnable, !effort.runnable);
+            self.on_disk = effort.on_disk;
             self.was_stopped = effort.stopped;
         }
         verdict
@@ -157,7 +161,9 @@ impl Evidence {
         let waited = now.waited.saturating_sub(before.waited);
         let turns = now.turns.saturating_sub(before.turns);
         let each = waited / u32::try_from(turns).unwrap_or(u32::MAX).max(1);
-        if self.runnable && turns < TURNS_LEAST || each > STARVED_WAIT {
+        let too_few = self.runnable && turns < TURNS_LEAST;
+        // The kernel does not show a wait that has not ended, and many short waits are a long one together.
+        if too_few || !self.rested || each > STARVED_WAIT {
             return SilenceVerdict::Unproved("it gets too little CPU time");
         }
         if self.on_disk {
@@ -244,6 +250,9 @@ mod tests {
             let found = verdict(|at, effort, _| effort.runnable = at == moment);
             assert_eq!(found, SilenceVerdict::Hung);
         }
+        // A master that needs the processor all the time is not idle, however short each wait is.
+        let found = verdict(|_, effort, _| effort.runnable = true);
+        is_unproved(found, "too little CPU time");
         let found = verdict(|at, effort, _| {
             effort.turns /= 10;
             effort.waited += ms(at) / 5;
