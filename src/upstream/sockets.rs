@@ -220,8 +220,8 @@ mod tests {
         both(&[ESTABLISHED], 2 * own.len());
         clients.clear();
         let closing = [FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, CLOSING];
-        eventually("the ends are closed", || {
-            only_own(in_table(&closing)).len() == 2 * own.len()
+        eventually("the ends are closed, and the other ends know", || {
+            only_own(in_table(&[FIN_WAIT2, CLOSE_WAIT])).len() == 2 * own.len()
         });
         both(&closing, 2 * own.len());
         both(&[LISTEN, CLOSE_WAIT], 2 * own.len());
