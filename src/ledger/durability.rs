@@ -90,10 +90,11 @@ impl Ledger {
         }
     }
 
-    /// Writes the queued records to the checkpoint. Other tasks continue meanwhile, however long the disk takes.
+    /// Writes the queued records to the checkpoint in a task of its own, which waits for the disk however long it
+    /// takes.
     fn write(&self) {
         if let Some(worker) = self.worker() {
-            block_in_place(|| worker.work());
+            crate::task::spawn(async move { block_in_place(|| worker.work()) });
         }
     }
 

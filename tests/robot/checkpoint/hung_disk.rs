@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, FailingDisk, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, Trouble, eventually,
-    free_port, holds, signal, status,
+    free_port, holds, params, signal, status,
 };
 use rustix::process::Signal;
 
@@ -105,6 +105,25 @@ fn on_a_hung_disk_reads_continue_and_writes_wait_for_a_limited_time() {
     client.set_param("/after", 1);
     let wanted = State::read(&client);
     assert_survives(&mut rescue, &wanted);
+}
+
+/// The write that finds the disk silent is not answered by the mirror as one that changes nothing.
+#[test]
+fn a_deletion_waits_for_a_hung_disk_for_a_limited_time() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
+    let rescue = disk.under(setup).start();
+    let client = rescue.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/x", 1);
+    disk.begin(Trouble::Hangs);
+    within(LATE, "a deletion", || {
+        client.ok("deleteParam", params!["/node", "/x"])
+    });
+    node.unpublish(&client, "/topic");
+    disk.heal();
 }
 
 /// The disk hangs again before the whole checkpoint that follows the first hang has been written.
