@@ -80,10 +80,7 @@ impl Ledger {
         let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
         // The master refuses calls with its own messages.
         let refused = match &reply {
-            Reply::Value(value) => {
-                let code = value.as_array().and_then(<[Value]>::first);
-                code.and_then(Value::as_int).is_some_and(|code| code != 1)
-            }
+            Reply::Value(value) => is_refusal(value),
             Reply::Fault { .. } => true,
         };
         let mark = inner.mark();
@@ -238,4 +235,14 @@ fn is_unregistration(call: &Request) -> bool {
 /// Whether a call, which is no multicall, sets a parameter.
 fn sets_parameter(call: &Request) -> bool {
     *call.method() == Method::SetParam
+}
+
+/// Whether the master refuses a call, or any call of a multicall, with this answer.
+fn is_refusal(answer: &Value) -> bool {
+    match answer.as_array() {
+        Some([Value::Int(code), ..]) => *code != 1,
+        Some(results) => results.iter().any(is_refusal),
+        // The fault of a call of a multicall.
+        None => true,
+    }
 }

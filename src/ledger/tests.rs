@@ -208,6 +208,17 @@ fn an_unregistration_without_effect_is_left_to_the_master() {
         assert!(ledger.answer_if_unchanged(now, &calls).is_none());
     }
     assert!(ledger.answer_if_unchanged(now, &bye).is_none());
+    // A deletion that the mirror has already looks like a refusal, also within a multicall.
+    let delete = call("deleteParam", &["/n", "/unset"]);
+    for calls in [vec![delete.clone()], vec![watch.clone(), delete.clone()]] {
+        let calls = Request::multicall(calls);
+        assert!(ledger.answer_if_unchanged(now, &calls).is_none());
+        let nested = Request::multicall([calls]);
+        assert!(ledger.answer_if_unchanged(now, &nested).is_none());
+    }
+    assert!(ledger.answer_if_unchanged(now, &delete).is_none());
+    let watches = Request::multicall([watch.clone(), watch]);
+    assert!(ledger.answer_if_unchanged(now, &watches).is_some());
 }
 
 /// Loggers repeat parameter subscriptions all the time, so these use no memory and do not outdate a prepared injection.
