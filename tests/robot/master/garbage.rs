@@ -21,13 +21,13 @@ struct Garbled {
 }
 
 impl Garbled {
-    /// Starts a master that gives `answer` to calls with `/garbled`. `reads` says whether the mirror or the master
-    /// answers reads.
+    /// Starts a master that gives `answer` to calls with `garbled`, without a slash because an injection sets parameters
+    /// as members of the root. `reads` says whether the mirror or the master answers reads.
     fn start(answer: Vec<u8>, reads: &str) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);
         let master = real.client();
-        let answer = Arc::new(Mutex::new((&b"/garbled"[..], answer)));
+        let answer = Arc::new(Mutex::new((&b"garbled"[..], answer)));
         let said = answer.clone();
         let fake = FakeMaster::start(move |body| {
             let (word, answer) = &*said.lock().unwrap();
@@ -142,7 +142,7 @@ fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
     let [changes, reads] = garbled_calls(&node);
     let several = changes.last().unwrap().clone();
     for (number, (answer, (code, body))) in cases.into_iter().enumerate() {
-        garbled.say(b"/garbled", &answer);
+        garbled.say(b"garbled", &answer);
         for (method, params) in &[changes.clone(), reads.clone()].concat() {
             if params == &several.1 && answer.ends_with(FAULT.as_bytes()) {
                 continue; // Tested below.
@@ -162,7 +162,7 @@ fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
     }
     // A multicall that fails as a whole may have been run in part. That part counts as recorded until the
     // state has been read from the master and shows that nothing was run.
-    garbled.say(b"/garbled", &with_status("200 OK", FAULT.as_bytes()));
+    garbled.say(b"garbled", &with_status("200 OK", FAULT.as_bytes()));
     let request = http_request(&encode_call("system.multicall", several.1));
     assert_eq!(client.exchange(&request).unwrap().text(), FAULT);
     client.set_param("/kept", 99);
@@ -222,7 +222,7 @@ fn a_master_whose_answers_are_not_http_counts_as_away() {
     node.claim_subscription("/garbled", Some("a/B"));
     let [changes, reads] = garbled_calls(&node);
     for (number, answer) in cases.into_iter().enumerate() {
-        garbled.say(b"/garbled", &answer);
+        garbled.say(b"garbled", &answer);
         for (change, read) in changes.iter().zip(reads.iter().cycle()) {
             for (method, params) in [change, read] {
                 let case = format!("case {number}, {method}");
