@@ -9,7 +9,7 @@ use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, TAKEOVER, TTL, victim};
 use crate::support::{Library, PATIENCE, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
-use crate::{alone, rounds};
+use crate::{rounds, turn};
 
 /// Waits until the parameter has the value `value` on each computer.
 #[track_caller]
@@ -27,7 +27,7 @@ fn await_param(fleet: &Fleet, key: &str, value: i32) {
 
 #[test]
 fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
-    let _alone = alone();
+    let _turn = turn();
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let traffic = Traffic::start(&fleet);
@@ -105,7 +105,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
 /// reached the leader.
 #[test]
 fn a_computer_that_is_cut_off_twice_continues_from_its_own_writes() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
     let cut = (leader + 1) % 3;
@@ -139,7 +139,7 @@ fn a_computer_that_is_cut_off_twice_continues_from_its_own_writes() {
 /// itself.
 #[test]
 fn a_call_that_a_cut_cable_held_up_does_not_replace_a_later_one() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
     let cut = (leader + 1) % 3;
@@ -163,7 +163,7 @@ fn a_call_that_a_cut_cable_held_up_does_not_replace_a_later_one() {
 
 #[test]
 fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "refuse"]);
     let leader = fleet.await_whole();
     fleet.computers[leader].set_param("/steady", 7);
@@ -206,7 +206,7 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
 /// would drop a stream.
 #[test]
 fn a_computer_that_was_cut_off_does_not_notify_nodes_of_others() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     for round in 0..rounds() {
         let leader = fleet.await_whole();

@@ -6,14 +6,14 @@ use crate::computer::{Computer, NAMES, send};
 use crate::fleet::{Fleet, TAKEOVER, TTL, victim};
 use crate::support::{Library, eventually, params, signal};
 use crate::traffic::{Named, TYPE, Traffic};
-use crate::{alone, rounds};
+use crate::{rounds, turn};
 use rustix::process::Signal;
 
 /// The computer dies by a power cut, after which the others get no packet from it, or by SIGKILL for all its processes,
 /// after which the kernel closes their connections.
 #[test]
 fn no_node_notices_that_another_computer_dies_and_comes_back() {
-    let _alone = alone();
+    let _turn = turn();
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
@@ -80,7 +80,7 @@ fn no_node_notices_that_another_computer_dies_and_comes_back() {
 /// The leader cannot reach the old node, and dies before it has told it to shut down.
 #[test]
 fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
     let rest = fleet.others(leader);
@@ -112,7 +112,7 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
 /// [`Traffic`], so that the processor is idle.
 #[test]
 fn writes_go_on_soon_after_the_death_of_the_leaders_worker_or_computer() {
-    let _alone = alone();
+    let _turn = turn();
     let mut chance = Chance::new();
     let mut fleet = Fleet::quick(&[]);
     let (mut workers, mut computers) = (Vec::new(), Vec::new());

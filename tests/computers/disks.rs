@@ -3,9 +3,9 @@ use std::path::PathBuf;
 
 use rosrescue::xmlrpc::Value;
 
-use crate::alone;
 use crate::computer::Computer;
 use crate::fleet::Fleet;
+use crate::turn;
 
 /// A copy of the checkpoint files.
 pub(crate) struct Disk(Vec<(PathBuf, Vec<u8>)>);
@@ -40,7 +40,7 @@ impl Disk {
 /// stopped, as during an upgrade, so only this one can lead.
 #[test]
 fn a_leader_whose_disk_is_older_than_etcds_journal_takes_the_journal() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
     fleet.computers[leader].set_param("/before", 1);

@@ -3,7 +3,7 @@ use std::time::Instant;
 use crate::computer::NAMES;
 use crate::fleet::{Fleet, TAKEOVER, TTL};
 use crate::support::{Library, Node, eventually};
-use crate::{alone, rounds};
+use crate::{rounds, turn};
 
 /// Starts a driver like those of real robots: it publishes and logs at 50 Hz, and reads parameters that are not set.
 #[track_caller]
@@ -23,7 +23,7 @@ fn go_on(driver: &Node) {
 
 #[test]
 fn no_driver_fails_when_the_leaders_computer_dies() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::quick(&[]);
     let mut drivers = [0, 1, 2].map(|index| Some(driver(&fleet, index)));
     let mut longest = Vec::new();

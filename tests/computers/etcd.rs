@@ -1,13 +1,13 @@
 use std::time::Instant;
 
-use crate::alone;
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
 use crate::support::eventually;
 use crate::traffic::Traffic;
+use crate::turn;
 
 #[test]
 fn without_etcd_each_computer_serves_its_nodes_and_afterwards_one_leads() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     fleet.await_whole();
@@ -43,7 +43,7 @@ fn without_etcd_each_computer_serves_its_nodes_and_afterwards_one_leads() {
 
 #[test]
 fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
     for value in 1..=20 {

@@ -6,14 +6,14 @@ use crate::computer::NAMES;
 use crate::fleet::{Fleet, READ};
 use crate::support::eventually;
 use crate::traffic::Traffic;
-use crate::{alone, rounds};
+use crate::{rounds, turn};
 
 /// The documented limit is 200 ms; the test allows more, because the machine is busy.
 const HANDOVER: Duration = Duration::from_secs(2);
 
 #[test]
 fn the_leader_hands_over_when_it_is_told_to_and_when_it_is_stopped() {
-    let _alone = alone();
+    let _turn = turn();
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);

@@ -8,11 +8,11 @@ use std::fs;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use crate::alone;
 use crate::chance::Chance;
 use crate::fleet::Fleet;
 use crate::network::COUNT;
 use crate::support::{holds, params};
+use crate::turn;
 
 mod checker;
 mod clients;
@@ -35,7 +35,7 @@ const LATE: Duration = Duration::from_secs(2);
 
 #[test]
 fn every_promise_is_kept_under_random_failures() {
-    let _alone = alone();
+    let _turn = turn();
     let mut chance = Chance::new();
     let all = std::env::var("ROSRESCUE_FAULTS");
     let all = all.map_or(FAULTS, |all| {

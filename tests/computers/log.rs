@@ -1,7 +1,7 @@
-use crate::alone;
 use crate::computer::PORT;
 use crate::fleet::Fleet;
 use crate::support::{Client, encode_call, eventually, params, request};
+use crate::turn;
 
 /// The address from which `key` was set, according to the log of each computer.
 fn origins(fleet: &Fleet, key: &str) -> Vec<String> {
@@ -18,7 +18,7 @@ fn origins(fleet: &Fleet, key: &str) -> Vec<String> {
 
 #[test]
 fn the_log_of_every_computer_has_the_callers_address() {
-    let _alone = alone();
+    let _turn = turn();
     let fleet = Fleet::quick(&[]);
     let leader = fleet.await_whole();
     let rest = fleet.others(leader);

@@ -3,11 +3,11 @@ use std::thread::scope;
 
 use rosrescue::xmlrpc::Value;
 
-use crate::alone;
 use crate::computer::{Computer, PORT};
 use crate::fleet::Fleet;
 use crate::network::enter;
 use crate::support::{Client, Finish, eventually, params};
+use crate::turn;
 
 /// Number of parameters that are written while the computer is cut off.
 const KEYS: usize = 1500;
@@ -34,7 +34,7 @@ fn lost_writes(computer: &Computer) -> Option<u64> {
 
 #[test]
 fn writes_of_the_majority_win_and_each_lost_write_is_reported() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
     let cut = (leader + 1) % 3;
@@ -95,7 +95,7 @@ fn writes_of_the_majority_win_and_each_lost_write_is_reported() {
 
 #[test]
 fn a_write_made_while_cut_off_does_not_replace_one_made_during_the_merge() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
     let cut = (leader + 1) % 3;
@@ -170,7 +170,7 @@ fn a_write_made_while_cut_off_does_not_replace_one_made_during_the_merge() {
 /// calls again at the new leader.
 #[test]
 fn a_leader_without_etcd_drops_forwarded_calls_that_the_others_repeat() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let leader = fleet.await_whole();
     let rest = fleet.others(leader);

@@ -1,5 +1,5 @@
 //! Tests with three simulated computers, each with an etcd, a rosrescue and nodes: network namespaces on one switch.
-//! Computers are killed and cut off. The tests run one at a time, because each keeps the machine busy. They need root.
+//! Computers are killed and cut off. Two tests run at once, because each keeps a processor busy. They need root.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,7 +8,10 @@
     reason = "a test"
 )]
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{
+    Mutex, MutexGuard, PoisonError,
+    atomic::{AtomicUsize, Ordering},
+};
 
 #[path = "../support/mod.rs"]
 mod support;
@@ -47,11 +50,13 @@ mod starts;
 /// Tests of the simulated computers themselves.
 mod wiring;
 
-/// Lock for tests that must not run side by side. A test takes it first, so that it is released after everything that
-/// the test started has ended.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+/// Waits until at most one other test runs. A test does this first, so that its turn ends after everything that it
+/// started has ended.
+fn turn() -> MutexGuard<'static, ()> {
+    static TESTS: AtomicUsize = AtomicUsize::new(0);
+    static TURNS: [Mutex<()>; 2] = [const { Mutex::new(()) }; 2];
+    let turn = &TURNS[TESTS.fetch_add(1, Ordering::Relaxed) % TURNS.len()];
+    turn.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.

@@ -1,10 +1,10 @@
 use std::time::Instant;
 
-use crate::alone;
 use crate::computer::{NAMES, PORT};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
 use crate::support::eventually;
 use crate::traffic::Traffic;
+use crate::turn;
 
 /// Runs `cut` with the leader and a follower, and later `mend`. Meanwhile all computers must serve; the follower is
 /// alone.
@@ -51,7 +51,7 @@ fn without_each_other(
 
 #[test]
 fn two_computers_that_do_not_reach_each_other_both_serve() {
-    let _alone = alone();
+    let _turn = turn();
     // With its defaults, etcd 3.4 elects for up to 3 s when the pair is mended, which is longer than the time to live.
     let mut fleet = Fleet::quick(&[]);
     without_each_other(
@@ -70,7 +70,7 @@ fn two_computers_that_do_not_reach_each_other_both_serve() {
 
 #[test]
 fn a_leader_without_etcd_stops_leading_although_all_reach_it() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     let leader = fleet.await_whole();

@@ -12,7 +12,7 @@ use crate::fleet::Fleet;
 use crate::network::enter;
 use crate::support::{Client, FakeNode, eventually, holds, params, signal};
 use crate::traffic::Named;
-use crate::{alone, rounds};
+use crate::{rounds, turn};
 
 /// Number of parameters, each with its own writer.
 const KEYS: usize = 8;
@@ -57,7 +57,7 @@ fn watch(computer: &Computer) -> Named {
 /// leader answers these and newer calls.
 #[test]
 fn a_leader_that_was_paused_sends_no_old_notifications() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let (mut first, mut watcher) = (0, None);
     for round in 0..rounds() {
@@ -127,7 +127,7 @@ fn a_leader_that_was_paused_sends_no_old_notifications() {
 /// values, however long the leader is stopped.
 #[test]
 fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
-    let _alone = alone();
+    let _turn = turn();
     // The leader is stopped for less than this time to live.
     let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);
     let leader = fleet.await_whole();
@@ -170,7 +170,7 @@ fn is_sending_to(computer: &Computer, port: u16) -> bool {
 /// until the cable is mended, and then the node would get it after the next leader's.
 #[test]
 fn no_old_notification_arrives_after_a_cut() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let leader = fleet.await_whole();
     let rest = fleet.others(leader);

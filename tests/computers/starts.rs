@@ -1,14 +1,14 @@
 use rosrescue::xmlrpc::Value;
 
-use crate::alone;
 use crate::computer::{Computer, NAMES, endpoints};
 use crate::fleet::Fleet;
 use crate::network::COUNT;
 use crate::support::eventually;
+use crate::turn;
 
 #[test]
 fn two_start_at_the_same_moment_and_a_third_joins_later() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::empty(&[]);
     for index in [0, 1] {
         fleet.computers[index].start_rescue();
@@ -45,7 +45,7 @@ fn two_start_at_the_same_moment_and_a_third_joins_later() {
 
 #[test]
 fn a_session_goes_on_after_restarts_and_a_new_one_begins_after_a_reboot_of_all() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     fleet.computers[1].set_param("/of_this_session", 1);
     let before = fleet.await_same_state();
@@ -79,7 +79,7 @@ fn a_session_goes_on_after_restarts_and_a_new_one_begins_after_a_reboot_of_all()
 
 #[test]
 fn a_new_session_goes_on_when_its_first_leader_leads_again() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::empty(&[]);
     for index in 0..COUNT {
         fleet.computers[index].start_rescue();
@@ -105,7 +105,7 @@ fn a_new_session_goes_on_when_its_first_leader_leads_again() {
 
 #[test]
 fn a_computer_with_a_name_in_use_does_not_start_and_disturbs_nothing() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::empty(&[]);
     for index in [0, 1] {
         fleet.computers[index].start_rescue();
@@ -143,7 +143,7 @@ fn a_computer_with_a_name_in_use_does_not_start_and_disturbs_nothing() {
 
 #[test]
 fn a_computer_that_has_another_address_than_before_starts() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::empty(&[]);
     for index in [0, 1] {
         fleet.computers[index].start_rescue();
@@ -171,7 +171,7 @@ fn a_computer_that_has_another_address_than_before_starts() {
 
 #[test]
 fn wrong_options_are_reported_with_what_to_do() {
-    let _alone = alone();
+    let _turn = turn();
     let mut fleet = Fleet::empty(&[]);
     fleet.computers[0].start_rescue();
     fleet.computers[0].await_answers();

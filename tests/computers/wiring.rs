@@ -16,7 +16,7 @@ fn reaches(fleet: &Fleet, from: usize, to: usize, port: u16) -> bool {
 
 #[test]
 fn cables_pairs_ports_and_computers_are_cut_and_come_back() {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let mut fleet = Fleet::empty(&[]);
     let healthy = |fleet: &Fleet, index: usize, is: bool| {
         eventually(&format!("etcd {index} is healthy: {is}"), || {
