@@ -166,7 +166,7 @@ impl Ledger {
 
     pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
         self.lock().update_session(change);
-        self.write_soon();
+        self.write();
         self.work.notify_one();
     }
 
@@ -268,7 +268,7 @@ impl Ledger {
         let label = Label { at, origin };
         inner.append(vec![RecordContent::labelled(call.clone().into(), label)]);
         drop(inner);
-        self.write_soon();
+        self.write();
     }
 
     /// Wakes the tasks that write and replicate records.
@@ -426,7 +426,7 @@ impl Ledger {
         }
         inner.append(entries);
         drop(inner);
-        self.write_soon();
+        self.write();
         self.work.notify_one();
         Ok(())
     }
@@ -510,7 +510,7 @@ impl Ledger {
         }
         inner.write_session();
         drop(inner);
-        self.write_soon();
+        self.write();
         self.work.notify_one();
     }
 

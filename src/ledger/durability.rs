@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, atomic::Ordering},
 };
 
-use tokio::{task::block_in_place, time::timeout};
+use tokio::time::timeout;
 
 use super::{
     Ledger,
@@ -90,16 +90,8 @@ impl Ledger {
         }
     }
 
-    /// Writes the queued records to the checkpoint in a task of its own, which waits for the disk however long it
-    /// takes.
-    fn write(&self) {
-        if let Some(worker) = self.worker() {
-            crate::task::spawn(async move { block_in_place(|| worker.work()) });
-        }
-    }
-
     /// Writes the queued records to the checkpoint, in another thread.
-    pub(super) fn write_soon(&self) {
+    pub(super) fn write(&self) {
         if let Some(worker) = self.worker() {
             crate::task::spawn_blocking(move || worker.work());
         }
@@ -163,7 +155,7 @@ impl Ledger {
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
     ) -> Option<T> {
         let result = self.lock().journal.as_ref()?.run(work)?;
-        self.write_soon();
+        self.write();
         result.await.ok()
     }
 
@@ -178,7 +170,7 @@ impl Ledger {
             inner.whole.taken = inner.version;
             inner.journal.as_mut()?.run_whole(checkpoint, work)?
         };
-        self.write_soon();
+        self.write();
         result.await.ok()
     }
 
