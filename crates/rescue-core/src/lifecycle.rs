@@ -62,6 +62,15 @@ enum Timer {
     Spawn,
 }
 
+/// Masters whose port another program took.
+#[derive(Debug, Default)]
+struct TakenPorts {
+    /// Number of consecutive ones.
+    count: usize,
+    /// Whether the last one still runs.
+    last_runs: bool,
+}
+
 /// The state machine that decides what happens to the master.
 #[derive(Debug)]
 pub struct Lifecycle {
@@ -97,10 +106,7 @@ pub struct Lifecycle {
     evidence: Evidence,
     /// Number of consecutive failed spawns.
     failed_spawns: usize,
-    /// Number of consecutive masters whose port another program took.
-    taken_ports: usize,
-    /// Whether the last master whose port was taken still runs.
-    port_taken: bool,
+    taken_ports: TakenPorts,
     timer: Option<(Instant, Timer)>,
 }
 
@@ -126,8 +132,7 @@ impl Lifecycle {
             patience: Patience::new(probing.patience),
             evidence: Evidence::default(),
             failed_spawns: 0,
-            taken_ports: 0,
-            port_taken: false,
+            taken_ports: TakenPorts::default(),
             timer: None,
         }
     }
@@ -226,8 +231,8 @@ impl Lifecycle {
             }
             Input::Refused => self.refused(now),
             Input::PortTaken => {
-                self.taken_ports += 1;
-                self.port_taken = true;
+                self.taken_ports.count += 1;
+                self.taken_ports.last_runs = true;
                 self.give_up(now)
             }
             Input::Unreachable => self.unreachable(now),
@@ -288,7 +293,7 @@ impl Lifecycle {
             }
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
-                (self.dying, self.taken_ports) = (false, 0);
+                (self.dying, self.taken_ports.count) = (false, 0);
                 self.phase = Phase::Serving;
                 (self.served, self.known) = (true, true);
                 self.seeking_since = None;
@@ -318,7 +323,7 @@ impl Lifecycle {
             }
             Input::Exited => {
                 self.child = None;
-                let spawn = match std::mem::take(&mut self.port_taken) {
+                let spawn = match std::mem::take(&mut self.taken_ports.last_runs) {
                     true => self.spawn_elsewhere(now),
                     false => self.spawn(now),
                 };
@@ -498,7 +503,7 @@ impl Lifecycle {
 
     /// Handles the end of a child that never got its port. It does not count as a death.
     fn spawn_elsewhere(&mut self, now: Instant) -> Vec<Action> {
-        match self.taken_ports.checked_sub(DEATHS_AT_ONCE + 1) {
+        match self.taken_ports.count.checked_sub(DEATHS_AT_ONCE + 1) {
             None => vec![Action::Spawn],
             Some(further) => {
                 self.timer = Some((now + pause_after(further), Timer::Spawn));

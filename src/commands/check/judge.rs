@@ -1,6 +1,5 @@
 //! Judges the facts: what they mean for the robot, and what to do.
 
-mod computers;
 mod network;
 mod system;
 #[cfg(test)]

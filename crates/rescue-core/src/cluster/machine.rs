@@ -36,6 +36,17 @@ const PATIENCE: Duration = Duration::from_millis(1500);
 /// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
 const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
 
+/// Numbers of this computer's last records.
+#[derive(Clone, Copy, Debug, Default)]
+struct Written {
+    /// In its ledger.
+    recorded: u64,
+    /// Known to be in the journal.
+    committed: u64,
+    /// Acknowledged to callers.
+    acknowledged: u64,
+}
+
 /// Decides who leads. See the [module](self).
 #[derive(Debug)]
 pub struct Machine {
@@ -59,9 +70,7 @@ pub struct Machine {
     /// Whether the mirror must be rebuilt from the journal.
     stale: bool,
     session: JournalSession,
-    recorded: u64,
-    committed: u64,
-    acknowledged: u64,
+    written: Written,
     /// Whether the leader's rosrescue answers, and since when.
     peer: Option<(bool, Instant)>,
     releasing: Option<String>,
@@ -87,9 +96,7 @@ impl Machine {
             followed: 0,
             stale: false,
             session: JournalSession::default(),
-            recorded: 0,
-            committed: 0,
-            acknowledged: 0,
+            written: Written::default(),
             peer: None,
             releasing: None,
             claim_not_before: None,
@@ -137,7 +144,7 @@ impl Machine {
 
     /// The last record of this computer that is known to be in the journal.
     pub fn committed(&self) -> u64 {
-        self.committed
+        self.written.committed
     }
 
     /// Whether no other computer can lead at `now`.
@@ -202,7 +209,7 @@ impl Machine {
             Input::Followed(seq) => self.followed(seq),
             Input::Decided { seq, goes_on } => self.session.decided(seq, goes_on),
             Input::Recorded(seq) => {
-                self.recorded = self.recorded.max(seq);
+                self.written.recorded = self.written.recorded.max(seq);
                 self.acknowledge_early(now, &mut actions);
             }
             Input::Peer(leads) => self.peer(now, leads, &mut actions),
@@ -388,7 +395,7 @@ impl Machine {
         };
         self.retry_at = None;
         if leadership.caught_up {
-            self.committed = self.view.seq();
+            self.written.committed = self.view.seq();
         }
         if released.is_some() {
             // After a release, another computer may lead.
@@ -403,7 +410,7 @@ impl Machine {
             lapsed: false,
             ..leadership
         });
-        let upto = self.committed;
+        let upto = self.written.committed;
         self.acknowledge(upto, actions);
         if self.role == Role::Alone && self.is_sole(now) {
             match leadership.caught_up {
@@ -468,12 +475,12 @@ impl Machine {
 
     /// Has the member keep this computer's calls that are not in the journal.
     fn hand_back(&mut self, actions: &mut Vec<Action>) {
-        let Self {
+        let Written {
+            recorded,
             committed,
             acknowledged,
-            ..
-        } = *self;
-        if self.recorded > committed {
+        } = self.written;
+        if recorded > committed {
             actions.push(Action::Yield {
                 committed,
                 acknowledged,
@@ -485,7 +492,11 @@ impl Machine {
 
     fn follow_to(&mut self, seq: u64) {
         self.followed = seq;
-        (self.recorded, self.committed, self.acknowledged) = (seq, seq, seq);
+        self.written = Written {
+            recorded: seq,
+            committed: seq,
+            acknowledged: seq,
+        };
     }
 
     fn followed(&mut self, seq: u64) {
@@ -516,13 +527,13 @@ impl Machine {
             _ => false,
         };
         if may {
-            self.acknowledge(self.recorded, actions);
+            self.acknowledge(self.written.recorded, actions);
         }
     }
 
     fn acknowledge(&mut self, seq: u64, actions: &mut Vec<Action>) {
-        if seq > self.acknowledged {
-            self.acknowledged = seq;
+        if seq > self.written.acknowledged {
+            self.written.acknowledged = seq;
             actions.push(Action::Acknowledge(seq));
         }
     }

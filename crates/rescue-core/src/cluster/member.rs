@@ -24,22 +24,20 @@ use crate::{
     master::{Master, Request},
 };
 
-mod chores;
 mod following;
-mod giving;
-mod leaving;
-mod lost;
-mod merging;
+mod leading;
 mod notifying;
-mod roles;
 #[cfg(test)]
 mod tests;
 mod types;
 
-use self::{chores::Chores, following::Reading, leaving::Release, lost::Lost, merging::Merging};
+use self::{
+    following::{Merging, Reading},
+    leading::Lost,
+    notifying::Notifying,
+};
 pub use self::{
-    chores::SAYS_EVERY,
-    roles::PROBES,
+    leading::PROBES,
     types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
 };
 
@@ -54,6 +52,8 @@ struct Journal {
     state: Master,
     progress: Progress,
     displaced: DisplacedLately,
+    /// Whether this computer, if it leads next, keeps its ledger's state instead of this one.
+    own_wins: bool,
 }
 
 impl Journal {
@@ -67,6 +67,15 @@ impl Journal {
             }
         }
     }
+}
+
+/// What the actions that were returned last have told `app/cluster`.
+#[derive(Debug)]
+struct Told {
+    role: Role,
+    standing: Standing,
+    /// Whether this computer was told to have a master.
+    has_master: bool,
 }
 
 /// The probes of the leader's rosrescue.
@@ -102,13 +111,8 @@ struct Namesake {
 pub struct Member {
     keys: Keys,
     machine: Machine,
-    /// The machine's role after the actions that were returned last.
-    role: Role,
-    standing: Standing,
-    has_master: bool,
+    told: Told,
     own: Own,
-    /// Whether this computer, if it leads next, keeps its ledger's state instead of the journal's.
-    own_wins: bool,
     lost: Lost,
     journal: Journal,
     reading: Reading,
@@ -141,11 +145,12 @@ impl Member {
         Self {
             keys,
             machine: Machine::new(settings),
-            role: Role::Joining,
-            standing: Standing::Nobody { known },
-            has_master: false,
+            told: Told {
+                role: Role::Joining,
+                standing: Standing::Nobody { known },
+                has_master: false,
+            },
             own,
-            own_wins: false,
             lost: Lost::default(),
             journal: Journal::default(),
             reading: Reading::default(),
@@ -230,7 +235,7 @@ impl Member {
 
     /// The machine's role after the actions that were returned last.
     pub fn role(&self) -> Role {
-        self.role
+        self.told.role
     }
 
     pub fn settings(&self) -> &Settings {
@@ -248,7 +253,7 @@ impl Member {
 
     /// Who has the master, and where calls go.
     pub fn standing(&self) -> &Standing {
-        &self.standing
+        &self.told.standing
     }
 
     /// The place in the journal up to which the mirror is current.
@@ -341,12 +346,12 @@ impl Member {
 
     /// Whether calls are recorded on this computer: it leads, or it is cut off and serves.
     fn records(&self) -> bool {
-        self.standing.records()
+        self.told.standing.records()
     }
 
     /// Whether the ledger must hold the journal's state, because this computer does not record calls itself.
     fn follows(&self) -> bool {
-        self.reading.loaded && !self.own_wins && !self.records()
+        self.reading.loaded && !self.journal.own_wins && !self.records()
     }
 
     /// Whether the mirror may answer: its state is that of the session which continues.
@@ -357,7 +362,7 @@ impl Member {
 
     /// Whether writes answered now are kept for a later leader.
     fn keeps(&self) -> bool {
-        self.role == Role::Alone && self.settings().alone == WhenAlone::Serve
+        self.told.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
     /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and
@@ -370,5 +375,219 @@ impl Member {
         self.update_probes(now);
         self.update_merge(now);
         self.update_chores(now);
+    }
+}
+
+/// How long a handover may take.
+const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
+/// How long giving up leadership may take when rosrescue stops.
+const STOP_LIMIT: Duration = Duration::from_secs(4);
+
+/// Why leadership is given up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Why {
+    #[default]
+    No,
+    /// A handover was requested, and its caller waits.
+    Asked,
+    /// rosrescue stops, and waits for rosout.
+    EndingRosout,
+    Stops,
+}
+
+#[derive(Debug, Default)]
+struct Release {
+    why: Why,
+    /// The time limit of the handover or the stop.
+    by: Option<Instant>,
+}
+
+impl Release {
+    /// Whether writes wait for the next leader.
+    fn is_begun(&self) -> bool {
+        matches!(self.why, Why::Asked | Why::Stops)
+    }
+}
+
+impl Member {
+    fn stop(&mut self, now: Instant) {
+        if self.told.has_master {
+            self.release.why = Why::EndingRosout;
+            self.release.by = Some(now + STOP_LIMIT);
+            self.act(Action::EndRosout);
+        } else {
+            self.end();
+        }
+    }
+
+    fn rosout_ended(&mut self) {
+        match self.machine.role() {
+            Role::Leading => self.begin_release(Why::Stops, String::new()),
+            _ => self.end(),
+        }
+    }
+
+    fn hand_over(&mut self, now: Instant, to: String, refused: Option<String>) {
+        let refused = match self.machine.role() {
+            Role::Leading if self.release.why != Why::No => {
+                Some("a handover or a stop is already under way".to_owned())
+            }
+            Role::Leading => refused,
+            _ => Some("this computer does not lead".to_owned()),
+        };
+        if let Some(why) = refused {
+            return self.act(Action::HandedOver(Err(why)));
+        }
+        self.begin_release(Why::Asked, to);
+        self.release.by = Some(now + HANDOVER_LIMIT);
+    }
+
+    /// Gives up leadership. From now on writes wait for the next leader.
+    fn begin_release(&mut self, why: Why, to: String) {
+        self.release.why = why;
+        let term = self.machine.term().unwrap_or_default();
+        self.stand_leading(term);
+        self.tell_machine(machine::Input::HandOver(to));
+    }
+
+    /// Ends a handover: another computer may lead now.
+    fn released(&mut self) {
+        if self.release.why == Why::Asked {
+            self.release = Release::default();
+            self.act(Action::HandedOver(Ok(())));
+        }
+    }
+
+    fn woken(&mut self, now: Instant) {
+        if self.release.by.is_some_and(|by| by <= now) {
+            self.release.by = None;
+            match self.release.why {
+                // The request may still reach etcd, so writes keep waiting.
+                Why::Asked => {
+                    let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
+                    self.act(Action::HandedOver(Err(why)));
+                }
+                Why::EndingRosout | Why::Stops => self.end(),
+                Why::No => {}
+            }
+        }
+        if self.queue.start_by.is_some_and(|by| by <= now) {
+            self.start(now);
+        }
+        self.tell_machine(machine::Input::Wake);
+    }
+
+    /// Finishes a stop as soon as this computer no longer leads.
+    fn end_if_stopped(&mut self) {
+        if self.release.why == Why::Stops && self.machine.role() != Role::Leading {
+            self.end();
+        }
+    }
+
+    fn end(&mut self) {
+        self.act(Action::End);
+    }
+}
+
+/// How often a computer updates its entry among the members.
+pub const SAYS_EVERY: Duration = Duration::from_secs(5);
+/// How often the leader compacts etcd, and the age from which revisions are dropped.
+const FORGET: Duration = Duration::from_secs(300);
+/// Pause after a snapshot that could not be written.
+const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
+
+#[derive(Debug, Default)]
+struct Chores {
+    /// When to write this computer's entry among the members.
+    say_at: Option<Instant>,
+    /// Whether a snapshot is being written.
+    snapshot: bool,
+    /// After a failed snapshot, when the next one may begin.
+    snapshot_at: Option<Instant>,
+    /// The revision up to which to compact etcd, and when.
+    forget: Option<(Instant, u64)>,
+    /// The record with which the journal has all writes that a lone leader kept in a file.
+    kept_until: Option<u64>,
+    /// What the entries among the members say about notifications.
+    notifying: Notifying,
+}
+
+impl Chores {
+    fn due(&self) -> Option<Instant> {
+        let forget = self.forget.map(|(at, _)| at);
+        [self.say_at, forget].into_iter().flatten().min()
+    }
+
+    /// Has this computer's entry among the members updated at `now`.
+    fn say_at(&mut self, now: Instant) {
+        self.say_at = Some(now);
+    }
+
+    /// Keeps the file of kept writes as it is until the journal has record `seq`. If the leader lost its power before,
+    /// the writes would be lost without a report.
+    fn keep_until(&mut self, seq: u64) {
+        self.kept_until = Some(seq);
+    }
+
+    /// Whether the file of kept writes must stay as it is.
+    fn keeps_file(&self) -> bool {
+        self.kept_until.is_some()
+    }
+}
+
+impl Member {
+    /// Writes this computer's entry among the members and, if it leads, a snapshot, and compacts etcd, each when it is
+    /// due.
+    fn update_chores(&mut self, now: Instant) {
+        // Before the watch for a namesake is over, the entry could overwrite that of another computer.
+        let watch = self.namesake.watch.as_ref();
+        let may_say = watch.is_some_and(|of| of.is_over(now));
+        if self.chores.say_at.is_none_or(|at| at <= now) {
+            self.chores.say_at = Some(now + SAYS_EVERY);
+            if may_say {
+                self.act(Action::Say);
+            }
+        }
+        if let Some(seq) = self.chores.kept_until {
+            let leads = self.machine.role() == Role::Leading;
+            if !leads || self.journal.progress.seq >= seq {
+                self.chores.kept_until = None;
+                self.keep_all();
+            }
+        }
+        let term = self.machine.term();
+        let Some(term) = term.filter(|_| self.machine.role() == Role::Leading) else {
+            self.chores.forget = None;
+            return;
+        };
+        let is_early = self.chores.snapshot_at.is_some_and(|at| now < at);
+        let progress = self.journal.progress;
+        if !self.chores.snapshot && !is_early && progress.wants_snapshot() {
+            self.chores.snapshot = true;
+            self.act(Action::WriteSnapshot {
+                term,
+                progress,
+                state: self.journal.state.clone(),
+                displaced: self.journal.displaced.at(now),
+            });
+        }
+        let revision = self.view().revision;
+        match self.chores.forget {
+            Some((at, before)) if at <= now => {
+                self.chores.forget = Some((now + FORGET, revision));
+                self.act(Action::Forget(before));
+            }
+            None => self.chores.forget = Some((now + FORGET, revision)),
+            Some(_) => {}
+        }
+    }
+
+    fn snapshot_written(&mut self, now: Instant, written: Option<(Progress, usize)>) {
+        self.chores.snapshot = false;
+        match written {
+            Some((then, bytes)) => self.journal.progress.snapshot_written(then, bytes),
+            // A full etcd refuses at once, so the next attempt must wait.
+            None => self.chores.snapshot_at = Some(now + SNAPSHOT_PAUSE),
+        }
     }
 }

@@ -1,18 +1,20 @@
-//! Judges port, addresses and names.
+//! Judges port, addresses and names, and the facts about `--cluster`.
 
 use super::{
     super::{
+        computers::{Cluster, Unusable},
         facts::{Host, Port, SetupFacts},
         ros::Responder,
     },
     Findings, list, named,
 };
-use crate::ros_env;
+use crate::{cluster::survey, ros_env};
 
 /// A name lookup that takes longer than this, in milliseconds, is a finding: it delays every call to the node.
 const SLOW: u128 = 1000;
 /// Subject of findings about clients that bypass rosrescue.
 const BYPASS: &str = "unprotected";
+const CLUSTER: &str = "--cluster";
 const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 
 impl Findings {
@@ -359,6 +361,61 @@ impl Findings {
                     known.join(", ")
                 ),
             );
+        }
+    }
+
+    pub(super) fn cluster(&mut self, facts: &SetupFacts) {
+        let cluster = match facts.cluster.as_deref() {
+            None => return,
+            Some(Ok(cluster)) => cluster,
+            Some(Err(Unusable::Options(error))) => {
+                let todo = "correct the options: with these, `core` does not start";
+                return self.bad(CLUSTER, error.to_string(), todo);
+            }
+            Some(Err(Unusable::Etcd(error))) => {
+                let todo = "correct the etcd options: with these, `core` does not start";
+                return self.bad(CLUSTER, error.to_string(), todo);
+            }
+        };
+        let all = cluster.tried.len();
+        let good = cluster.tried.iter().filter(|one| one.cluster.is_ok());
+        let good = good.count();
+        for complaint in survey::complaints(&cluster.tried) {
+            match good * 2 > all {
+                true => self.warn(CLUSTER, complaint.what, complaint.todo),
+                false => self.bad(CLUSTER, complaint.what, complaint.todo),
+            }
+        }
+        if good == all {
+            self.ok(CLUSTER, format!("all {all} members of etcd answer"));
+        }
+        self.robot(cluster);
+        if let Some(uri) = &cluster.namesake {
+            let Cluster { name, uri: own, .. } = cluster;
+            self.bad(
+                "--cluster-name",
+                format!(
+                    "another computer has the same name, {name}: it is at {uri}, this one is at {own}"
+                ),
+                "give this computer a unique name with --cluster-name",
+            );
+        } else {
+            self.ok(
+                "--cluster-name",
+                format!("this computer is {}, at {}", cluster.name, cluster.uri),
+            );
+        }
+    }
+
+    fn robot(&mut self, cluster: &Cluster) {
+        let robot = &cluster.robot;
+        match (&cluster.leader, survey::typo(robot, &cluster.others)) {
+            (Some(leader), _) => self.ok(
+                CLUSTER,
+                format!("etcd has the robot {robot}, last led by {leader}"),
+            ),
+            (None, Some(typo)) => self.warn(CLUSTER, typo.what, typo.todo),
+            (None, None) => {}
         }
     }
 }

@@ -65,10 +65,10 @@ impl Machine {
         let op = match self.leadership {
             Some(leadership) => {
                 let seq = match leadership.caught_up {
-                    true => self.recorded,
+                    true => self.written.recorded,
                     false => self.view.seq(),
                 };
-                let whole = seq == self.committed && self.role == Role::Leading;
+                let whole = seq == self.written.committed && self.role == Role::Leading;
                 Op::Beat {
                     guard,
                     beat: leadership.beat + 1,
@@ -118,7 +118,7 @@ impl Machine {
             return self.observed;
         };
         let pause = self.settings.ttl / BEATS;
-        let waiting = leadership.caught_up && self.recorded > self.committed;
+        let waiting = leadership.caught_up && self.written.recorded > self.written.committed;
         Some(match self.settings.commit {
             Commit::Always if waiting => sent,
             Commit::Interval if leadership.full => sent,
