@@ -395,6 +395,7 @@ enum Why {
     Stops,
 }
 
+/// How leadership is given up: for a handover, or because rosrescue stops.
 #[derive(Debug, Default)]
 struct Release {
     why: Why,
@@ -496,6 +497,7 @@ const FORGET: Duration = Duration::from_secs(300);
 /// Pause after a snapshot that could not be written.
 const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 
+/// Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
 #[derive(Debug, Default)]
 struct Chores {
     /// When to write this computer's entry among the members.

@@ -436,6 +436,7 @@ impl Member {
 /// How long a computer that knows less of the lost journal waits for the one that knows the most, in times to live.
 const PATIENCE: u32 = 3;
 
+/// What is known of the journal that etcd has lost.
 #[derive(Debug, Default)]
 pub(super) struct Lost {
     /// When the loss was noticed, how much of the lost journal this computer knows, and the last record of the new
