@@ -50,8 +50,8 @@ mod starts;
 /// Tests of the simulated computers themselves.
 mod wiring;
 
-/// Waits until at most one other test runs. A test does this first, so that its turn ends after everything that it
-/// started has ended.
+/// Waits for one of two turns, which the tests take alternately. A test does this first, so that its turn ends after
+/// everything that it started has ended.
 fn turn() -> MutexGuard<'static, ()> {
     static TESTS: AtomicUsize = AtomicUsize::new(0);
     static TURNS: [Mutex<()>; 2] = [const { Mutex::new(()) }; 2];

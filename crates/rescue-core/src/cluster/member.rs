@@ -69,12 +69,12 @@ impl Journal {
     }
 }
 
-/// What the actions that were returned last have told `app/cluster`.
+/// What `app/cluster` knows once it has carried out the returned actions.
 #[derive(Debug)]
 struct Told {
     role: Role,
     standing: Standing,
-    /// Whether this computer was told to have a master.
+    /// Whether this computer has a master, or starts one.
     has_master: bool,
 }
 
