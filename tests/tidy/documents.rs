@@ -1,16 +1,8 @@
 //! Checks documents against the program, and the names in them.
 
-use std::{collections::BTreeSet, fs, path::Path, process::Command};
+use std::{collections::BTreeSet, fs, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
-
-/// Maximum number of bytes of documents: people read no more. The last entry is all of `docs` except the decisions and
-/// the help.
-const BYTES_MOST: [(&str, usize); 3] = [
-    ("README.md", 8 << 10),
-    ("docs/architecture.md", 20 << 10),
-    ("docs", 155 << 10),
-];
 
 /// The output of `rosrescue ARGUMENTS` at a width of 100, without settings of this computer.
 fn printed(arguments: &[&str]) -> String {
@@ -59,75 +51,6 @@ fn the_documents_have_the_help_as_the_program_prints_it() {
             printed(&[&command, "--help"]),
             "put this help of `rosrescue {command}` into docs/cli.md"
         );
-    }
-}
-
-#[test]
-fn documents_stay_short() {
-    for (name, most) in BYTES_MOST {
-        let counted = documents().into_iter().filter(|document| {
-            let path = document.strip_prefix(root()).unwrap();
-            path == Path::new(name)
-                || path.parent() == Some(Path::new(name)) && !path.ends_with("cli.md")
-        });
-        let bytes: usize = counted.map(|document| read(document).len()).sum();
-        assert!(bytes <= most, "{name} has {bytes} bytes, more than {most}");
-    }
-}
-
-/// The sentences of a document's text. A block of commands is no sentence, and a table's cell is at least one.
-fn sentences(text: &str) -> Vec<String> {
-    let mut fenced = false;
-    let mut paragraphs = vec![String::new()];
-    for line in text.lines() {
-        let start = line.trim_start();
-        fenced ^= start.starts_with("```");
-        if fenced || start.starts_with("```") || line.starts_with("    ") {
-            paragraphs.push(String::new());
-            continue;
-        }
-        let is_new = ["* ", "|", "#"].iter().any(|mark| start.starts_with(mark))
-            || start.starts_with(|c: char| c.is_ascii_digit());
-        for (cell, number) in start.split('|').zip(0..) {
-            if start.is_empty() || is_new || number > 0 {
-                paragraphs.push(String::new());
-            }
-            let last = paragraphs.last_mut().unwrap();
-            *last += " ";
-            *last += cell.trim();
-        }
-    }
-    let ends = [". ", "? ", "! ", ".** ", ".) "];
-    let mut sentences = paragraphs;
-    for end in ends {
-        let split = sentences.iter().flat_map(|text| text.split(end));
-        sentences = split.map(str::to_owned).collect();
-    }
-    sentences
-}
-
-/// Counts words. Text between backticks counts as one word, and so does an address.
-fn words(sentence: &str) -> usize {
-    let spoken: String = sentence.split('`').step_by(2).collect::<Vec<_>>().join("X");
-    let spoken = spoken
-        .split("](")
-        .map(|part| part.split_once(')').map_or(part, |(_, rest)| rest));
-    let spoken: String = spoken.collect::<Vec<_>>().join(" ");
-    let is_word = |word: &&str| word.contains(char::is_alphanumeric);
-    spoken.split_whitespace().filter(is_word).count()
-}
-
-#[test]
-fn sentences_are_short() {
-    assert_eq!(sentences("One. Two\nthree.\n* Four | five").len(), 4);
-    for document in ["README.md", "ROS_MASTER_URI.md"] {
-        for sentence in sentences(&read(document)) {
-            let words = words(&sentence);
-            assert!(
-                words <= 30,
-                "{document} has a sentence of {words} words: {sentence}"
-            );
-        }
     }
 }
 

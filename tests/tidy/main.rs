@@ -1,4 +1,4 @@
-//! Checks that no compiler makes: documents match the program, modules import downward only, files stay small.
+//! Checks that no compiler makes: documents match the program, modules import downward only.
 
 #![allow(
     clippy::unwrap_used,
@@ -14,16 +14,12 @@ mod commands;
 mod documents;
 mod lines;
 mod scripts;
-mod types;
 mod words;
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
-
-/// A longer file contains more than one idea.
-const LINES_MOST: usize = 800;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -189,17 +185,4 @@ fn only_the_clock_reads_the_wall_clock() {
         "status/condition.rs",
     ];
     assert_eq!(users, expected.map(|name| root().join("src").join(name)));
-}
-
-#[test]
-fn files_stay_small() {
-    let others = ["tests", "benches"].map(|folder| rust_files(&root().join(folder)));
-    for file in others.into_iter().flatten().chain(sources()) {
-        let lines = read(&file).lines().count();
-        assert!(
-            lines <= LINES_MOST,
-            "{} has {lines} lines; split it by idea",
-            file.display()
-        );
-    }
 }

@@ -1,13 +1,9 @@
-//! Plain English: phrases that must not come back, and sentences that are too long to read once.
+//! Plain English: phrases that must not come back.
 
 use std::{
     path::{Path, PathBuf},
     process::Command,
 };
-
-use clap::CommandFactory;
-use regex::Regex;
-use rosrescue::cli::Cli;
 
 use super::{read, root};
 
@@ -104,11 +100,6 @@ const PHRASES: &[(&str, &str)] = &[
     ("whoever", "(name the program or person)"),
 ];
 
-/// Maximum number of words of a sentence in `--help`.
-const HELP_WORDS: usize = 25;
-/// Maximum number of words of a sentence in the documents that a new user reads first.
-const GUIDE_WORDS: usize = 30;
-
 /// Files and folders whose words are not checked: this list, the examples of how to write, and the code of several
 /// computers with its tests.
 const UNCHECKED: [&str; 3] = [
@@ -198,119 +189,4 @@ fn phrases_that_confuse_do_not_come_back() {
         }
     }
     assert!(found.is_empty(), "{}", found.join("\n"));
-}
-
-/// The sentences of a paragraph. Code between backticks counts as one word, a link as its text.
-fn sentences(paragraph: &str) -> Vec<String> {
-    let code = Regex::new("`[^`]*`").unwrap();
-    let link = Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap();
-    let end = Regex::new(r"[.!?]\)?(?:\s+|$)").unwrap();
-    let plain = link.replace_all(paragraph, "$1");
-    let plain = code.replace_all(&plain, "code");
-    end.split(&plain).map(str::to_owned).collect()
-}
-
-/// The sentences of `paragraph` with more than `most` words.
-fn long(paragraph: &str, most: usize) -> Vec<String> {
-    let is_word = |word: &&str| word.chars().any(char::is_alphanumeric);
-    let mut sentences = sentences(paragraph);
-    sentences.retain(|sentence| sentence.split_whitespace().filter(is_word).count() > most);
-    sentences
-}
-
-/// Collects the long sentences in the help of `command` and its subcommands.
-fn long_in_help(command: &clap::Command, found: &mut Vec<String>) {
-    let default = Regex::new(r"\[default: [^\]]*\]").unwrap();
-    let mut texts: Vec<String> = Vec::new();
-    let own = [
-        command.get_about(),
-        command.get_long_about(),
-        command.get_after_help(),
-        command.get_after_long_help(),
-    ];
-    texts.extend(own.into_iter().flatten().map(ToString::to_string));
-    for argument in command.get_arguments() {
-        let help = [argument.get_help(), argument.get_long_help()];
-        texts.extend(help.into_iter().flatten().map(ToString::to_string));
-        let values = argument.get_possible_values();
-        let help = values.iter().filter_map(|value| value.get_help());
-        texts.extend(help.map(ToString::to_string));
-    }
-    for text in texts {
-        // Indented lines are examples of commands, and a default in brackets is no sentence.
-        let lines: Vec<_> = text
-            .lines()
-            .filter(|line| !line.starts_with("  "))
-            .collect();
-        let text = default.replace_all(&lines.join("\n"), "").into_owned();
-        for paragraph in text.split("\n\n").flat_map(|part| part.split("\n- ")) {
-            for sentence in long(paragraph, HELP_WORDS) {
-                found.push(format!("{}: {sentence}", command.get_name()));
-            }
-        }
-    }
-    for command in command.get_subcommands() {
-        long_in_help(command, found);
-    }
-}
-
-#[test]
-fn help_has_short_sentences() {
-    let mut found = Vec::new();
-    long_in_help(&Cli::command(), &mut found);
-    found.sort();
-    found.dedup();
-    assert!(found.is_empty(), "{found:#?}");
-}
-
-/// The paragraphs, list items and table cells of a document, without its code.
-fn paragraphs(document: &str) -> Vec<String> {
-    let mut paragraphs = Vec::new();
-    let mut present = String::new();
-    let mut is_code = false;
-    for line in document.lines() {
-        let text = line.trim();
-        if text.starts_with("```") {
-            is_code = !is_code;
-        }
-        let is_indented = line.starts_with("    ") && present.is_empty();
-        let begins = text.is_empty()
-            || text.starts_with(['#', '|', '!', '<', '>'])
-            || text.starts_with("* ")
-            || text.starts_with("- ")
-            || text
-                .split_once(". ")
-                .is_some_and(|(number, _)| number.parse::<u32>().is_ok());
-        if begins || is_code {
-            paragraphs.push(std::mem::take(&mut present));
-        }
-        if is_code || is_indented || text.is_empty() || text.starts_with(['#', '!', '<']) {
-            continue;
-        }
-        match text.starts_with('|') {
-            true => paragraphs.extend(text.split('|').map(str::to_owned)),
-            false => present = format!("{present} {text}"),
-        }
-    }
-    paragraphs.push(present);
-    paragraphs
-}
-
-#[test]
-fn the_first_documents_have_short_sentences() {
-    let twenty = "word ".repeat(20);
-    let text =
-        format!("# Title\n{twenty}\n{twenty}.\n\n    {twenty}{twenty}\n| {twenty} | {twenty} |\n");
-    let found = paragraphs(&text);
-    let found = found.iter().map(|part| long(part, GUIDE_WORDS).len());
-    assert_eq!(found.sum::<usize>(), 1);
-    for file in ["README.md", "ROS_MASTER_URI.md"] {
-        let text = read(file);
-        let found = paragraphs(&text);
-        let found: Vec<_> = found
-            .iter()
-            .flat_map(|part| long(part, GUIDE_WORDS))
-            .collect();
-        assert!(found.is_empty(), "{file}: {found:#?}");
-    }
 }
