@@ -18,6 +18,8 @@ use crate::{
         handover::{Guard, Sockets},
     },
     log::Stderr,
+    resolver,
+    ros_env::MasterUri,
     server::listener,
     task::boxed,
 };
@@ -30,6 +32,8 @@ use tracing_subscriber::{
 
 /// How long other threads may finish slow work, such as a name lookup, after rosrescue has stopped serving.
 const LAST_JOBS: Duration = Duration::from_millis(500);
+/// Longest time for the lookup of the host in `ROS_MASTER_URI`.
+const LOOKUP: Duration = Duration::from_secs(6);
 /// A signal to all processes named rosrescue, as sent by killall, reaches a worker twice: directly
 /// and through its guardian. A second signal within this time counts as the first one.
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
@@ -174,10 +178,32 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
             stopper.cancel();
         }
     });
+    if let Some(served) = sockets.addresses().first() {
+        let served = MasterUri {
+            port: served.port(),
+            ..config.advertised.clone()
+        };
+        // In the background: a dead name server must not delay the start.
+        crate::task::spawn(warn_of_another_master(served));
+    }
     let mut names = vec![hostname, config.advertised.host.clone()];
     names.extend(std::env::var("ROS_HOSTNAME").ok());
     app::run(config, sockets, names, stop, say).await?;
     Ok(())
+}
+
+/// Warns, as roscore does, if nodes with this environment would not use the rosrescue at `served`.
+async fn warn_of_another_master(served: MasterUri) {
+    let given = std::env::var("ROS_MASTER_URI").unwrap_or_default();
+    let Ok(uri) = MasterUri::parse(&given) else {
+        return;
+    };
+    if let Some(why) = resolver::why_not_here(&uri, served.port, LOOKUP).await {
+        tracing::warn!(
+            "ROS_MASTER_URI={given} {why}: nodes started with it do not use this rosrescue; where they start, run \
+             `export ROS_MASTER_URI={served}`"
+        );
+    }
 }
 
 /// Prints a line. A closed stdout is not an error.

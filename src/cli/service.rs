@@ -28,6 +28,9 @@ pub struct InstallArgs {
         conflicts_with = "user"
     )]
     pub run_as: Option<String>,
+    /// Install although ROS_MASTER_URI does not lead to this service
+    #[arg(long)]
+    pub other_master: bool,
     /// Command of the service: `core` or `proxy`, with options [default: core]
     #[arg(last = true, value_name = "COMMAND")]
     pub service: Vec<String>,

@@ -13,6 +13,7 @@ use std::{
     net::{SocketAddr, TcpListener},
     path::{Path, PathBuf},
     process::{self as system, Stdio},
+    time::Duration,
 };
 
 use clap::{CommandFactory, FromArgMatches};
@@ -27,10 +28,13 @@ use super::{
 use crate::{
     cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
     config::Config,
-    process,
+    process, resolver,
+    ros_env::MasterUri,
     server::listener,
 };
 
+/// Longest time for the lookup of the host in `ROS_MASTER_URI`.
+const LOOKUP: Duration = Duration::from_secs(6);
 const UNITS: [&str; 2] = ["rosrescue.service", "rosrescue.socket"];
 /// ROS's variables that concern the master.
 const SETTINGS: [&str; 5] = [
@@ -64,7 +68,7 @@ struct Plan {
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = Place::of(&args.scope)?;
     needs_root(&place, &args.scope)?;
-    carry_out(&install(args, &place)?, &args.scope)
+    carry_out(&install(args, &place).await?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
@@ -162,7 +166,7 @@ impl Place {
     }
 }
 
-fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
+async fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -206,6 +210,14 @@ fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
     }
     plan.obstacles
         .extend(misplaced(&program).filter(|_| !place.user));
+    if let Some(obstacle) = other_master(&settings, &service.advertised).await {
+        match args.other_master {
+            true => plan.notes.push(obstacle),
+            false => plan.obstacles.push(format!(
+                "{obstacle}, then run this again, or confirm it with --other-master"
+            )),
+        }
+    }
     let (disabled, before) = plan.plan_other_units(place, &service);
     let files = place.files();
     let [unit, socket_unit, dropin, socket_dropin] =
@@ -564,9 +576,22 @@ fn misplaced(program: &Path) -> Option<String> {
     })
 }
 
+/// Why nodes with the `ROS_MASTER_URI` of `settings` would not use the service at `served`, and what to do.
+async fn other_master(settings: &BTreeMap<String, String>, served: &MasterUri) -> Option<String> {
+    let given = settings.get("ROS_MASTER_URI")?;
+    let uri = MasterUri::parse(given).ok()?;
+    let why = resolver::why_not_here(&uri, served.port, LOOKUP).await?;
+    Some(format!(
+        "ROS_MASTER_URI={given} {why}: nodes started with it would not use this service. Run `export \
+         ROS_MASTER_URI={served}`"
+    ))
+}
+
 /// A parsed service command.
 struct Service {
     listen: Vec<SocketAddr>,
+    /// The address where nodes find the service.
+    advertised: MasterUri,
     /// Whether the command is `core`, which starts the master itself.
     runs_rosmaster: bool,
     /// Whether the service must find rosmaster on the PATH.
@@ -627,8 +652,10 @@ fn read_service(
             "write the full path of {file}: a service starts in /"
         )));
     }
+    let config = config.map_err(|error| usage(error.to_string()))?;
     Ok(Service {
-        listen: config.map_err(|error| usage(error.to_string()))?.listen,
+        listen: config.listen,
+        advertised: config.advertised,
         runs_rosmaster: rosmaster.is_some(),
         searches_rosmaster: rosmaster.is_some_and(Option::is_none),
     })

@@ -119,6 +119,30 @@ fn a_new_session_is_reported_as_new() {
     assert!(!said.contains("whole state was restored"), "{said}");
 }
 
+#[test]
+fn a_master_uri_that_does_not_lead_here_is_warned_of() {
+    let scratch = Scratch::new();
+    let warns = |line: &str| line.contains("ROS_MASTER_URI=");
+    for (master, why) in [
+        ("http://192.0.2.1:11311", "is another computer"),
+        ("http://nobody.invalid:11311", "has no address"),
+        ("http://localhost:1", "has port 1, and rosrescue has"),
+    ] {
+        let setup = Setup::core(&scratch, free_port()).env("ROS_MASTER_URI", master);
+        let mut rescue = setup.start();
+        let line = rescue.wait_line("the warning", |line| warns(line) && line.contains("WARN"));
+        let todo = format!(
+            "`export ROS_MASTER_URI=http://127.0.0.1:{}/`",
+            rescue.port()
+        );
+        assert!(line.contains(why) && line.contains(&todo), "{line}");
+    }
+    let setup = Setup::core(&scratch, free_port());
+    let own = format!("http://localhost:{}", setup.port);
+    let rescue = setup.env("ROS_MASTER_URI", own).start();
+    assert!(!rescue.stderr().iter().any(|line| warns(line)));
+}
+
 /// The gate stays open although rosmaster closes connections that were idle for four seconds.
 #[test]
 fn probes_keep_the_sentinel_from_being_idle() {

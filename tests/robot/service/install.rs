@@ -93,6 +93,51 @@ fn without_root_the_first_thing_it_says_is_that_it_needs_root() {
     }
 }
 
+/// Runs `rosrescue install --user --dry-run OPTIONS` with this `ROS_MASTER_URI`.
+fn dry_run(scratch: &Scratch, master: &str, options: &[&str]) -> Output {
+    let mut command = Command::new(PROGRAM);
+    scratch.prepare(&mut command);
+    command
+        .args(["install", "--user", "--dry-run"])
+        .args(options)
+        .env("HOME", scratch.path(""))
+        .env_remove("XDG_CONFIG_HOME")
+        .env("ROS_MASTER_URI", master)
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn a_master_uri_of_another_computer_has_to_be_confirmed() {
+    let scratch = Scratch::new();
+    for (master, why) in [
+        ("http://192.0.2.1:11311", "is another computer"),
+        ("http://nobody.invalid:11311", "has no address"),
+    ] {
+        let refused = said(&dry_run(&scratch, master, &[]), 1);
+        let obstacle = format!("cannot  ROS_MASTER_URI={master} {why}");
+        let todo =
+            "`export ROS_MASTER_URI=http://127.0.0.1:11311/`, then run this again, or confirm it";
+        assert!(
+            refused.contains(&obstacle) && refused.contains(todo),
+            "{refused}"
+        );
+        let confirmed = said(&dry_run(&scratch, master, &["--other-master"]), 0);
+        assert!(
+            confirmed.contains(&format!("note    ROS_MASTER_URI={master}")),
+            "{confirmed}"
+        );
+    }
+    said(&dry_run(&scratch, "http://localhost:11311", &[]), 0);
+    // Nodes with this environment would look for a master at another port.
+    let port = ["--", "core", "-p", "11411"];
+    let refused = said(&dry_run(&scratch, "http://localhost:11311", &port), 1);
+    assert!(
+        refused.contains("has port 11311, and rosrescue has 11411"),
+        "{refused}"
+    );
+}
+
 /// In a container, root may have no sudo and no variable with the user's name.
 #[test]
 fn a_dry_run_needs_no_sudo() {
