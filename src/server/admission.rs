@@ -7,7 +7,7 @@ use std::net::IpAddr;
 
 use hyper::{
     HeaderMap, StatusCode,
-    header::{CONTENT_TYPE, HOST, ORIGIN},
+    header::{HOST, ORIGIN},
 };
 
 use crate::master::{MASTER, Request};
@@ -21,40 +21,20 @@ pub(crate) struct Rejection {
     pub reason: String,
 }
 
-/// Content types that a browser sends to any site without asking that site first.
-const BROWSER_TYPES: [&str; 3] = [
-    "application/x-www-form-urlencoded",
-    "multipart/form-data",
-    "text/plain",
-];
+/// The browser's own word on where a request comes from. Pages cannot set or remove it.
+const SEC_FETCH_SITE: &str = "sec-fetch-site";
 
 /// Whether a POST with these headers may call the master. `names` are the names of this computer.
 ///
-/// A browser sends the page's origin with every POST, or `null` if it hides the origin. No ROS
-/// client sends an origin. The content type may be missing, as in a browser's POST of a typed
-/// array.
+/// Every browser since 2020 sends the page's origin with each POST, or `null` if it hides the origin. No ROS client
+/// sends an origin. The content type tells nothing: boards send the same ones as web pages, and a page can send a POST
+/// without one.
 pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
         check_origin(headers)?;
     }
-    let Some(content_type) = headers.get(CONTENT_TYPE) else {
-        return Ok(());
-    };
-    let content_type = String::from_utf8_lossy(content_type.as_bytes());
-    let essence = content_type
-        .split(';')
-        .next()
-        .unwrap_or_default()
-        .trim()
-        .to_ascii_lowercase();
-    if BROWSER_TYPES.contains(&essence.as_str()) {
-        return Err(Rejection {
-            status: StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            reason: format!("content type `{essence:.100}` is not accepted; XML-RPC is text/xml"),
-        });
-    }
-    Ok(())
+    check_site(headers)
 }
 
 /// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but a page
@@ -81,6 +61,20 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Rejection> {
         }
     }
     Ok(())
+}
+
+/// Whether the browser, if it is one, does not say that the request comes from a page of another site. A page at another
+/// port of this computer (`same-site`) is another site.
+fn check_site(headers: &HeaderMap) -> Result<(), Rejection> {
+    let site = headers.get_all(SEC_FETCH_SITE).iter();
+    let mut foreign = site.filter(|site| !matches!(site.as_bytes(), b"same-origin" | b"none"));
+    match foreign.next() {
+        None => Ok(()),
+        Some(_) => Err(Rejection {
+            status: StatusCode::FORBIDDEN,
+            reason: "a page of another site may not call the master".to_owned(),
+        }),
+    }
 }
 
 /// Whether `Host` is an address or a name of this computer. After DNS rebinding, a foreign page sends its own name,
@@ -161,6 +155,12 @@ mod tests {
                 ("host", "any.name.at.all"),
                 ("content-type", "text/xml; charset=utf-8"),
             ],
+            // Boards, which use the default of curl, wget or ESP-IDF.
+            &[
+                ("host", "pc:11311\\Accept: */*"),
+                ("content-type", "application/x-www-form-urlencoded"),
+            ],
+            &[("content-type", "text/plain;charset=UTF-8")],
             &[],
         ] {
             assert_eq!(check_post(&headers(pairs), &[]), Ok(()));
@@ -170,41 +170,35 @@ mod tests {
     #[test]
     fn web_pages_do_not() {
         let own = ["robot".to_owned()];
-        for (pairs, status) in [
-            (&[("content-type", "text/plain;charset=UTF-8")][..], 415),
-            (
-                &[("content-type", "application/x-www-form-urlencoded")],
-                415,
-            ),
-            (
-                &[
-                    ("origin", "http://evil.example"),
-                    ("host", "evil.example:11311"),
-                ],
-                403,
-            ),
-            (
-                &[
-                    ("origin", "http://evil.example"),
-                    ("host", "10.0.0.5:11311"),
-                ],
-                403,
-            ),
-            (
-                &[("origin", "http://robot:8000"), ("host", "robot:11311")],
-                403,
-            ),
-            (&[("origin", "null"), ("host", "robot:11311")], 403),
-            (&[("origin", "http://robot:11311")], 403),
+        for pairs in [
+            &[
+                ("origin", "http://evil.example"),
+                ("host", "evil.example:11311"),
+            ][..],
+            &[
+                ("origin", "http://evil.example"),
+                ("host", "10.0.0.5:11311"),
+            ],
+            &[("origin", "http://robot:8000"), ("host", "robot:11311")],
+            &[("origin", "null"), ("host", "robot:11311")],
+            &[("origin", "http://robot:11311")],
+            &[("sec-fetch-site", "cross-site"), ("host", "localhost")],
+            &[("sec-fetch-site", "same-site"), ("host", "localhost")],
+            &[
+                ("sec-fetch-site", "cross-site"),
+                ("origin", "http://robot:11311"),
+                ("host", "robot:11311"),
+            ],
         ] {
             let refusal = check_post(&headers(pairs), &own).unwrap_err();
-            assert_eq!(refusal.status.as_u16(), status, "{pairs:?}");
+            assert_eq!(refusal.status.as_u16(), 403, "{pairs:?}");
         }
         for host in ["Robot:11311", "10.0.0.5:11311", "[::1]:11311"] {
             let mut same_site = headers(&[("origin", "http://robot:11311")]);
             let origin = format!("http://{}", host.to_lowercase());
             same_site.insert(ORIGIN, origin.parse().unwrap());
             same_site.insert(HOST, host.parse().unwrap());
+            same_site.insert(SEC_FETCH_SITE, HeaderValue::from_static("same-origin"));
             assert_eq!(check_post(&same_site, &own), Ok(()));
         }
         // The computer's domains are unknown, so such a page may read but not make changes.

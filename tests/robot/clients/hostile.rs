@@ -244,29 +244,40 @@ fn a_web_page_cannot_change_anything() {
     let text = String::from_utf8(body.clone()).unwrap();
     let post =
         |head: &str| format!("POST / HTTP/1.1\r\n{head}Content-Length: {length}\r\n\r\n{text}");
-    let request_of = |kind: &str, more: &str| {
-        post(&format!(
-            "Host: evil.example\r\nContent-Type: {kind}\r\n{more}"
-        ))
-    };
     // As sent by `fetch(url, {method: 'POST', mode: 'no-cors', body: new Uint8Array(...)})`.
     let address = format!("Host: 127.0.0.1:{}\r\n", robot.port());
     let untyped = |origin: &str| post(&format!("{address}Origin: {origin}\r\n"));
-    for bytes in [
-        request_of("text/plain", "Origin: http://evil.example\r\n"),
-        request_of("text/plain;charset=UTF-8", ""),
-        request_of("application/x-www-form-urlencoded", ""),
-        request_of("multipart/form-data; boundary=x", ""),
-        request_of("text/xml", "Origin: http://evil.example\r\n"),
+    // The content types that a browser sends without asking first, and XML-RPC's.
+    let types = [
+        "text/plain",
+        "text/plain;charset=UTF-8",
+        "application/x-www-form-urlencoded",
+        "multipart/form-data; boundary=x",
+        "text/xml",
+    ];
+    let foreign = [
+        "Origin: http://evil.example",
+        "Origin: null",
+        "Sec-Fetch-Site: cross-site",
+        "Sec-Fetch-Site: same-site",
+    ];
+    let of_pages = types.iter().flat_map(|kind| {
+        let (post, address) = (&post, &address);
+        let of = foreign.iter();
+        of.map(move |header| post(&format!("{address}Content-Type: {kind}\r\n{header}\r\n")))
+    });
+    let untyped_or_rebound = [
         untyped("http://evil.example"),
         untyped("http://127.0.0.1:8000"),
         untyped("null"),
-        post(&format!(
-            "{address}Content-Type: text/xml\r\nOrigin: http://evil.example\r\n"
-        )),
-    ] {
+        // A page whose own name was pointed at this address.
+        post(
+            "Host: evil.example\r\nOrigin: http://evil.example\r\nSec-Fetch-Site: same-origin\r\n",
+        ),
+    ];
+    for bytes in of_pages.chain(untyped_or_rebound) {
         let response = client.exchange(bytes.as_bytes()).unwrap();
-        assert!(response.code >= 400, "{}: {bytes}", response.status);
+        assert_eq!(response.code, 403, "{}: {bytes}", response.status);
     }
     assert_eq!(robot.bare().param("/evil"), None);
     let fine = [
@@ -275,6 +286,9 @@ fn a_web_page_cannot_change_anything() {
         post(&address).into_bytes(),
         post("Host: robot.example:11311\r\nContent-Type: text/xml\r\n").into_bytes(),
         post("").into_bytes(),
+        // Boards, with the default content type of curl, wget and ESP-IDF.
+        post("Content-Type: application/x-www-form-urlencoded\r\n").into_bytes(),
+        post("Content-Type: text/plain\r\n").into_bytes(),
         // A page that rosrescue itself has served.
         untyped(&format!("http://127.0.0.1:{}", robot.port())).into_bytes(),
     ];
