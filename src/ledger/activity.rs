@@ -9,7 +9,7 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 
 use crate::{
-    master::{self, Displaced, Kind, Master, Method, NoticeSink, Request, names},
+    master::{self, Displaced, Effect, Master, NoticeSink, Request, Write},
     order::Subject,
     xmlrpc::{Call, Value},
 };
@@ -266,16 +266,12 @@ impl Activity {
 
     /// Notes the topic registrations that `call` removes, before it is applied to `mirror`.
     pub(super) fn note_lost(&mut self, mirror: &Master, call: &Request) {
-        for call in call.calls() {
-            let publishes = match call.method() {
-                Method::UnregisterPublisher => true,
-                Method::UnregisterSubscriber => false,
+        for write in Write::all(call) {
+            let (node, publishes, topic) = match write.effect {
+                Effect::UnregisterPublisher { topic, .. } => (write.caller, true, topic),
+                Effect::UnregisterSubscriber { topic, .. } => (write.caller, false, topic),
                 _ => continue,
             };
-            let (Some(node), Some(name)) = (call.caller(), call.text(1)) else {
-                continue;
-            };
-            let topic = names::resolve(name, node);
             if let Some(api) = mirror.api_of(node)
                 && mirror.has_topic(node, publishes, &topic)
                 && node.len() + api.len() + topic.len() <= LOST_MOST
@@ -287,7 +283,7 @@ impl Activity {
                     node: node.to_owned(),
                     api: api.to_owned(),
                     publishes,
-                    topic,
+                    topic: topic.into_owned(),
                 });
             }
         }
@@ -304,11 +300,12 @@ impl Activity {
     }
 
     fn note(&mut self, now: Instant, call: &Request) {
-        let Some(caller) = call.caller() else {
+        let Some(write) = Write::of(call) else {
             return;
         };
+        let caller = write.caller;
         self.count += 1;
-        if call.registrant().is_some() {
+        if write.registrant().is_some() {
             self.last_calls
                 .entry(caller.to_owned())
                 .or_default()
@@ -316,7 +313,7 @@ impl Activity {
             if self.unidentified.len() < NOTICES {
                 self.unidentified.insert(caller.to_owned(), now);
             }
-        } else if call.kind() == Kind::Unregister {
+        } else if write.unregisters() {
             self.last_calls
                 .entry(caller.to_owned())
                 .or_default()

@@ -5,7 +5,11 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-use crate::{health::port_of, master::Request, ros_env::MasterUri};
+use crate::{
+    health::port_of,
+    master::{Request, Write},
+    ros_env::MasterUri,
+};
 
 /// Maximum number of hosts that are remembered. A robot has few.
 const MOST: usize = 1024;
@@ -21,8 +25,8 @@ impl Served {
 
     /// Notes the host of the node that `call` registers.
     pub(crate) fn add(&self, call: &Request) {
-        for call in call.calls() {
-            let Some(host) = call.registrant().and_then(|(_, api)| host_of(api)) else {
+        for write in Write::all(call) {
+            let Some(host) = write.registrant().and_then(|(_, api)| host_of(api)) else {
                 continue;
             };
             let mut hosts = self.lock();

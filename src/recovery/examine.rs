@@ -15,7 +15,7 @@ use crate::{
     ledger::{Basis, Ledger, late::CatchUp},
     lifecycle::{Input, Probing, Supervision},
     limit::rarely,
-    master::{self, Counts, Master, Method, Request},
+    master::{self, Counts, Effect, Master, Request, Write},
     nodes::client::{self, Reaction},
     process::{self, listeners},
     replay::{
@@ -400,8 +400,13 @@ impl Examiner {
                 });
                 // A master does not tell which nodes subscribe to parameters.
                 let hidden = |call: &Request| {
-                    let method = call.method();
-                    matches!(method, Method::SubscribeParam | Method::UnsubscribeParam)
+                    let hidden = |write: Write<'_>| {
+                        matches!(
+                            write.effect,
+                            Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. }
+                        )
+                    };
+                    Write::of(call).is_some_and(hidden)
                 };
                 if state != found || pending.iter().any(hidden) {
                     (state, Change::Replace(before))

@@ -21,7 +21,7 @@ use crate::{
     gate::{self, State},
     ledger::{Ledger, Mark, delivery::Delivery},
     limit::rarely,
-    master::{Master, Method, Request},
+    master::{Effect, Master, Request, Write},
     order::Order,
     status::stats::Stats,
     upstream::{RawReply, inspect::InspectError, next::NextConnection},
@@ -701,15 +701,13 @@ impl Answers {
 
 /// Whether `call`, or an entry of it, registers something for a node.
 fn registers(call: &Request) -> bool {
-    let mut calls = call.calls().into_iter();
-    calls.any(|call| call.registrant().is_some())
+    Write::all(call).any(|write| write.registrant().is_some())
 }
 
 /// Whether `call`, or an entry of it, subscribes to a parameter. The reply contains the parameter's
 /// value.
 fn subscribes_params(call: &Request) -> bool {
-    let mut calls = call.calls().into_iter();
-    calls.any(|call| *call.method() == Method::SubscribeParam)
+    Write::all(call).any(|write| matches!(write.effect, Effect::SubscribeParam { .. }))
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`Request`]: a call, parsed once, with its [`Method`] and its [`Kind`].
+//! * [`Write`]: a call that changes the state, with its arguments by name.
 //!
 //! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that clients can
 //! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that no ROS client
@@ -26,6 +27,7 @@ mod tell;
 mod tests;
 mod updates;
 mod would_change;
+mod write;
 
 pub use api::{Applied, Method, is_success};
 pub use kind::Kind;
@@ -42,3 +44,4 @@ pub use tell::{
     Displaced, MASTER, PARAM_UPDATE, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update,
     publisher_update, question, shutdown,
 };
+pub use write::{Effect, Write};

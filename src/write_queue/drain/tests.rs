@@ -6,6 +6,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 
 use super::*;
+use crate::master::Method;
 use crate::{
     checkpoint::format::Session,
     cli::SyncPolicy,

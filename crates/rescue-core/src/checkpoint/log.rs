@@ -12,7 +12,7 @@ use crate::{
         session::{Rebuilt, rebuild},
     },
     hide::Hide,
-    master::{Master, Method, Request, names},
+    master::{Effect, Master, Request, Write, names},
 };
 
 /// The state at an earlier time.
@@ -248,29 +248,35 @@ impl LogReader {
 
 /// Applies `call`, which is no multicall, to `state`. Returns what it changed.
 fn changes(state: &mut Master, call: &Request, hide: &Hide) -> Vec<Difference> {
-    let Some(caller) = call.caller() else {
+    let Some(write) = Write::of(call) else {
         state.apply_telling(call, &mut ());
         return Vec::new();
     };
-    let name = call.text(1).map(|name| names::resolve(name, caller));
-    let name = name.unwrap_or_default();
+    let (caller, name) = (write.caller, write.name());
     let facts = |state: &Master| Facts {
         api: state.api_of(caller).map(str::to_owned),
-        value: of_subject(state, call, &name),
+        value: registration_of(state, &write),
     };
-    let method = call.method();
-    let (what, param) = match method {
-        Method::SetParam | Method::DeleteParam => (What::Parameter, state.param(&name)),
-        Method::RegisterPublisher | Method::UnregisterPublisher => (What::Publisher, None),
-        Method::RegisterSubscriber | Method::UnregisterSubscriber => (What::Subscriber, None),
-        Method::RegisterService | Method::UnregisterService => (What::Service, None),
-        _ => (What::ParamSubscriber, None),
+    let (what, param) = match &write.effect {
+        Effect::SetParam { key, .. } | Effect::DeleteParam { key } => {
+            (What::Parameter, state.param(key))
+        }
+        Effect::RegisterPublisher { .. } | Effect::UnregisterPublisher { .. } => {
+            (What::Publisher, None)
+        }
+        Effect::RegisterSubscriber { .. } | Effect::UnregisterSubscriber { .. } => {
+            (What::Subscriber, None)
+        }
+        Effect::RegisterService { .. } | Effect::UnregisterService { .. } => (What::Service, None),
+        Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. } => {
+            (What::ParamSubscriber, None)
+        }
     };
     let before = facts(state);
     state.apply_telling(call, &mut ());
     let after = facts(state);
     if what == What::Parameter {
-        return compare_param(&name, param.as_ref(), state.param(&name).as_ref(), hide);
+        return compare_param(name, param.as_ref(), state.param(name).as_ref(), hide);
     }
     let difference = |what, name: &str, node, a, b| Difference {
         what,
@@ -286,7 +292,7 @@ fn changes(state: &mut Master, call: &Request, hide: &Hide) -> Vec<Difference> {
     }
     if before.value != after.value {
         let node = Some(caller.to_owned());
-        found.push(difference(what, &name, node, before.value, after.value));
+        found.push(difference(what, name, node, before.value, after.value));
     }
     found
 }
@@ -299,28 +305,28 @@ struct Facts {
     value: Option<String>,
 }
 
-/// The caller's registration that `call` is about.
-fn of_subject(state: &Master, call: &Request, name: &str) -> Option<String> {
-    let caller = call.caller()?;
+/// The caller's registration that `write` is about.
+fn registration_of(state: &Master, write: &Write<'_>) -> Option<String> {
+    let (caller, name) = (write.caller, write.name());
     let topic = |publishes| {
         let there = state.has_topic(caller, publishes, name);
         there.then(|| state.type_of(name).unwrap_or_default().to_owned())
     };
-    match call.method() {
-        Method::RegisterPublisher | Method::UnregisterPublisher => topic(true),
-        Method::RegisterSubscriber | Method::UnregisterSubscriber => topic(false),
-        Method::RegisterService | Method::UnregisterService => {
+    match write.effect {
+        Effect::RegisterPublisher { .. } | Effect::UnregisterPublisher { .. } => topic(true),
+        Effect::RegisterSubscriber { .. } | Effect::UnregisterSubscriber { .. } => topic(false),
+        Effect::RegisterService { .. } | Effect::UnregisterService { .. } => {
             let node = state.provider_of(name)?;
             let mut services = state.services_of(node);
             let (_, api) = services.find(|(service, _)| *service == name)?;
             Some(format!("{node} at {api}"))
         }
-        Method::SubscribeParam | Method::UnsubscribeParam => {
+        Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. } => {
             let key = names::param_key(name);
             let mut keys = state.param_subscriptions(caller);
             keys.any(|it| it == key).then(String::new)
         }
-        _ => None,
+        Effect::SetParam { .. } | Effect::DeleteParam { .. } => None,
     }
 }
 

@@ -10,14 +10,14 @@ pub mod wire;
 
 use std::fmt;
 
-use self::changes::param_of;
 pub(super) use self::changes::value_at;
+use self::changes::{param_of, param_path};
 pub use self::{
     changes::{ChangeSubject, Changes, parameter_of},
     pending::{WritesToSend, weight},
 };
 use crate::{
-    master::{Master, Method, Request, names},
+    master::{Effect, Master, Method, Request, Write, names},
     xmlrpc::Value,
 };
 
@@ -136,8 +136,8 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let parts: Vec<&str> = names::parts(&path).collect();
     let present = value_at(now.params(), &parts).cloned();
     if matches!(why, Conflict::Parameter(_)) && !parts.is_empty() {
-        let wanted = match call.method() {
-            Method::SetParam => call.params().get(2),
+        let wanted = match Write::of(call).map(|write| write.effect) {
+            Some(Effect::SetParam { value, .. }) => Some(value),
             _ => None,
         };
         if wanted == present.as_ref() {
@@ -146,14 +146,7 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     }
     // The present owner of the name or service has already ended that registration.
     let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
-    let unregisters = matches!(
-        call.method(),
-        Method::UnregisterPublisher
-            | Method::UnregisterSubscriber
-            | Method::UnregisterService
-            | Method::UnsubscribeParam
-    );
-    if over && unregisters {
+    if over && Write::of(call).is_some_and(|write| write.unregisters()) {
         return Verdict::Holds;
     }
     let call = call.clone();
@@ -161,37 +154,43 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
 }
 
 fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict> {
-    let caller = call.caller()?;
-    let name = || Some(names::resolve(call.text(1)?, caller));
-    let node = |at: usize| node(changes, now, caller, call.text(at)?);
-    let registered_again = |publishes| {
+    let write = Write::of(call)?;
+    let caller = write.caller;
+    let node = |api| node(changes, now, caller, api);
+    let registered_again = |publishes, topic: &str| {
         let subject = ChangeSubject::Topic {
             publishes,
-            topic: name()?,
+            topic: topic.to_owned(),
             node: caller.to_owned(),
         };
-        let registered = changes.has(&subject) && now.has_topic(caller, publishes, &name()?);
-        registered.then_some(())?;
-        Some(Conflict::Registration {
-            name: name()?,
+        let registered = changes.has(&subject) && now.has_topic(caller, publishes, topic);
+        registered.then(|| Conflict::Registration {
+            name: topic.to_owned(),
             node: caller.to_owned(),
         })
     };
-    match call.method() {
-        Method::SetParam | Method::DeleteParam => {
-            let changed = changes.has_param(&param_of(call)?);
-            changed.then_some(())?;
-            Some(Conflict::Parameter(name()?))
+    match &write.effect {
+        Effect::SetParam { key, .. } | Effect::DeleteParam { key } => {
+            let changed = changes.has_param(&param_path(key));
+            changed.then(|| Conflict::Parameter(key.to_string()))
         }
-        Method::RegisterPublisher | Method::RegisterSubscriber => node(3),
-        Method::UnregisterPublisher => node(2).or_else(|| registered_again(true)),
-        Method::UnregisterSubscriber => node(2).or_else(|| registered_again(false)),
-        Method::RegisterService => {
-            node(3).or_else(|| service(changes, now, &name()?, call.text(2)?))
+        Effect::RegisterPublisher { api, .. } | Effect::RegisterSubscriber { api, .. } => node(api),
+        Effect::UnregisterPublisher { topic, api } => {
+            node(api).or_else(|| registered_again(true, topic))
         }
-        Method::UnregisterService => service(changes, now, &name()?, call.text(2)?),
-        Method::SubscribeParam | Method::UnsubscribeParam => node(1),
-        _ => None,
+        Effect::UnregisterSubscriber { topic, api } => {
+            node(api).or_else(|| registered_again(false, topic))
+        }
+        Effect::RegisterService {
+            service: name,
+            service_api,
+            api,
+        } => node(api).or_else(|| service(changes, now, name, service_api)),
+        Effect::UnregisterService {
+            service: name,
+            service_api,
+        } => service(changes, now, name, service_api),
+        Effect::SubscribeParam { api, .. } | Effect::UnsubscribeParam { api, .. } => node(api),
     }
 }
 

@@ -3,7 +3,7 @@
 
 use super::{Evidence, mutant::WrongRule, port_of};
 use crate::{
-    master::{Master, Request},
+    master::{Master, Request, Write},
     replay::Token,
 };
 
@@ -39,7 +39,7 @@ impl Moving {
         }
         let mut after = mirror.clone();
         after.apply_telling(call, &mut ());
-        for (node, to) in call.calls().into_iter().filter_map(Request::registrant) {
+        for (node, to) in Write::all(call).filter_map(|write| write.registrant()) {
             let Some(from) = mirror.api_of(node) else {
                 continue;
             };
@@ -64,7 +64,7 @@ impl Moving {
 
     /// Whether `call` moves a name.
     pub fn is_any(mirror: &Master, call: &Request) -> bool {
-        let mut names = call.calls().into_iter().filter_map(Request::registrant);
+        let mut names = Write::all(call).filter_map(|write| write.registrant());
         names.any(|(node, to)| {
             let from = mirror.api_of(node);
             from.is_some_and(|from| port_of(from) != port_of(to) && !Token::is_ours(node))

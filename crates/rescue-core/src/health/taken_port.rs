@@ -8,7 +8,7 @@ use std::collections::HashMap;
 
 use super::port_of;
 use crate::{
-    master::{Master, Request},
+    master::{Master, Request, Write},
     replay::Token,
 };
 
@@ -41,7 +41,7 @@ impl<'a> Holders<'a> {
 
 /// The nodes for which `call` or one of its entries registers something, with their ports.
 fn registrants(call: &Request) -> Vec<(&str, &str)> {
-    let registrants = call.calls().into_iter().filter_map(Request::registrant);
+    let registrants = Write::all(call).filter_map(|write| write.registrant());
     registrants
         .map(|(node, api)| (node, port_of(api)))
         .collect()

@@ -2,7 +2,7 @@
 
 use crate::{
     health::port_of,
-    master::{Master, Method, Request, names},
+    master::{Effect, Master, Method, Request, Write, names},
 };
 
 /// What a call or a notification is about.
@@ -61,39 +61,33 @@ impl Concern {
             };
         };
         let mut concern = Self::default();
-        match call.method() {
-            Method::Multicall => call.calls().into_iter().for_each(|call| concern.add(call)),
-            _ => concern.add(call),
-        }
+        Write::all(call).for_each(|write| concern.add(&write));
         concern
     }
 
-    fn add(&mut self, call: &Request) {
-        let Some(caller) = call.caller() else { return };
-        let resolved = |at: usize| {
-            let name = call.text(at).filter(|name| !name.is_empty())?;
-            Some(names::resolve(name, caller))
+    fn add(&mut self, write: &Write<'_>) {
+        let topic = |topic: &str| Some(Subject::Topic(topic.to_owned()));
+        let param = |key: &str| Some(Subject::Param(names::param_key(key)));
+        let (told, heard) = match &write.effect {
+            Effect::RegisterPublisher { topic: name, .. }
+            | Effect::UnregisterPublisher { topic: name, .. } => (topic(name), None),
+            Effect::SetParam { key, .. } | Effect::DeleteParam { key } => (param(key), None),
+            Effect::RegisterSubscriber { topic: name, .. } => (None, topic(name)),
+            Effect::SubscribeParam { key, .. } => (None, param(key)),
+            Effect::RegisterService { .. }
+            | Effect::UnregisterService { .. }
+            | Effect::UnregisterSubscriber { .. }
+            | Effect::UnsubscribeParam { .. } => (None, None),
         };
-        let topic = || resolved(1).map(Subject::Topic);
-        let param = |at| resolved(at).map(|key| Subject::Param(names::param_key(&key)));
-        match call.method() {
-            Method::RegisterPublisher | Method::UnregisterPublisher => self.tells.extend(topic()),
-            Method::SetParam | Method::DeleteParam => self.tells.extend(param(1)),
-            _ => {}
-        }
-        let Some((node, api)) = call.registrant() else {
+        self.tells.extend(told);
+        let Some((node, api)) = write.registrant() else {
             return;
         };
         let port = port_of(api);
-        let subject = match call.method() {
-            Method::RegisterSubscriber => topic(),
-            Method::SubscribeParam => param(2),
-            _ => None,
-        };
         // A node of this name at another address will be shut down.
         let name = Subject::Name(node.to_owned());
         self.tells.push(name.clone());
-        let subjects = [Some(name), subject].into_iter().flatten();
+        let subjects = [Some(name), heard].into_iter().flatten();
         self.hears.extend(subjects.map(|subject| Heard {
             port: port.to_owned(),
             subject,

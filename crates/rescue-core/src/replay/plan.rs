@@ -7,7 +7,7 @@ use bytes::Bytes;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
 use super::{Token, order};
-use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable};
+use crate::master::{CALLER_ID, Master, Method, Request, Write, reply_entry, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
 /// Maximum number of mismatches in an error.
@@ -338,12 +338,10 @@ fn is_alike(result: &Value, predicted: &Value) -> bool {
 /// Names a call that was not answered as predicted.
 fn mismatch(call: &Request) -> String {
     let method = call.method();
-    let at = match method {
-        Method::SubscribeParam => 2,
-        _ => 1,
-    };
-    let subject = call.text(at).map_or_else(String::new, |subject| {
-        format!(" of `{subject}` by `{}`", call.caller().unwrap_or_default())
+    let write = Write::of(call);
+    let name = write.as_ref().map(Write::name).or_else(|| call.text(1));
+    let subject = name.map_or_else(String::new, |name| {
+        format!(" of `{name}` by `{}`", call.caller().unwrap_or_default())
     });
     format!("{method}{subject} was not answered as predicted")
 }

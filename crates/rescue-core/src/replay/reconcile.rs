@@ -2,7 +2,7 @@
 //! latest token: the one with the highest number that rosrescue knows.
 
 use super::{Token, restore};
-use crate::master::{Master, Method, Request, names};
+use crate::master::{Effect, Master, Method, Request, Write, names};
 use crate::xmlrpc::Value;
 
 /// Which side wins where the mirror and a master with the latest [`Token`] differ.
@@ -43,10 +43,12 @@ pub fn reconcile(
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
+        let Some(Write { caller, effect }) = Write::of(call) else {
+            continue;
+        };
         // A node that has another address by now has lost its earlier subscriptions.
-        let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
-        if *call.method() == Method::UnsubscribeParam
-            && known.is_none_or(|known| call.text(1) == Some(known))
+        if let Effect::UnsubscribeParam { api, .. } = effect
+            && mirror.api_of(caller).is_none_or(|known| known == api)
         {
             let params = call.params().iter().cloned();
             master.apply_telling(&Request::new(Method::SubscribeParam, params), &mut ());

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use super::{Entry, Kind, Master, Notice, NoticeSink, Request, returnable};
+use super::{Effect, Entry, Kind, Master, Notice, NoticeSink, Request, returnable, write};
 use crate::xmlrpc::{Reply, Value};
 
 /// What a method returns: status code, message, value.
@@ -24,17 +24,28 @@ pub(crate) enum Failure {
 }
 
 /// The arguments of a method.
-pub(crate) struct Args<'a> {
+#[derive(Clone, Copy)]
+pub(crate) struct Arguments<'a> {
     pub(crate) caller_id: &'a str,
     /// The parameters after the caller id.
-    params: &'a [Value],
-    pub(crate) notices: &'a mut dyn NoticeSink,
+    pub(crate) rest: &'a [Value],
 }
 
-impl<'a> Args<'a> {
+impl<'a> Arguments<'a> {
     pub(crate) fn params<const N: usize>(&self) -> Result<&'a [Value; N], Failure> {
-        self.params.try_into().map_err(|_| bad_arity())
+        self.rest.try_into().map_err(|_| bad_arity())
     }
+}
+
+/// Checks and names the arguments of a write.
+pub(crate) type Decoder = for<'a> fn(Arguments<'a>) -> Result<Effect<'a>, Failure>;
+
+/// How a method is run.
+enum Run {
+    /// The method changes nothing.
+    Read(for<'a> fn(&mut Master, Arguments<'a>) -> MethodResult),
+    /// The method does what its arguments are decoded to.
+    Write(Decoder),
 }
 
 /// The properties of a Master API method.
@@ -44,7 +55,7 @@ struct Spec {
     arity: usize,
     /// The value of an answer that reports an error.
     error: fn() -> Value,
-    run: fn(&mut Master, Args<'_>) -> MethodResult,
+    run: Run,
 }
 
 const MULTICALL: &str = "system.multicall";
@@ -66,7 +77,7 @@ const ATTRIBUTES: [(&str, &str); 11] = [
 ];
 
 macro_rules! methods {
-    ($($method:ident $name:literal $kind:ident $arity:literal $error:expr => $run:ident;)*) => {
+    ($($method:ident $name:literal $kind:ident $arity:literal $error:expr => $run:expr;)*) => {
         /// A method of the Master API, or any other method that a client may call.
         #[derive(Clone, Debug, PartialEq, Eq, Hash)]
         pub enum Method {
@@ -100,7 +111,7 @@ macro_rules! methods {
                         kind: Kind::$kind,
                         arity: $arity,
                         error: || $error,
-                        run: Master::$run,
+                        run: $run,
                     } }),)*
                     Self::Multicall | Self::Unknown(_) => None,
                 }
@@ -110,28 +121,28 @@ macro_rules! methods {
 }
 
 methods! {
-    RegisterPublisher "registerPublisher" Mutate 4 list() => register_publisher;
-    RegisterSubscriber "registerSubscriber" Mutate 4 list() => register_subscriber;
-    RegisterService "registerService" Mutate 4 0.into() => register_service;
-    SetParam "setParam" Mutate 3 0.into() => set_param;
-    GetParam "getParam" Read 2 0.into() => get_param;
-    HasParam "hasParam" Read 2 false.into() => has_param;
-    LookupService "lookupService" Read 2 "".into() => lookup_service;
-    LookupNode "lookupNode" Read 2 "".into() => lookup_node;
-    UnregisterPublisher "unregisterPublisher" Unregister 3 0.into() => unregister_publisher;
-    UnregisterSubscriber "unregisterSubscriber" Unregister 3 0.into() => unregister_subscriber;
-    UnregisterService "unregisterService" Unregister 3 0.into() => unregister_service;
-    SubscribeParam "subscribeParam" Mutate 3 0.into() => subscribe_param;
-    UnsubscribeParam "unsubscribeParam" Unregister 3 0.into() => unsubscribe_param;
-    DeleteParam "deleteParam" Mutate 2 0.into() => delete_param;
-    SearchParam "searchParam" Read 2 0.into() => search_param;
-    GetParamNames "getParamNames" Read 1 list() => get_param_names;
-    GetSystemState "getSystemState" Read 1 vec![list(), list(), list()].into() => get_system_state;
-    GetPublishedTopics "getPublishedTopics" Read 2 0.into() => get_published_topics;
-    GetTopicTypes "getTopicTypes" Read 1 list() => get_topic_types;
-    GetPid "getPid" Identity 1 (-1).into() => get_pid;
-    GetUri "getUri" Identity 1 "".into() => get_uri;
-    Shutdown "shutdown" Shutdown 2 0.into() => shutdown;
+    RegisterPublisher "registerPublisher" Mutate 4 list() => Run::Write(write::register_publisher);
+    RegisterSubscriber "registerSubscriber" Mutate 4 list() => Run::Write(write::register_subscriber);
+    RegisterService "registerService" Mutate 4 0.into() => Run::Write(write::register_service);
+    SetParam "setParam" Mutate 3 0.into() => Run::Write(write::set_param);
+    GetParam "getParam" Read 2 0.into() => Run::Read(Master::get_param);
+    HasParam "hasParam" Read 2 false.into() => Run::Read(Master::has_param);
+    LookupService "lookupService" Read 2 "".into() => Run::Read(Master::lookup_service);
+    LookupNode "lookupNode" Read 2 "".into() => Run::Read(Master::lookup_node);
+    UnregisterPublisher "unregisterPublisher" Unregister 3 0.into() => Run::Write(write::unregister_publisher);
+    UnregisterSubscriber "unregisterSubscriber" Unregister 3 0.into() => Run::Write(write::unregister_subscriber);
+    UnregisterService "unregisterService" Unregister 3 0.into() => Run::Write(write::unregister_service);
+    SubscribeParam "subscribeParam" Mutate 3 0.into() => Run::Write(write::subscribe_param);
+    UnsubscribeParam "unsubscribeParam" Unregister 3 0.into() => Run::Write(write::unsubscribe_param);
+    DeleteParam "deleteParam" Mutate 2 0.into() => Run::Write(write::delete_param);
+    SearchParam "searchParam" Read 2 0.into() => Run::Read(Master::search_param);
+    GetParamNames "getParamNames" Read 1 list() => Run::Read(Master::get_param_names);
+    GetSystemState "getSystemState" Read 1 vec![list(), list(), list()].into() => Run::Read(Master::get_system_state);
+    GetPublishedTopics "getPublishedTopics" Read 2 0.into() => Run::Read(Master::get_published_topics);
+    GetTopicTypes "getTopicTypes" Read 1 list() => Run::Read(Master::get_topic_types);
+    GetPid "getPid" Identity 1 (-1).into() => Run::Read(Master::get_pid);
+    GetUri "getUri" Identity 1 "".into() => Run::Read(Master::get_uri);
+    Shutdown "shutdown" Shutdown 2 0.into() => Run::Read(Master::shutdown);
 }
 
 impl fmt::Display for Method {
@@ -145,6 +156,14 @@ impl Method {
     /// entries.
     pub(crate) fn kind(&self) -> Kind {
         self.spec().map_or(Kind::Unknown, |spec| spec.kind)
+    }
+
+    /// The decoder of a write. `None` for a method that changes nothing, and for a multicall.
+    pub(crate) fn decoder(&self) -> Option<Decoder> {
+        match self.spec()?.run {
+            Run::Read(_) => None,
+            Run::Write(decode) => Some(decode),
+        }
     }
 }
 
@@ -284,12 +303,21 @@ impl Master {
         let Some(caller_id) = caller_id.as_str() else {
             return refused("caller_id must be a string");
         };
-        let args = Args {
-            caller_id,
-            params: rest,
-            notices,
-        };
-        (spec.run)(self, args)
+        let arguments = Arguments { caller_id, rest };
+        match spec.run {
+            Run::Read(answer) => answer(self, arguments),
+            Run::Write(decode) => {
+                let effect = decode(arguments)?;
+                // A topic type that passes the check and is not a string is a date. rosmaster keeps the date; this
+                // master keeps its text.
+                self.inexact |= matches!(rest.get(1), Some(Value::DateTime(_)))
+                    && matches!(
+                        effect,
+                        Effect::RegisterPublisher { .. } | Effect::RegisterSubscriber { .. }
+                    );
+                self.run(caller_id, effect, notices)
+            }
+        }
     }
 }
 

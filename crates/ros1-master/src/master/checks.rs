@@ -1,5 +1,7 @@
 //! Checks the parameters of calls as `rosmaster/validators.py` does, with the same error messages.
 
+use std::borrow::Cow;
+
 use super::api::Failure;
 use super::names;
 use crate::xmlrpc::Value;
@@ -51,7 +53,7 @@ pub(crate) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
 }
 
 /// rosmaster's `valid_name`.
-pub(crate) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+pub(crate) fn name<'a>(what: &str, value: &'a Value, caller_id: &str) -> Checked<Cow<'a, str>> {
     match value.as_str() {
         None | Some("") => refuse(what, "must be a non-empty string"),
         Some(text) if names::has_illegal_chars(text) => refuse(what, "contains illegal chars"),
@@ -60,7 +62,7 @@ pub(crate) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String
 }
 
 /// rosmaster's `is_topic` and `is_service`.
-pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+pub(crate) fn resource<'a>(what: &str, value: &'a Value, caller_id: &str) -> Checked<Cow<'a, str>> {
     let resolved = name(what, value, caller_id)?;
     match value.as_str() {
         Some("/") => refuse(what, "cannot be the global namespace"),
@@ -86,6 +88,6 @@ pub(crate) fn subgraph(value: &Value, caller_id: &str) -> Checked<String> {
     match value.as_str() {
         None => refuse("subgraph", "must be a string"),
         Some("") => Ok(String::new()),
-        Some(text) => Ok(names::resolve(text, caller_id)),
+        Some(text) => Ok(names::resolve(text, caller_id).into_owned()),
     }
 }

@@ -1,104 +1,137 @@
 //! The methods of the Master API, as in `rosmaster/master_api.py`.
 
-use super::api::{Args, Failure, MethodResult, strings};
+use super::api::{Arguments, MethodResult, strings};
 use super::registry::SharedRegistration;
-use super::{Master, NoticeSink, checks, names};
+use super::{Effect, Master, NoticeSink, checks, names};
 use crate::xmlrpc::{Struct, Value};
 
 impl Master {
-    pub(crate) fn get_pid(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn get_pid(&mut self, _: Arguments<'_>) -> MethodResult {
         Ok((1, String::new(), self.pid.into()))
     }
 
-    pub(crate) fn get_uri(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn get_uri(&mut self, _: Arguments<'_>) -> MethodResult {
         Ok((1, String::new(), self.uri.as_str().into()))
     }
 
-    pub(crate) fn shutdown(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn shutdown(&mut self, _: Arguments<'_>) -> MethodResult {
         Ok((1, "shutdown".to_owned(), 0.into()))
     }
 
-    pub(crate) fn register_publisher(&mut self, of: Args<'_>) -> MethodResult {
-        let caller_id = of.caller_id;
-        let (topic, topic_type, api) = self.topic_params(&of)?;
-        let bumped = self
-            .registry
-            .register(SharedRegistration::Publishers, &topic, caller_id, api);
-        self.notify_bumped(caller_id, bumped, of.notices);
-        if topic_type != "*" || !self.topic_types.contains_key(&topic) {
-            self.topic_types
-                .insert(topic.clone(), topic_type.to_owned());
+    /// Makes a write of `caller_id`, whose arguments are checked.
+    pub(crate) fn run(
+        &mut self,
+        caller_id: &str,
+        effect: Effect<'_>,
+        notices: &mut dyn NoticeSink,
+    ) -> MethodResult {
+        match effect {
+            Effect::RegisterPublisher {
+                topic,
+                topic_type,
+                api,
+            } => {
+                let shared = SharedRegistration::Publishers;
+                let bumped = self.registry.register(shared, &topic, caller_id, api);
+                self.notify_bumped(caller_id, bumped, notices);
+                if topic_type != "*" || !self.topic_types.contains_key(&*topic) {
+                    self.topic_types
+                        .insert(topic.to_string(), topic_type.to_owned());
+                }
+                let subscribers = self.notify_publishers(&topic, notices);
+                let message = format!("Registered [{caller_id}] as publisher of [{topic}]");
+                Ok((1, message, strings(subscribers)))
+            }
+            Effect::RegisterSubscriber {
+                topic,
+                topic_type,
+                api,
+            } => {
+                let shared = SharedRegistration::Subscribers;
+                let bumped = self.registry.register(shared, &topic, caller_id, api);
+                self.notify_bumped(caller_id, bumped, notices);
+                if topic_type != "*" && !self.topic_types.contains_key(&*topic) {
+                    self.topic_types
+                        .insert(topic.to_string(), topic_type.to_owned());
+                }
+                let publishers = self.registry.apis(SharedRegistration::Publishers, &topic);
+                Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
+            }
+            Effect::RegisterService {
+                service,
+                service_api,
+                api,
+            } => {
+                let bumped = self
+                    .registry
+                    .register_service(&service, caller_id, api, service_api);
+                self.notify_bumped(caller_id, bumped, notices);
+                let message = format!("Registered [{caller_id}] as provider of [{service}]");
+                Ok((1, message, 1.into()))
+            }
+            Effect::UnregisterPublisher { topic, api } => {
+                let shared = SharedRegistration::Publishers;
+                let (message, done) = self.registry.unregister(shared, &topic, caller_id, api);
+                if done {
+                    self.notify_publishers(&topic, notices);
+                }
+                Ok((1, message, i32::from(done).into()))
+            }
+            Effect::UnregisterSubscriber { topic, api } => {
+                let shared = SharedRegistration::Subscribers;
+                let (message, done) = self.registry.unregister(shared, &topic, caller_id, api);
+                Ok((1, message, i32::from(done).into()))
+            }
+            Effect::UnregisterService {
+                service,
+                service_api,
+            } => {
+                let (message, done) =
+                    self.registry
+                        .unregister_service(&service, caller_id, service_api);
+                Ok((1, message, i32::from(done).into()))
+            }
+            Effect::SubscribeParam { key, api } => {
+                let subscribed = names::param_key(&key);
+                let value = self.params.get(&subscribed);
+                let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
+                let shared = SharedRegistration::ParamSubscribers;
+                let bumped = self.registry.register(shared, &subscribed, caller_id, api);
+                self.notify_bumped(caller_id, bumped, notices);
+                Ok((1, format!("Subscribed to parameter [{key}]"), value))
+            }
+            Effect::UnsubscribeParam { key, api } => {
+                let shared = SharedRegistration::ParamSubscribers;
+                self.registry
+                    .unregister(shared, &names::param_key(&key), caller_id, api);
+                Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
+            }
+            Effect::SetParam { key, value } => {
+                let changed = names::param_key(&key);
+                let subscribers = &self.registry.param_subscribers;
+                let ignored = (self.old != Some(true)).then_some(caller_id);
+                let updates = self.params.set(&changed, value, ignored, subscribers)?;
+                self.registry.notify_params(updates, notices);
+                Ok((1, format!("parameter {key} set"), 0.into()))
+            }
+            Effect::DeleteParam { key } => {
+                let changed = names::param_key(&key);
+                let subscribers = &self.registry.param_subscribers;
+                Ok(match self.params.delete(&changed, subscribers)? {
+                    Some(updates) => {
+                        self.registry.notify_params(updates, notices);
+                        (1, format!("parameter {key} deleted"), 0.into())
+                    }
+                    None => (-1, format!("parameter [{key}] is not set"), 0.into()),
+                })
+            }
         }
-        let subscribers = self.notify_publishers(&topic, of.notices);
-        let message = format!("Registered [{caller_id}] as publisher of [{topic}]");
-        Ok((1, message, strings(subscribers)))
     }
 
-    pub(crate) fn register_subscriber(&mut self, of: Args<'_>) -> MethodResult {
-        let (topic, topic_type, api) = self.topic_params(&of)?;
-        let bumped =
-            self.registry
-                .register(SharedRegistration::Subscribers, &topic, of.caller_id, api);
-        self.notify_bumped(of.caller_id, bumped, of.notices);
-        if topic_type != "*" && !self.topic_types.contains_key(&topic) {
-            self.topic_types
-                .insert(topic.clone(), topic_type.to_owned());
-        }
-        let publishers = self.registry.apis(SharedRegistration::Publishers, &topic);
-        Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
-    }
-
-    pub(crate) fn register_service(&mut self, of: Args<'_>) -> MethodResult {
-        let caller_id = of.caller_id;
-        let [service, service_api, api] = of.params()?;
-        let service = checks::resource("service", service, caller_id)?;
-        let service_api = checks::api("service_api", service_api)?;
-        let api = checks::api("caller_api", api)?;
-        let bumped = self
-            .registry
-            .register_service(&service, caller_id, api, service_api);
-        self.notify_bumped(caller_id, bumped, of.notices);
-        let message = format!("Registered [{caller_id}] as provider of [{service}]");
-        Ok((1, message, 1.into()))
-    }
-
-    pub(crate) fn unregister_publisher(&mut self, of: Args<'_>) -> MethodResult {
-        let [topic, api] = of.params()?;
-        let topic = checks::resource("topic", topic, of.caller_id)?;
-        let api = checks::api("caller_api", api)?;
-        let (message, done) =
-            self.registry
-                .unregister(SharedRegistration::Publishers, &topic, of.caller_id, api);
-        if done {
-            self.notify_publishers(&topic, of.notices);
-        }
-        Ok((1, message, i32::from(done).into()))
-    }
-
-    pub(crate) fn unregister_subscriber(&mut self, of: Args<'_>) -> MethodResult {
-        let [topic, api] = of.params()?;
-        let topic = checks::resource("topic", topic, of.caller_id)?;
-        let api = checks::api("caller_api", api)?;
-        let (message, done) =
-            self.registry
-                .unregister(SharedRegistration::Subscribers, &topic, of.caller_id, api);
-        Ok((1, message, i32::from(done).into()))
-    }
-
-    pub(crate) fn unregister_service(&mut self, of: Args<'_>) -> MethodResult {
-        let [service, service_api] = of.params()?;
-        let service = checks::resource("service", service, of.caller_id)?;
-        let service_api = checks::api("service_api", service_api)?;
-        let (message, done) = self
-            .registry
-            .unregister_service(&service, of.caller_id, service_api);
-        Ok((1, message, i32::from(done).into()))
-    }
-
-    pub(crate) fn lookup_service(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn lookup_service(&mut self, of: Arguments<'_>) -> MethodResult {
         let [service] = of.params()?;
         let service = checks::resource("service", service, of.caller_id)?;
-        Ok(match self.registry.services.get(&service) {
+        Ok(match self.registry.services.get(&*service) {
             Some(entry) => {
                 let message = format!("rosrpc URI: [{}]", entry.api);
                 (1, message, entry.api.as_str().into())
@@ -107,16 +140,16 @@ impl Master {
         })
     }
 
-    pub(crate) fn lookup_node(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn lookup_node(&mut self, of: Arguments<'_>) -> MethodResult {
         let [node] = of.params()?;
         let node = checks::name("node", node, of.caller_id)?;
-        Ok(match self.registry.nodes.get(&node) {
+        Ok(match self.registry.nodes.get(&*node) {
             Some(found) => (1, "node api".to_owned(), found.api.as_str().into()),
             None => (-1, format!("unknown node [{node}]"), "".into()),
         })
     }
 
-    pub(crate) fn get_published_topics(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn get_published_topics(&mut self, of: Arguments<'_>) -> MethodResult {
         let [subgraph] = of.params()?;
         let mut subgraph = checks::subgraph(subgraph, of.caller_id)?;
         if !subgraph.is_empty() && !subgraph.ends_with('/') {
@@ -132,14 +165,14 @@ impl Master {
         ))
     }
 
-    pub(crate) fn get_topic_types(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn get_topic_types(&mut self, _: Arguments<'_>) -> MethodResult {
         let pairs = self.topic_types.iter();
         let pairs = pairs.map(|(topic, topic_type)| pair(topic, topic_type));
         let message = "current system state".to_owned();
         Ok((1, message, Value::Array(pairs.collect())))
     }
 
-    pub(crate) fn get_system_state(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn get_system_state(&mut self, _: Arguments<'_>) -> MethodResult {
         let shared = |kind| {
             let keys = self.registry.shared(kind).iter();
             let keys = keys.map(|(key, callers)| {
@@ -159,33 +192,7 @@ impl Master {
         Ok((1, "current system state".to_owned(), Value::Array(state)))
     }
 
-    pub(crate) fn set_param(&mut self, of: Args<'_>) -> MethodResult {
-        let [key, value] = of.params()?;
-        let key = names::resolve(checks::key(key)?, of.caller_id);
-        let value = checks::param_value(value)?;
-        let changed = names::param_key(&key);
-        let subscribers = &self.registry.param_subscribers;
-        let ignored = (self.old != Some(true)).then_some(of.caller_id);
-        let updates = self.params.set(&changed, value, ignored, subscribers)?;
-        self.registry.notify_params(updates, of.notices);
-        Ok((1, format!("parameter {key} set"), 0.into()))
-    }
-
-    pub(crate) fn delete_param(&mut self, of: Args<'_>) -> MethodResult {
-        let [key] = of.params()?;
-        let key = names::resolve(checks::key(key)?, of.caller_id);
-        let changed = names::param_key(&key);
-        let subscribers = &self.registry.param_subscribers;
-        Ok(match self.params.delete(&changed, subscribers)? {
-            Some(updates) => {
-                self.registry.notify_params(updates, of.notices);
-                (1, format!("parameter {key} deleted"), 0.into())
-            }
-            None => (-1, format!("parameter [{key}] is not set"), 0.into()),
-        })
-    }
-
-    pub(crate) fn get_param(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn get_param(&mut self, of: Arguments<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         Ok(match self.params.get(&key) {
@@ -194,14 +201,14 @@ impl Master {
         })
     }
 
-    pub(crate) fn has_param(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn has_param(&mut self, of: Arguments<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = names::resolve(checks::key(key)?, of.caller_id);
         let has = self.params.has(&key);
-        Ok((1, key, has.into()))
+        Ok((1, key.into_owned(), has.into()))
     }
 
-    pub(crate) fn search_param(&mut self, of: Args<'_>) -> MethodResult {
+    pub(crate) fn search_param(&mut self, of: Arguments<'_>) -> MethodResult {
         let [key] = of.params()?;
         let key = checks::key(key)?;
         Ok(match self.params.search(of.caller_id, key)? {
@@ -213,36 +220,12 @@ impl Master {
         })
     }
 
-    pub(crate) fn get_param_names(&mut self, _: Args<'_>) -> MethodResult {
+    pub(crate) fn get_param_names(&mut self, _: Arguments<'_>) -> MethodResult {
         Ok((
             1,
             "Parameter names".to_owned(),
             strings(self.params.names()),
         ))
-    }
-
-    pub(crate) fn subscribe_param(&mut self, of: Args<'_>) -> MethodResult {
-        let [api, key] = of.params()?;
-        let api = checks::api("caller_api", api)?;
-        let key = names::resolve(checks::key(key)?, of.caller_id);
-        let subscribed = names::param_key(&key);
-        let value = self.params.get(&subscribed);
-        let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
-        let kind = SharedRegistration::ParamSubscribers;
-        let bumped = self.registry.register(kind, &subscribed, of.caller_id, api);
-        self.notify_bumped(of.caller_id, bumped, of.notices);
-        Ok((1, format!("Subscribed to parameter [{key}]"), value))
-    }
-
-    pub(crate) fn unsubscribe_param(&mut self, of: Args<'_>) -> MethodResult {
-        let [api, key] = of.params()?;
-        let api = checks::api("caller_api", api)?;
-        let key = names::resolve(checks::key(key)?, of.caller_id);
-        let subscribed = names::param_key(&key);
-        let kind = SharedRegistration::ParamSubscribers;
-        self.registry
-            .unregister(kind, &subscribed, of.caller_id, api);
-        Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
     }
 
     /// Queues a `publisherUpdate` with the topic's publishers for each subscriber, and returns the addresses of the
@@ -254,19 +237,6 @@ impl Master {
             notices.publisher_update(&subscribers, topic, &publishers);
         }
         subscribers
-    }
-
-    fn topic_params<'a>(&mut self, of: &Args<'a>) -> Result<(String, &'a str, &'a str), Failure> {
-        let [topic, topic_type, api] = of.params()?;
-        let params = (
-            checks::resource("topic", topic, of.caller_id)?,
-            checks::topic_type(topic_type)?,
-            checks::api("caller_api", api)?,
-        );
-        // A type that passes the check and is not a string is a date. rosmaster keeps the date; this master keeps its
-        // text.
-        self.inexact |= topic_type.as_str().is_none();
-        Ok(params)
     }
 }
 

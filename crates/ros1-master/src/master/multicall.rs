@@ -88,7 +88,7 @@ impl Master {
         let [Value::Int(1), _, Value::Struct(_)] = answer.as_slice() else {
             return;
         };
-        let mut key = names::resolve(key, caller_id);
+        let mut key = names::resolve(key, caller_id).into_owned();
         if subscribes {
             key = names::param_key(&key);
         }

@@ -240,16 +240,6 @@ impl Request {
         }
     }
 
-    /// Caller id and address of the node for which this call registers something.
-    pub fn registrant(&self) -> Option<(&str, &str)> {
-        let at = match self.method {
-            Method::RegisterPublisher | Method::RegisterSubscriber | Method::RegisterService => 3,
-            Method::SubscribeParam => 1,
-            _ => return None,
-        };
-        Some((self.caller()?, self.text(at)?))
-    }
-
     /// Converts this call to an encoded entry of a multicall.
     pub fn into_entry(self) -> Value {
         Call::from(self).into_entry()

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::registry::SharedRegistration;
-use super::{CALLER_ID, Master, Method, Request, names, returnable};
+use super::{CALLER_ID, Master, Method, Request, Write, names, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id of rosmaster's calls to nodes.
@@ -112,7 +112,7 @@ impl Master {
     /// The node that `call` displaces: the call registers something under that node's name at another address, so the
     /// master tells the old node to shut down. Leaves [`Displaced::pid`] empty.
     pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
-        let (node, api) = call.registrant()?;
+        let (node, api) = Write::of(call)?.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
         let topics = self.publications(node).chain(self.subscriptions(node));
         Some(Displaced {

@@ -1,6 +1,6 @@
 //! Tells whether a call would change the state, without copying the state.
 
-use super::{Entry, Master, Method, Request, names};
+use super::{Effect, Entry, Master, Request, Write, names};
 use crate::xmlrpc::Value;
 
 impl Master {
@@ -14,59 +14,87 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state is already the one that `call` would lead to. `None` if unknown.
+    /// Whether a master in this state surely accepts `write`. False if in doubt.
+    pub fn accepts(&self, write: &Write<'_>) -> bool {
+        match &write.effect {
+            Effect::SetParam { key, value } => {
+                matches!(value, Value::Struct(_)) || names::parts(key).next().is_some()
+            }
+            Effect::DeleteParam { key } => {
+                names::parts(key).next().is_some() && self.params.written(key).is_some()
+            }
+            Effect::RegisterPublisher { .. }
+            | Effect::RegisterSubscriber { .. }
+            | Effect::RegisterService { .. }
+            | Effect::UnregisterPublisher { .. }
+            | Effect::UnregisterSubscriber { .. }
+            | Effect::UnregisterService { .. }
+            | Effect::SubscribeParam { .. }
+            | Effect::UnsubscribeParam { .. } => true,
+        }
+    }
+
+    /// Whether the state is already the one that `call` would lead to. `None` if unknown, as for a write that the
+    /// master refuses.
     fn is_settled(&self, call: &Request) -> Option<bool> {
-        let text = |index| call.text(index);
-        let caller_id = call.caller()?;
-        let name = |index| Some(names::resolve(text(index)?, caller_id));
-        let key = |index| Some(names::param_key(&name(index)?));
-        // The calling node, if it is registered at the address in the call.
-        let node = |index| {
-            let node = self.registry.nodes.get(caller_id);
-            node.filter(|node| Some(node.api.as_str()) == text(index))
+        if !call.method().kind().mutates() {
+            return Some(true);
+        }
+        let Write { caller, effect } = Write::of(call)?;
+        // The calling node, if it is registered at this address.
+        let node = |api: &str| {
+            let node = self.registry.nodes.get(caller);
+            node.filter(|node| node.api == api)
         };
-        let provides = |service: &str| {
+        let provides = |service: &str, api: &str| {
             let entry = self.registry.services.get(service);
-            entry.is_some_and(|of| of.node == caller_id && Some(of.api.as_str()) == text(2))
+            entry.is_some_and(|of| of.node == caller && of.api == api)
         };
-        Some(match call.method() {
-            Method::RegisterPublisher => {
-                let (topic, topic_type) = (name(1)?, text(2)?);
+        Some(match effect {
+            Effect::RegisterPublisher {
+                topic,
+                topic_type,
+                api,
+            } => {
                 let same_type = topic_type == "*" || self.type_of(&topic) == Some(topic_type);
-                same_type && node(3)?.publications.contains(&topic)
+                same_type && node(api)?.publications.contains(&*topic)
             }
-            Method::RegisterSubscriber => {
-                let (topic, topic_type) = (name(1)?, text(2)?);
+            Effect::RegisterSubscriber {
+                topic,
+                topic_type,
+                api,
+            } => {
                 let typed = topic_type == "*" || self.type_of(&topic).is_some();
-                typed && node(3)?.subscriptions.contains(&topic)
+                typed && node(api)?.subscriptions.contains(&*topic)
             }
-            Method::RegisterService => {
-                let service = name(1)?;
-                node(3)?.services.contains(&service) && provides(&service)
+            Effect::RegisterService {
+                service,
+                service_api,
+                api,
+            } => node(api)?.services.contains(&*service) && provides(&service, service_api),
+            Effect::SubscribeParam { key, api } => node(api)?
+                .param_subscriptions
+                .contains(&names::param_key(&key)),
+            Effect::UnregisterPublisher { topic, api } => {
+                !node(api).is_some_and(|node| node.publications.contains(&*topic))
             }
-            Method::SubscribeParam => node(1)?.param_subscriptions.contains(&key(2)?),
-            Method::UnregisterPublisher => {
-                let topic = name(1)?;
-                !node(2).is_some_and(|node| node.publications.contains(&topic))
+            Effect::UnregisterSubscriber { topic, api } => {
+                !node(api).is_some_and(|node| node.subscriptions.contains(&*topic))
             }
-            Method::UnregisterSubscriber => {
-                let topic = name(1)?;
-                !node(2).is_some_and(|node| node.subscriptions.contains(&topic))
+            Effect::UnregisterService {
+                service,
+                service_api,
+            } => !provides(&service, service_api),
+            Effect::UnsubscribeParam { key, api } => {
+                let key = names::param_key(&key);
+                !node(api).is_some_and(|node| node.param_subscriptions.contains(&key))
             }
-            Method::UnregisterService => !provides(&name(1)?),
-            Method::UnsubscribeParam => {
-                let key = key(2)?;
-                !node(1).is_some_and(|node| node.param_subscriptions.contains(&key))
-            }
-            Method::SetParam => {
-                let value = call.params().get(2)?;
+            Effect::SetParam { key, value } => {
                 // A struct with its members in another order is a different state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
-                plain && self.params.written(&key(1)?).as_ref() == Some(value)
+                plain && self.params.written(&names::param_key(&key)).as_ref() == Some(value)
             }
-            Method::DeleteParam => self.params.written(&key(1)?).is_none(),
-            // A read changes nothing. A write that is not listed above might.
-            method => !method.kind().mutates(),
+            Effect::DeleteParam { key } => self.params.written(&names::param_key(&key)).is_none(),
         })
     }
 }

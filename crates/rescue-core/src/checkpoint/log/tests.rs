@@ -1,5 +1,5 @@
 use super::*;
-use crate::{checkpoint::format::Checkpoint, dice::Dice, xmlrpc::Value};
+use crate::{checkpoint::format::Checkpoint, dice::Dice, master::Method, xmlrpc::Value};
 
 fn set(key: &str, value: i32) -> Request {
     Request::new(

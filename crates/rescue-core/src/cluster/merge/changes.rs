@@ -2,6 +2,7 @@
 //! show that a parameter was set and set back.
 
 use std::{
+    borrow::Cow,
     collections::{BTreeSet, HashMap, HashSet},
     ops::Bound,
 };
@@ -9,7 +10,7 @@ use std::{
 use super::TELLER;
 use crate::{
     cluster::mutant::Mutant,
-    master::{Master, Method, Request, names},
+    master::{Effect, Master, Request, Write, names},
     xmlrpc::{Struct, Value},
 };
 
@@ -41,31 +42,30 @@ impl ChangeSubject {
     /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing, and for a
     /// value that a merge sets again.
     pub fn of(call: &Request) -> Vec<Self> {
-        let Some(caller) = call.caller().filter(|caller| *caller != TELLER) else {
+        let Some(Write { caller, effect }) = Write::of(call).filter(|write| write.caller != TELLER)
+        else {
             return Vec::new();
         };
         let node = Self::Node(caller.to_owned());
-        let name = || Some(names::resolve(call.text(1)?, caller));
-        let topic = |publishes| {
-            let (topic, node) = (name()?, caller.to_owned());
-            Some(Self::Topic {
-                publishes,
-                topic,
-                node,
-            })
+        let topic = |publishes, topic: Cow<'_, str>| Self::Topic {
+            publishes,
+            topic: topic.into_owned(),
+            node: caller.to_owned(),
         };
-        match call.method() {
-            Method::SetParam | Method::DeleteParam => {
-                param_of(call).map(Self::Param).into_iter().collect()
+        match effect {
+            Effect::SetParam { key, .. } | Effect::DeleteParam { key } => {
+                vec![Self::Param(param_path(&key))]
             }
-            Method::RegisterPublisher => topic(true).into_iter().chain([node]).collect(),
-            Method::RegisterSubscriber => topic(false).into_iter().chain([node]).collect(),
-            Method::RegisterService => {
-                let service = name().map(Self::Service);
-                service.into_iter().chain([node]).collect()
+            Effect::RegisterPublisher { topic: name, .. } => vec![topic(true, name), node],
+            Effect::RegisterSubscriber { topic: name, .. } => vec![topic(false, name), node],
+            Effect::RegisterService { service, .. } => {
+                vec![Self::Service(service.into_owned()), node]
             }
-            Method::SubscribeParam => vec![node],
-            _ => Vec::new(),
+            Effect::SubscribeParam { .. } => vec![node],
+            Effect::UnregisterPublisher { .. }
+            | Effect::UnregisterSubscriber { .. }
+            | Effect::UnregisterService { .. }
+            | Effect::UnsubscribeParam { .. } => Vec::new(),
         }
     }
 }
@@ -83,12 +83,7 @@ pub(super) fn param_path(key: &str) -> String {
 
 /// The resolved name of the parameter that `call` sets or deletes.
 pub fn parameter_of(call: &Request) -> Option<String> {
-    match call.method() {
-        Method::SetParam | Method::DeleteParam => {
-            Some(names::resolve(call.text(1)?, call.caller()?))
-        }
-        _ => None,
-    }
+    Write::of(call)?.parameter().map(str::to_owned)
 }
 
 /// The path of the parameter that `call` sets or deletes.
@@ -257,8 +252,10 @@ impl Own {
         self.calls().any(|call| {
             let below = param_of(call).and_then(|of| path.strip_prefix(of.as_str()));
             let Some(below) = below else { return false };
-            let set = call.params().get(2);
-            let set = set.filter(|_| *call.method() == Method::SetParam);
+            let set = match Write::of(call).map(|write| write.effect) {
+                Some(Effect::SetParam { value, .. }) => Some(value),
+                _ => None,
+            };
             let parts: Vec<&str> = names::parts(below).collect();
             let value = match (set, parts.as_slice()) {
                 (set, []) => set,
@@ -271,7 +268,7 @@ impl Own {
 
     fn registers(&self, node: &str, api: &str) -> bool {
         let mut calls = self.calls();
-        calls.any(|call| call.registrant() == Some((node, api)))
+        calls.any(|call| Write::of(call).and_then(|it| it.registrant()) == Some((node, api)))
     }
 }
 

@@ -5,19 +5,19 @@ use std::collections::{BTreeMap, HashMap};
 use super::changes::param_of;
 use crate::{
     cluster::mutant::Mutant,
-    master::{Method, Request, names},
+    master::{Effect, Method, Request, Write},
     xmlrpc::{self, Value},
 };
 
 /// What a call registers or unregisters: for example, the node `caller` as a publisher of the topic `name`.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-struct Place {
+struct RegistrationSlot {
     what: &'static str,
     name: String,
     caller: String,
 }
 
-/// The last registration of a [`Place`], with its address, and the unregistrations after it.
+/// The last registration of a [`RegistrationSlot`], with its address, and the unregistrations after it.
 #[derive(Clone, Debug, Default)]
 struct Registered {
     registration: Option<(u64, String)>,
@@ -31,7 +31,7 @@ pub struct WritesToSend {
     last: u64,
     /// The numbers of the writes to parameters, by path and by whether they set the parameter or delete it.
     params: BTreeMap<(String, bool), u64>,
-    registered: HashMap<Place, Registered>,
+    registered: HashMap<RegistrationSlot, Registered>,
     /// The numbers of other calls, by their encoded form.
     others: HashMap<String, u64>,
 }
@@ -67,8 +67,8 @@ impl WritesToSend {
                 self.calls.remove(&number);
             }
             self.params.insert((path, sets), number);
-        } else if let Some((place, api, registers)) = place(call) {
-            let at = self.registered.entry(place).or_default();
+        } else if let Some((slot, api, registers)) = slot(call) {
+            let at = self.registered.entry(slot).or_default();
             if registers {
                 let before = std::mem::take(at);
                 at.registration = Some((number, api));
@@ -115,26 +115,26 @@ impl WritesToSend {
     }
 }
 
-/// What `call` registers or unregisters, with its address, and whether it registers.
-fn place(call: &Request) -> Option<(Place, String, bool)> {
-    let (what, name, api, registers) = match call.method() {
-        Method::RegisterPublisher => ("publisher", 1, 3, true),
-        Method::UnregisterPublisher => ("publisher", 1, 2, false),
-        Method::RegisterSubscriber => ("subscriber", 1, 3, true),
-        Method::UnregisterSubscriber => ("subscriber", 1, 2, false),
-        Method::RegisterService => ("service", 1, 2, true),
-        Method::UnregisterService => ("service", 1, 2, false),
-        Method::SubscribeParam => ("parameter", 2, 1, true),
-        Method::UnsubscribeParam => ("parameter", 2, 1, false),
-        _ => return None,
+/// The slot that `call` registers or unregisters, with the address, and whether it registers.
+fn slot(call: &Request) -> Option<(RegistrationSlot, String, bool)> {
+    let write = Write::of(call)?;
+    let (what, api, registers) = match write.effect {
+        Effect::RegisterPublisher { api, .. } => ("publisher", api, true),
+        Effect::UnregisterPublisher { api, .. } => ("publisher", api, false),
+        Effect::RegisterSubscriber { api, .. } => ("subscriber", api, true),
+        Effect::UnregisterSubscriber { api, .. } => ("subscriber", api, false),
+        Effect::RegisterService { service_api, .. } => ("service", service_api, true),
+        Effect::UnregisterService { service_api, .. } => ("service", service_api, false),
+        Effect::SubscribeParam { api, .. } => ("parameter", api, true),
+        Effect::UnsubscribeParam { api, .. } => ("parameter", api, false),
+        Effect::SetParam { .. } | Effect::DeleteParam { .. } => return None,
     };
-    let caller = call.caller()?.to_owned();
-    let place = Place {
+    let slot = RegistrationSlot {
         what,
-        name: names::resolve(call.text(name)?, &caller),
-        caller,
+        name: write.name().to_owned(),
+        caller: write.caller.to_owned(),
     };
-    Some((place, call.text(api)?.to_owned(), registers))
+    Some((slot, api.to_owned(), registers))
 }
 
 /// The approximate size of a call in bytes.
