@@ -166,6 +166,9 @@ mod service {
     mod package;
 }
 
+/// What the tests themselves rely on.
+mod tests;
+
 /// Random deaths, on a disk that fails at random.
 mod soak;
 

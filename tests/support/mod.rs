@@ -2,7 +2,8 @@
 //! state of a master, and waiting for conditions.
 //!
 //! Every process that a test starts carries the token of its [`Scratch`] in its environment. When the scratch
-//! folder is dropped, even after a panic, all of them are ended by their process ids.
+//! folder is dropped, even after a panic, all of them are ended by their process ids. Each test has a network namespace
+//! of its own, where the system allows it; what is still in it when the test ends is killed.
 
 #![allow(
     dead_code,
@@ -25,6 +26,7 @@ mod feed;
 mod kinds;
 pub(crate) mod links;
 mod name_server;
+mod namespace;
 mod netns;
 mod node;
 mod patience;
@@ -50,6 +52,7 @@ pub(crate) use fake::{FakeMaster, FakeNode, Heard, read_request};
 pub(crate) use feed::{feed, gzip};
 pub(crate) use kinds::{kinds, sorted, unordered};
 pub(crate) use name_server::NameServer;
+pub(crate) use namespace::{is_isolated, isolate};
 pub(crate) use netns::{Netns, ip};
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{Finish, PATIENCE, comes_true, eventually, eventually_some, holds};

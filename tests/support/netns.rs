@@ -4,6 +4,7 @@
 use std::process::Command;
 use std::sync::atomic::{AtomicU8, Ordering};
 
+use super::namespace::isolate;
 use super::process::behind;
 
 /// A network namespace with a veth to this one. Both are removed on drop.
@@ -29,6 +30,7 @@ pub(crate) fn ip(words: &str) {
 impl Netns {
     #[track_caller]
     pub(crate) fn new() -> Self {
+        isolate();
         static COUNT: AtomicU8 = AtomicU8::new(0);
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
         let pid = std::process::id();

@@ -87,7 +87,7 @@ pub(crate) struct Process {
     name: String,
     child: Child,
     ended: Option<ExitStatus>,
-    /// The ports that no other process may get for a while after this one has ended.
+    /// The ports that no other process may get after this one has ended.
     ports: Vec<u16>,
     lines: Arc<Mutex<Vec<Line>>>,
     readers: [JoinHandle<()>; 2],
@@ -131,8 +131,8 @@ impl Process {
         line.split_whitespace().nth(1).unwrap().parse().unwrap()
     }
 
-    /// Makes the ports at which the process listens now refuse connections for a while after it has ended. Otherwise a
-    /// node of another test could get a dead node's port and be taken for it.
+    /// Makes the ports at which the process listens now refuse connections after it has ended, until the end of the test.
+    /// Otherwise another node could get a dead node's port and be taken for it.
     pub(crate) fn hold_ports(&mut self) {
         self.ports = listening_ports(self.pid());
     }

@@ -1,6 +1,6 @@
 //! A folder, a token and ports for one test.
 
-use std::collections::VecDeque;
+use std::cell::RefCell;
 use std::ffi::OsString;
 use std::fs;
 use std::io::ErrorKind;
@@ -18,10 +18,14 @@ use rustix::process::Signal;
 use tempfile::TempDir;
 use tokio::net::TcpSocket;
 
+use super::namespace::{is_isolated, isolate};
 use super::process::signal;
 
 /// The environment variable that marks every process of a test.
 const TOKEN: &str = "ROSRESCUE_SCRATCH_TOKEN";
+
+/// The environment variable with the folder of the test.
+const HOME: &str = "ROS_HOME";
 
 /// If this variable is set, all rosmasters and rospy nodes speak HTTP/1.0, as on a kernel before 4.16.
 const HTTP_1_0: &str = "ROSRESCUE_HTTP_1_0";
@@ -38,6 +42,7 @@ pub(crate) struct Scratch {
 
 impl Scratch {
     pub(crate) fn new() -> Self {
+        isolate();
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let token = format!(
             "{}-{}",
@@ -72,7 +77,7 @@ impl Scratch {
         }
         command
             .env(TOKEN, &self.token)
-            .env("ROS_HOME", self.folder.path())
+            .env(HOME, self.folder.path())
             .env("ROS_LOG_DIR", self.log_dir())
             .env("ROS_IP", "127.0.0.1")
             .env("PYTHONUNBUFFERED", "1")
@@ -84,7 +89,7 @@ impl Scratch {
 
     /// Processes that this test has started, directly or not, and that still run: id and command.
     pub(crate) fn survivors(&self) -> Vec<(u32, String)> {
-        let mark = format!("{TOKEN}={}", self.token);
+        let is_ours = |folder: &Path| has_token(folder, |token| token == self.token);
         let mut found = Vec::new();
         for entry in fs::read_dir("/proc").unwrap().flatten() {
             let Some(pid) = entry
@@ -94,11 +99,7 @@ impl Scratch {
             else {
                 continue;
             };
-            let environment = fs::read(entry.path().join("environ")).unwrap_or_default();
-            if environment
-                .split(|&byte| byte == 0)
-                .any(|pair| pair == mark.as_bytes())
-            {
+            if is_ours(&entry.path()) {
                 let command = fs::read(entry.path().join("cmdline")).unwrap_or_default();
                 found.push((pid, String::from_utf8_lossy(&command).replace('\0', " ")));
             }
@@ -131,6 +132,17 @@ impl Drop for Scratch {
     }
 }
 
+/// Whether the process with this folder in `/proc` was started by a test, directly or not, whose token `is_wanted`.
+fn has_token(folder: &Path, is_wanted: impl Fn(&str) -> bool) -> bool {
+    let environment = fs::read(folder.join("environ")).unwrap_or_default();
+    environment.split(|&byte| byte == 0).any(|pair| {
+        let pair = std::str::from_utf8(pair).unwrap_or_default();
+        pair.strip_prefix(TOKEN)
+            .and_then(|rest| rest.strip_prefix('='))
+            .is_some_and(&is_wanted)
+    })
+}
+
 fn is_install(variable: &str) -> bool {
     [
         "ROS_ROOT",
@@ -144,31 +156,12 @@ fn is_install(variable: &str) -> bool {
 }
 
 /// A port at which no process listens, on IPv4 or IPv6. It is below the ports that the kernel gives to
-/// outgoing connections, so nothing takes it by chance before the test binds it. Other test programs do not
-/// get it either as long as this one runs.
+/// outgoing connections, so nothing takes it by chance before the test binds it. Where tests share a network, other
+/// test programs do not get it either as long as this one runs.
 pub(crate) fn free_port() -> u16 {
-    const FIRST: u16 = 12_000;
-    const BLOCKS: u16 = 200;
-    const BLOCK: u16 = 100;
-    /// The sockets that reserve our blocks of ports, and the unused ports of the last block.
-    static OURS: Mutex<(Vec<UnixListener>, Range<u16>)> = Mutex::new((Vec::new(), 0..0));
-    let mut ours = OURS.lock().unwrap_or_else(PoisonError::into_inner);
+    isolate();
     loop {
-        let Some(port) = ours.1.next() else {
-            let start = u16::try_from(std::process::id() % u32::from(BLOCKS)).unwrap();
-            let (block, socket) = (0..BLOCKS)
-                .map(|step| (start + step) % BLOCKS)
-                .find_map(|block| {
-                    let name = format!("rosrescue-tests-ports-{block}");
-                    let name = SocketAddr::from_abstract_name(name).unwrap();
-                    Some((block, UnixListener::bind_addr(&name).ok()?))
-                })
-                .expect("a block of ports that no other test program has reserved");
-            let first = FIRST + block * BLOCK;
-            ours.0.push(socket);
-            ours.1 = first..first + BLOCK;
-            continue;
-        };
+        let port = next_port();
         let v4 = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port));
         let v6 = TcpListener::bind((Ipv6Addr::LOCALHOST, port));
         // Some computers have no IPv6.
@@ -178,23 +171,56 @@ pub(crate) fn free_port() -> u16 {
     }
 }
 
+/// The ports that tests choose: those below the ones that the kernel gives to outgoing connections.
+const FIRST: u16 = 12_000;
+const BLOCKS: u16 = 200;
+const BLOCK: u16 = 100;
+
+/// A port that no other test of this program gets for a while.
+fn next_port() -> u16 {
+    /// The unused ports that we may take, and the sockets that reserve them.
+    static OURS: Mutex<(Range<u16>, Vec<UnixListener>)> = Mutex::new((0..0, Vec::new()));
+    let mut ours = OURS.lock().unwrap_or_else(PoisonError::into_inner);
+    loop {
+        if let Some(port) = ours.0.next() {
+            return port;
+        }
+        ours.0 = if is_isolated() {
+            FIRST..FIRST + BLOCKS * BLOCK
+        } else {
+            let (block, socket) = reserve();
+            ours.1.push(socket);
+            block
+        };
+    }
+}
+
+/// Reserves a block of ports that no other test program gets as long as the socket is open.
+fn reserve() -> (Range<u16>, UnixListener) {
+    let start = u16::try_from(std::process::id() % u32::from(BLOCKS)).unwrap();
+    let mut blocks = (0..BLOCKS).map(|step| (start + step) % BLOCKS);
+    let reserved = blocks.find_map(|block| {
+        let name = format!("rosrescue-tests-ports-{block}");
+        let name = SocketAddr::from_abstract_name(name).unwrap();
+        let first = FIRST + block * BLOCK;
+        Some((first..first + BLOCK, UnixListener::bind_addr(&name).ok()?))
+    });
+    reserved.expect("a block of ports that no other test program has reserved")
+}
+
 /// The first of the ports that the kernel chooses by itself.
 pub(crate) const FIRST_OF_KERNEL: u16 = 32_768;
 
-/// Makes `port` refuse connections until 200 other ports have been held, so that no other process gets it by chance.
+/// Makes `port` refuse connections until the end of this test, so that no other process gets it by chance.
 pub(crate) fn hold_port(port: u16) {
-    static HELD: Mutex<VecDeque<TcpSocket>> = Mutex::new(VecDeque::new());
+    thread_local!(static HELD: RefCell<Vec<TcpSocket>> = const { RefCell::new(Vec::new()) });
     let Ok(socket) = TcpSocket::new_v4() else {
         return;
     };
     // Closed connections of the dead process must not prevent the bind.
     let address = (Ipv4Addr::UNSPECIFIED, port).into();
     if socket.set_reuseaddr(true).is_ok() && socket.bind(address).is_ok() {
-        let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
-        held.push_back(socket);
-        if held.len() > 200 {
-            held.pop_front();
-        }
+        HELD.with_borrow_mut(|held| held.push(socket));
     }
 }
 

@@ -107,6 +107,7 @@ fn no_rosrescue_or_another_program_at_the_port_is_exit_status_3() {
 
 #[test]
 fn a_newer_rosrescue_is_reported_as_newer() {
+    let scratch = Scratch::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     thread::spawn(move || {
@@ -121,7 +122,7 @@ fn a_newer_rosrescue_is_reported_as_newer() {
             );
         }
     });
-    let ran = Tool::rosrescue(&Scratch::new(), port, &["status"]);
+    let ran = Tool::rosrescue(&scratch, port, &["status"]);
     assert_eq!(ran.exit(), 1, "{ran:?}");
     assert!(
         ran.stderr.contains("version 9.9.9, newer than this one"),
