@@ -66,7 +66,7 @@ pub(crate) struct Window {
 #[derive(Debug)]
 enum Master {
     Guarded(Box<Robot>),
-    Bare(Scratch, Option<Rosmaster>, u16),
+    Bare(Scratch, Option<Box<Rosmaster>>, u16),
 }
 
 impl Master {
@@ -78,7 +78,7 @@ impl Master {
                 let scratch = Scratch::new();
                 let master = Rosmaster::start(&scratch);
                 let port = master.port;
-                Self::Bare(scratch, Some(master), port)
+                Self::Bare(scratch, Some(Box::new(master)), port)
             }
         }
     }
@@ -111,7 +111,7 @@ impl Master {
                 if let Some(mut dead) = master.take() {
                     dead.kill();
                 }
-                *master = Some(Rosmaster::start_at(scratch, *port));
+                *master = Some(Box::new(Rosmaster::start_at(scratch, *port)));
             }
         }
     }

@@ -1,11 +1,11 @@
-//! Tests of the tests: each one has a network of its own, and leaves nothing behind.
+//! Tests of the tests: each one has a network of its own, leaves nothing behind, and explains its failure.
 
 use std::net::TcpListener;
 use std::process::Command;
 use std::sync::mpsc;
 use std::thread;
 
-use crate::support::{alive, is_isolated, isolate};
+use crate::support::{FakeNode, Scratch, alive, free_port, is_isolated, isolate, report};
 
 /// Runs `test` like a test named `name`. Returns `None` if it panics.
 fn run<T: Send + 'static>(name: &str, test: impl FnOnce() -> T + Send + 'static) -> Option<T> {
@@ -56,4 +56,22 @@ fn a_process_that_a_test_leaves_behind_ends_with_it() {
         let left = receive.recv().unwrap();
         assert!(!alive(left), "{left}");
     }
+}
+
+#[test]
+fn the_report_about_a_failure_says_who_listens_and_how_to_repeat_it() {
+    let said = run("some::test", || {
+        let _scratch = Scratch::new();
+        let port = free_port();
+        let _node = FakeNode::start_at("/node", port);
+        (port, report().unwrap())
+    });
+    let (port, said) = said.unwrap();
+    let repeat = "cargo test --locked --test robot some::test -- --exact --nocapture";
+    assert!(said.contains(repeat), "{said}");
+    let listening = format!(
+        "listening at 127.0.0.1:{port}: process {}",
+        std::process::id()
+    );
+    assert!(said.contains(&listening), "{said}");
 }

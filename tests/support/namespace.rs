@@ -13,6 +13,8 @@ use std::thread;
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
+use super::report;
+
 const HOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/namespace.sh");
 
 /// The process that holds the namespace of a test. On drop it kills all other processes in the namespace, and ends.
@@ -64,7 +66,7 @@ fn shown_error(read: Option<std::io::Result<usize>>) -> String {
 }
 
 /// Gives the test of this thread a network namespace until its end, unless it has one. Where that is not allowed, tests
-/// share the namespace of the test program.
+/// share the namespace of the test program. A panic is followed by a report from now on.
 pub(crate) fn isolate() {
     thread_local!(static OWN: RefCell<Option<Namespace>> = const { RefCell::new(None) });
     static REFUSED: OnceLock<()> = OnceLock::new();
@@ -72,6 +74,7 @@ pub(crate) fn isolate() {
     if thread::current().name().is_none_or(|name| name == "main") {
         return;
     }
+    report::install();
     if is_isolated() || REFUSED.get().is_some() {
         return;
     }

@@ -1,5 +1,6 @@
 //! Child processes whose output is recorded.
 
+use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -10,7 +11,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal};
 
 use super::patience::{eventually, eventually_some};
-use super::scratch::{FIRST_OF_KERNEL, hold_port};
+use super::scratch::{FIRST_OF_KERNEL, HOME, hold_port};
 
 /// Sends `signal` to one process. It is not an error if the process is gone.
 pub(crate) fn signal(pid: u32, signal: Signal) {
@@ -27,7 +28,7 @@ pub(crate) fn stop(pid: u32) {
     signal(pid, Signal::STOP);
     let tasks = format!("/proc/{pid}/task");
     eventually("every thread of a process has stopped", || {
-        std::fs::read_dir(&tasks)
+        fs::read_dir(&tasks)
             .expect("a living process")
             .flatten()
             .all(|task| state(&task.path()).is_none_or(|state| state == 'T'))
@@ -41,18 +42,18 @@ pub(crate) fn alive(pid: u32) -> bool {
 
 /// The state letter of a process or thread. `None` if it is gone.
 fn state(folder: &Path) -> Option<char> {
-    let stat = std::fs::read_to_string(folder.join("stat")).ok()?;
+    let stat = fs::read_to_string(folder.join("stat")).ok()?;
     // The name of the command comes first, in parentheses, and may itself contain any characters.
     stat.rsplit(')').next()?.trim_start().chars().next()
 }
 
 /// The ports that the kernel chose for the process, and at which it listens.
 fn listening_ports(pid: u32) -> Vec<u16> {
-    let files = std::fs::read_dir(format!("/proc/{pid}/fd"));
+    let files = fs::read_dir(format!("/proc/{pid}/fd"));
     let files = files.into_iter().flatten().flatten();
-    let files = files.filter_map(|file| std::fs::read_link(file.path()).ok());
+    let files = files.filter_map(|file| fs::read_link(file.path()).ok());
     let open: Vec<_> = files.collect();
-    let table = std::fs::File::open(format!("/proc/{pid}/net/tcp")).into_iter();
+    let table = fs::File::open(format!("/proc/{pid}/net/tcp")).into_iter();
     let lines = table.flat_map(|table| BufReader::new(table).lines().skip(1));
     // Listening sockets come first. Tens of thousands of others may follow.
     let sockets = lines.map_while(|line| {
@@ -85,6 +86,8 @@ struct Line {
 #[derive(Debug)]
 pub(crate) struct Process {
     name: String,
+    /// The scratch folder of the test.
+    folder: Option<Box<Path>>,
     child: Child,
     ended: Option<ExitStatus>,
     /// The ports that no other process may get after this one has ended.
@@ -97,6 +100,8 @@ impl Process {
     #[track_caller]
     pub(crate) fn start(name: impl Into<String>, command: &mut Command) -> Self {
         let name = name.into();
+        let folder = command.get_envs().find(|(key, _)| *key == HOME);
+        let folder = folder.and_then(|(_, value)| value.map(|path| Path::new(path).into()));
         let mut child = command
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
@@ -111,6 +116,7 @@ impl Process {
         ];
         Self {
             name,
+            folder,
             child,
             ended: None,
             ports: Vec::new(),
@@ -126,7 +132,7 @@ impl Process {
     /// A value in KiB from `/proc/PID/status`, such as `VmRSS` or its maximum so far, `VmHWM`.
     #[track_caller]
     pub(crate) fn kib(&self, name: &str) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
+        let status = fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
         let line = status.lines().find(|line| line.starts_with(name)).unwrap();
         line.split_whitespace().nth(1).unwrap().parse().unwrap()
     }
@@ -255,6 +261,25 @@ impl Process {
     }
 }
 
+impl Process {
+    /// Prints the end of the output. All of it goes to a file.
+    fn show_end(&self, ended: Option<ExitStatus>) {
+        const SHOWN: usize = 60;
+        let log = self.log();
+        let lines: Vec<_> = log.lines().collect();
+        let file = self.folder.as_ref();
+        let file = file.map(|folder| folder.join(format!("output-of-{}", self.pid())));
+        if let Some(file) = file.filter(|file| fs::write(file, &log).is_ok() && lines.len() > SHOWN)
+        {
+            eprintln!("{}\n     … all of it is in {}", lines[0], file.display());
+            eprintln!("{}", lines[lines.len() - SHOWN..].join("\n"));
+        } else {
+            eprint!("{log}");
+        }
+        eprintln!("     (ended before the test: {ended:?})");
+    }
+}
+
 impl Drop for Process {
     fn drop(&mut self) {
         let ended = self.exited();
@@ -263,7 +288,7 @@ impl Drop for Process {
             let _ = self.child.wait();
         }
         if thread::panicking() {
-            eprintln!("{}     (ended before the test: {ended:?})", self.log());
+            self.show_end(ended);
         }
     }
 }

@@ -25,7 +25,7 @@ use super::process::signal;
 const TOKEN: &str = "ROSRESCUE_SCRATCH_TOKEN";
 
 /// The environment variable with the folder of the test.
-const HOME: &str = "ROS_HOME";
+pub(super) const HOME: &str = "ROS_HOME";
 
 /// If this variable is set, all rosmasters and rospy nodes speak HTTP/1.0, as on a kernel before 4.16.
 const HTTP_1_0: &str = "ROSRESCUE_HTTP_1_0";
@@ -141,6 +141,12 @@ fn has_token(folder: &Path, is_wanted: impl Fn(&str) -> bool) -> bool {
             .and_then(|rest| rest.strip_prefix('='))
             .is_some_and(&is_wanted)
     })
+}
+
+/// Whether a test of this program started the process with this folder in `/proc`.
+pub(super) fn is_of_this_program(folder: &Path) -> bool {
+    let start = format!("{}-", std::process::id());
+    has_token(folder, |token| token.starts_with(&start))
 }
 
 fn is_install(variable: &str) -> bool {
