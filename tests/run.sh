@@ -1,10 +1,13 @@
 #!/bin/sh
 # Runs every check of rosrescue on a bare Debian or Ubuntu: installs missing parts of ROS 1, then checks formatting,
 # clippy, the documentation, the dependencies (if cargo-deny is installed) and whether the fuzz targets compile, and runs
-# unit, integration and documentation tests. Needs a Rust toolchain.
+# unit, integration and documentation tests, those without ROS first. Needs a Rust toolchain.
 set -eu
 cd "$(dirname "$0")/.."
 
+if ! unshare --net true 2>/dev/null; then
+    echo "tests/run.sh: tests share this computer's network, because network namespaces are not allowed here" >&2
+fi
 if ! command -v cargo >/dev/null; then
     PATH="$PATH:$HOME/.cargo/bin"
 fi
@@ -35,20 +38,51 @@ else
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 
-# All test programs run, even if one fails. The failures are repeated at the end.
-#
+# Under nohup, SIGHUP is ignored by every child, and tests of an orderly stop would fail.
+default_hup=
+if env --default-signal=HUP true 2>/dev/null; then
+    default_hup="env --default-signal=HUP"
+fi
 # Tests with real ROS mostly wait for processes, so twice as many as there are cores run at once. Tests that measure
 # times (tests/timing) always run one at a time.
-threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
-# Under nohup, SIGHUP is ignored by every child, and tests of an orderly stop would fail.
-if env --default-signal=HUP true 2>/dev/null; then
-    set -- env --default-signal=HUP
-fi
+export RUST_TEST_THREADS="${RUST_TEST_THREADS:-$((2 * $(nproc)))}"
 log=$(mktemp)
 trap 'rm -f "$log" "$log.failed"' EXIT
-{ RUST_TEST_THREADS=$threads "$@" cargo test --locked --workspace --no-fail-fast 2>&1 || echo $? >"$log.failed"; } | tee "$log"
+
+# Runs test programs. If one fails, the next ones run all the same.
+programs() {
+    { $default_hup cargo test --locked --workspace --no-fail-fast "$@" 2>&1 || echo "$?" >"$log.failed"; } | tee -a "$log"
+}
+
+# Prints each failed test: the command that repeats it, and the beginning of its message.
+failures() {
+    awk '
+        $1 == "Running" && $2 == "unittests" { program = $4; sub(/^.*\//, "", program); sub(/-[^-]*$/, "", program)
+            gsub(/_/, "-", program); program = "-p " program " --lib" }
+        $1 == "Running" && $2 ~ /^tests\// { program = $2; sub(/^tests\//, "", program)
+            sub(/(\/main)?\.rs$/, "", program); program = "--test " program }
+        $1 == "Doc-tests" { program = "--doc" }
+        /^---- .* stdout ----$/ { print "cargo test --locked " program " " $2 " -- --exact --nocapture"; left = 8 }
+        /^stack backtrace:|^note: run with|^To repeat it:/ { left = 0 }
+        left > 0 && !/^----/ && NF { print "    " $0; left-- }
+        /^error: could not compile|^  process did/ { print }
+    ' "$log"
+}
+
+fast="codec checkpoint tidy"
+slow=
+for program in tests/*/main.rs crates/*/tests/*.rs; do
+    program=$(basename "${program%/main.rs}" .rs)
+    case " $fast " in *" $program "*) ;; *) slow="$slow $program" ;; esac
+done
+cargo test --locked --workspace --no-run
+# shellcheck disable=SC2046,SC2086 # several arguments
+programs --lib --bins $(printf ' --test %s' $fast)
+# shellcheck disable=SC2046,SC2086
+programs $(printf ' --test %s' $slow)
+programs --doc
 if [ -e "$log.failed" ]; then
-    echo "tests/run.sh: cargo test failed. The beginning of the output of each failed test:" >&2
-    awk '/^---- .* stdout ----$/ { left = 12 } /^stack backtrace:/ { left = 0 } left-- > 0' "$log" >&2
+    echo "tests/run.sh: failed:" >&2
+    failures >&2
     exit "$(cat "$log.failed")"
 fi
