@@ -19,7 +19,7 @@ use crate::{
     nodes::client::{self, Reaction},
     process::{self, listeners},
     replay::{
-        self, Authority, Bears, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
+        self, Authority, Bears, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
         withheld_run_id,
     },
     status::{report::RecoveryOutcome, software, stats::Stats},
@@ -481,48 +481,79 @@ impl Examiner {
                 plan,
             }
         });
+        let mut before: Option<(Master, Master)> = None;
         for round in 1..=ROUNDS {
             let Prepared { plan, complete, .. } = next;
             tracing::debug!(round, bytes = plan.request().len(), complete, "injecting");
             let reply = connection.predicted(plan.request().clone(), plan.answer());
             let raw = self.while_alive(reply).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
-            let Err(mismatches) = verdict(&plan, &raw)? else {
+            let Err(mut deviation) = verdict(&plan, &raw)? else {
                 examination.mismatches.clear();
                 if !complete || plan.expected().is_inexact() {
                     self.ledger.adopt(plan.expected().clone());
                 }
-                self.ledger.delivered();
-                tracing::debug!(skipped = plan.skipped().len(), "injected");
-                if !matches!(change, Change::Renew(_)) {
-                    self.stats.masters_restored.count();
-                }
+                self.injected(&plan, change, round);
                 // Freeing thousands of small allocations takes time, so another thread does it.
                 crate::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
-            examination.mismatches = mismatches;
-            rarely!(
-                error,
-                round,
-                mismatches = ?examination.mismatches,
-                "the master does not hold the state that it was given; giving it the missing part again; please report this line"
-            );
             // What the master holds now replaces what was expected, and the missing part is injected again.
             let first = self.first_look(connection).await?;
-            let found = inspect::second(first, connection, plan.expected());
-            let found = self.while_alive(found).await?;
-            let plan = tokio::task::block_in_place(|| Plan::new(state, &found, token));
+            if first.bears() != Bears::Present && deviation.failed.is_empty() {
+                deviation.failed.push("the token is missing".to_owned());
+            }
+            let now = inspect::second(first, connection, plan.expected());
+            let now = self.while_alive(now).await?;
+            if deviation.failed.is_empty() {
+                rarely!(
+                    info,
+                    round,
+                    changed = ?deviation.changed,
+                    "another program has changed the master while it got its state; the changes are kept"
+                );
+            } else {
+                rarely!(
+                    error,
+                    round,
+                    mismatches = ?deviation.failed,
+                    "the master does not hold the state that it was given; giving it the missing part again; please report this line"
+                );
+            }
+            examination.mismatches.clone_from(&deviation.failed);
+            let (state, found) = before.as_ref().map_or((state, found), |(a, b)| (a, b));
+            let (wanted, repair) = tokio::task::block_in_place(|| {
+                let wanted = plan.remaining(state, found, &deviation, &now);
+                let repair = Plan::repair(&wanted, &now, token);
+                (wanted, repair)
+            });
+            let is_whole = deviation.failed.is_empty() && repair.expected() == &now;
+            if is_whole || round == ROUNDS {
+                self.ledger.adopt(now);
+                self.injected(&plan, change, ROUNDS);
+                return Ok(());
+            }
             next = Prepared {
                 basis: None,
-                complete: plan.expected() == state,
-                plan,
+                complete: false,
+                plan: repair,
             };
-            if round == ROUNDS {
-                self.ledger.adopt(found);
-            }
+            before = Some((wanted, now));
         }
         Ok(())
+    }
+
+    /// Notes that the master has got `plan` in this round, and that the mirror equals it.
+    fn injected(&self, plan: &Plan, change: &Change, round: u32) {
+        self.ledger.delivered();
+        tracing::debug!(skipped = plan.skipped().len(), "injected");
+        if !matches!(change, Change::Renew(_)) {
+            self.stats.masters_restored.count();
+        }
+        if round > 1 {
+            // Another program changes the master, and may have done so once more.
+            self.ledger.doubt();
+        }
     }
 
     async fn first_look(&self, connection: &mut Connection) -> Result<Inspection, ExamineError> {
@@ -547,9 +578,9 @@ impl Examiner {
     }
 }
 
-/// Whether a master's reply is the one that `plan` predicts; if not, the differences. Decodes the reply only if its
+/// Whether a master's reply is the one that `plan` predicts; if not, how it differs. Decodes the reply only if its
 /// bytes differ from the prediction, because the reply is long and calls are waiting.
-fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
+fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Deviation>, ExamineError> {
     Ok(match raw.body == plan.answer() {
         true => Ok(()),
         false if raw.keeps_order() => plan.verify(&raw.decode()?),

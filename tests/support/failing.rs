@@ -156,8 +156,8 @@ impl Forkserver {
         answer.trim_end().to_owned()
     }
 
-    /// Starts a master on `port` and returns its process id. It dies for the reasons in `failures`, unless
-    /// that is empty.
+    /// Starts a master on `port` and returns its process id. It does what `failures` says (`tests/failing/rosmaster`),
+    /// unless that is empty.
     pub(crate) fn start(&mut self, port: u16, failures: &str) -> u32 {
         let order = format!("start {port} {failures}");
         self.order(order.trim_end()).parse().unwrap()

@@ -26,7 +26,7 @@ mod treatment;
 pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
-pub use plan::{Plan, Skipped};
+pub use plan::{Deviation, Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
 pub use roscore::{ROSOUT, RUN_ID_AFTER, lacks_run_id, rosout_to_ask, withheld_run_id};
 pub use token::{Bears, Token};

@@ -300,3 +300,38 @@ fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
         }
     }
 }
+
+/// Number of calls that a new master gets for each of the states below, until it has answered the last one that reads
+/// its parameters: two looks with six calls each, then the injection.
+const READ: usize = 2 * 6 + 7;
+
+/// A roscore sets parameters while its master gets the state, and a vendor's script may set more.
+#[test]
+fn parameters_that_another_program_sets_at_any_moment_of_an_injection_stay() {
+    let mut proxied = Proxied::new();
+    let client = proxied.rescue.client();
+    let node = FakeNode::start("/node");
+    client.set_param("/ours/x", 1);
+    node.publish(&client, "/topic", "a/B");
+    node.subscribe(&client, "/topic", "a/B");
+    let mut pid = proxied.bare().master_pid().unwrap();
+    for moment in 1..=READ {
+        proxied.forkserver.kill(pid);
+        let key = format!("/ours/set_{moment}");
+        pid = (proxied.forkserver).start(proxied.port, &format!("set {moment} {key}"));
+        proxied.await_open(pid);
+        let value = i32::try_from(moment).ok().map(Value::Int);
+        assert_eq!(proxied.bare().param(&key), value, "moment {moment}");
+        assert_eq!(proxied.bare().param("/ours/x"), Some(Value::Int(1)));
+        proxied.forkserver.kill(pid);
+        eventually("the mirror stands in", || status(&client)["open"] == false);
+        assert_eq!(client.param(&key), value, "in the mirror, moment {moment}");
+        pid = proxied.live();
+        assert_eq!(proxied.bare().param(&key), value, "moment {moment}, later");
+        let state = State::read(&proxied.bare());
+        assert_eq!(state.publishers_of("/topic"), ["/node"]);
+        assert_eq!(state.subscribers_of("/topic"), ["/node"]);
+    }
+    let log = proxied.rescue.stderr().join("\n");
+    assert!(!log.contains("please report"), "{log}");
+}

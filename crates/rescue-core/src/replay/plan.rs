@@ -5,19 +5,23 @@ use std::fmt;
 use bytes::Bytes;
 
 use super::inspect::lookup;
-use super::restore::{self, Restore};
+use super::restore::{self, Manner, Restore};
 use super::{Token, order};
 use crate::master::{CALLER_ID, Master, Method, Request, Write, reply_entry, returnable};
-use crate::xmlrpc::{self, ListWriter, Reply, Value};
+use crate::xmlrpc::{self, ListWriter, Reply, Struct, Value};
 
 /// Maximum number of mismatches in an error.
 const MISMATCHES_MAX: usize = 20;
+/// Part of the fault with which rosmaster answers a multicall if another program sets a parameter while the answer with
+/// all parameters is encoded. All calls have been executed by then.
+const CHANGED_MEANWHILE: &str = "changed size during iteration";
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
 ///
 /// # Order
 ///
-/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, so these are not notified.
+/// 1. One `setParam('/', tree)`, right after a `getParam('/')` that shows what it overwrites. Parameters come before
+///    their subscribers, so these are not notified.
 /// 2. Publishers, before there are subscribers to notify. Some topic types are set by a helper that subscribes and
 ///    unsubscribes at once: types of topics without publishers and subscribers, and types that the order of the calls
 ///    would put too late in `getTopicTypes`. The plan sets no more types in this way than the order requires.
@@ -142,18 +146,24 @@ impl Plan {
     ///
     /// Tokens in `target` and `found` are ignored.
     pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
-        Self::write(target, found, None, false, token)
+        Self::write(target, found, None, Manner::Add, token)
+    }
+
+    /// Like [`Self::new`], but the parameters become exactly those of `target`. Each that differs is set or deleted by
+    /// its own call, so nothing is overwritten that another program sets at the same time.
+    pub fn repair(target: &Master, found: &Master, token: &Token) -> Self {
+        Self::write(target, found, None, Manner::Repair, token)
     }
 
     /// Plans to replace the token `before` of a master whose state is `found`, and to change nothing else.
     pub fn renew(found: &Master, before: &Token, token: &Token) -> Self {
-        Self::write(found, found, Some(before), false, token)
+        Self::write(found, found, Some(before), Manner::Add, token)
     }
 
     /// Plans to bring a master whose state is `found` to exactly `target`, and to replace its token `before` by
-    /// `token`. Everything is removed, subscribers first, and added again. No node is notified.
+    /// `token`. Registrations are removed, subscribers first, and added again. No node is notified.
     pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
-        Self::write(target, found, Some(before), true, token)
+        Self::write(target, found, Some(before), Manner::Replace, token)
     }
 
     /// Plans to run `writes` on a master whose state is `behind`, and to replace its token `before` by `token`.
@@ -168,27 +178,27 @@ impl Plan {
         })
     }
 
-    /// Plans the calls that bring a master from `found` to `target`. With `empties`, the first calls remove everything
-    /// that the master holds.
+    /// Plans the calls that bring a master from `found` to `target`. To [replace](Manner::Replace), the first calls
+    /// remove all registrations.
     fn write(
         target: &Master,
         found: &Master,
         before: Option<&Token>,
-        empties: bool,
+        manner: Manner,
         token: &Token,
     ) -> Self {
         Self::sequence(found, before, token, |write| {
             let mut emptied = None;
-            if empties {
+            if manner == Manner::Replace {
                 let mut model = found.clone();
-                for call in restore::removal(found, target) {
+                for call in restore::removal(found) {
                     let predicted = model.apply(&call).reply;
                     write(call, predicted);
                 }
                 emptied = Some(model);
             }
             let Restore { model, skipped, .. } =
-                Restore::run(target, emptied.as_ref().unwrap_or(found), empties, write);
+                Restore::run(target, emptied.as_ref().unwrap_or(found), manner, write);
             (model, skipped)
         })
     }
@@ -259,8 +269,8 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// A sentence for each entry that was answered differently, at most 20, without parameter values.
-    pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
+    /// How the answers differ.
+    pub fn verify(&self, reply: &Reply) -> Result<(), Deviation> {
         self.verify_by(reply, true)
     }
 
@@ -270,18 +280,17 @@ impl Plan {
     /// # Errors
     ///
     /// As for [`Self::verify`].
-    pub fn verify_in_any_order(&self, reply: &Reply) -> Result<(), Vec<String>> {
+    pub fn verify_in_any_order(&self, reply: &Reply) -> Result<(), Deviation> {
         self.verify_by(reply, false)
     }
 
-    fn verify_by(&self, reply: &Reply, ordered: bool) -> Result<(), Vec<String>> {
-        let whole = |text: &str| {
-            let sentence = format!("the whole injection was answered with {text}");
-            Err(vec![sentence])
-        };
+    fn verify_by(&self, reply: &Reply, ordered: bool) -> Result<(), Deviation> {
+        let mut deviation = Deviation::default();
+        let whole = |text: &str| vec![format!("the whole injection was answered with {text}")];
         let call = Request::decode(&self.request);
         let (Ok(call), Ok(predicted)) = (call, xmlrpc::decode_reply(&self.answer)) else {
-            return whole("something else than predicted");
+            deviation.failed = whole("something else than predicted");
+            return Err(deviation);
         };
         let (results, predicted) = match (reply, &predicted) {
             (Reply::Value(Value::Array(results)), Reply::Value(Value::Array(predicted)))
@@ -289,27 +298,84 @@ impl Plan {
             {
                 (results, predicted)
             }
-            (Reply::Fault { text, .. }, _) => return whole(text),
-            _ => return whole("another number of results than there were calls"),
+            (Reply::Fault { text, .. }, _) => {
+                match text.contains(CHANGED_MEANWHILE) {
+                    true => deviation.changed = whole(text),
+                    false => deviation.failed = whole(text),
+                }
+                return Err(deviation);
+            }
+            _ => {
+                deviation.failed = whole("another number of results than there were calls");
+                return Err(deviation);
+            }
         };
-        let mismatches: Vec<_> = (results.iter().zip(predicted))
-            .zip(call.calls())
-            .filter(|((result, predicted), call)| {
-                let in_any_order = || {
-                    let lists = !matches!(call.method(), Method::GetParam);
-                    order::sorted(result, lists) == order::sorted(predicted, lists)
-                };
-                !is_alike(result, predicted) && (ordered || !in_any_order())
-            })
-            .map(|(_, call)| mismatch(call))
-            .take(MISMATCHES_MAX)
-            .collect();
-        if mismatches.is_empty() {
-            Ok(())
-        } else {
-            Err(mismatches)
+        let calls = call.calls();
+        for (index, (result, predicted)) in results.iter().zip(predicted).enumerate() {
+            let Some(call) = calls.get(index) else { break };
+            let in_any_order = || {
+                let lists = !matches!(call.method(), Method::GetParam);
+                order::sorted(result, lists) == order::sorted(predicted, lists)
+            };
+            if is_alike(result, predicted) || !ordered && in_any_order() {
+                continue;
+            }
+            if calls.get(index + 1).is_some_and(|next| sets_all(next)) {
+                deviation.overwritten = value(result).and_then(Value::as_struct).cloned();
+            }
+            // A registration is answered with the other nodes of its topic, which another program may have registered.
+            let list = match !call.kind().mutates() || code(result) == code(predicted) {
+                true => &mut deviation.changed,
+                false => &mut deviation.failed,
+            };
+            if list.len() < MISMATCHES_MAX {
+                list.push(mismatch(call));
+            }
+        }
+        match deviation == Deviation::default() {
+            true => Ok(()),
+            false => Err(deviation),
         }
     }
+
+    /// The state that a master must have, after it has answered this plan with `deviation`, for [`Self::repair`].
+    /// `target` is the plan's target, `found` what the master held before, and `now` what it has held since.
+    ///
+    /// Parameters that another program has set or deleted since `found` was read count as newer, unless the target
+    /// differs from `found` in the same ones. What the master lacks of the rest is given to it again.
+    pub fn remaining(
+        &self,
+        target: &Master,
+        found: &Master,
+        deviation: &Deviation,
+        now: &Master,
+    ) -> Master {
+        let given = self.expected.params();
+        let mut tree = given.clone();
+        if let Some(overwritten) = &deviation.overwritten {
+            tree = restore::changed(found.params(), given, overwritten);
+        }
+        tree = match deviation.failed.is_empty() {
+            true => restore::changed(given, now.params(), &tree),
+            // It is not known whether the master has executed the `setParam`.
+            false => restore::merged(&tree, now.params()),
+        };
+        let mut wanted = target.clone();
+        let params = [CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+        wanted.apply_telling(&Request::new(Method::SetParam, params), &mut ());
+        wanted
+    }
+}
+
+/// How a master has answered a plan differently than predicted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Deviation {
+    /// A sentence for each call that was not executed, at most 20, without parameter values.
+    pub failed: Vec<String>,
+    /// A sentence for each answer that shows that another program has changed the master since it was read, at most 20.
+    pub changed: Vec<String>,
+    /// The parameters that the plan has overwritten, if they were not those that the master held when it was read.
+    pub overwritten: Option<Struct>,
 }
 
 /// The reads that check the whole target state. Looks up only addresses that the master had before, because the others
@@ -328,9 +394,23 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     calls
 }
 
+/// The code of a call's answer in a multicall. `None` for a fault.
+fn code(entry: &Value) -> Option<i32> {
+    entry.as_array()?.first()?.as_array()?.first()?.as_int()
+}
+
+/// The value of a call's answer in a multicall.
+fn value(entry: &Value) -> Option<&Value> {
+    entry.as_array()?.first()?.as_array()?.get(2)
+}
+
+/// Whether `call` sets the whole parameter tree.
+fn sets_all(call: &Request) -> bool {
+    *call.method() == Method::SetParam && call.text(1) == Some("/")
+}
+
 /// Whether an entry was answered as predicted. For a refusal only the code is compared.
 fn is_alike(result: &Value, predicted: &Value) -> bool {
-    let code = |entry: &Value| entry.as_array()?.first()?.as_array()?.first()?.as_int();
     let refused = code(predicted).filter(|code| *code != 1);
     result == predicted || refused.is_some() && refused == code(result)
 }

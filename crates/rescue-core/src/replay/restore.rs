@@ -24,15 +24,24 @@ pub(super) struct Restore<'a, W> {
     /// Whether the new master's list of topic types is a prefix of the list in `target`, the state to restore. If not,
     /// the order of the types cannot be restored.
     ordered: bool,
-    /// Whether the topic types of `target`, the state to restore, win over those of the new master. This requires that
-    /// the new master has no registrations.
-    types_win: bool,
+    manner: Manner,
+}
+
+/// How the new master's state is treated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Manner {
+    /// What the master holds stays. One `setParam` sets the whole parameter tree.
+    Add,
+    /// Like [`Self::Add`], but the parameters become exactly those of the target, and each that differs is set or
+    /// deleted by its own call. So nothing is overwritten that another program sets at the same time.
+    Repair,
+    /// The parameters and topic types of the target replace those of the master, which has no registrations.
+    Replace,
 }
 
 impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
-    /// Brings a model of `found` to `target`. With `types_win`, `found` must have no registrations, and
-    /// topics that have another type there get the target's type.
-    pub(super) fn run(target: &'a Master, found: &'a Master, types_win: bool, write: W) -> Self {
+    /// Brings a model of `found` to `target`.
+    pub(super) fn run(target: &'a Master, found: &'a Master, manner: Manner, write: W) -> Self {
         let known = found.topic_types().keys();
         let first = target.topic_types().keys().take(known.len());
         let mut restore = Self {
@@ -44,7 +53,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             target,
             found,
             types_in: 0,
-            types_win,
+            manner,
         };
         restore.params();
         restore.nodes();
@@ -68,7 +77,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     fn params(&mut self) {
         let found = self.found.params();
-        let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
+        let keeps = self.manner == Manner::Add && !found.is_empty();
+        let both = keeps.then(|| merged(self.target.params(), found));
         let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
             // There is nothing to set, so even parameters that a master cannot return stay.
@@ -77,9 +87,49 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         let (tree, left_out) = returnable::writable(whole);
         let keys = left_out.into_iter();
         self.skipped.extend(keys.map(|key| Skipped::Param { key }));
-        if !tree.iter().eq(found) {
-            let params = [CALLER_ID.into(), "/".into(), Value::Struct(tree)];
-            self.push(Method::SetParam, params);
+        if tree.iter().eq(found) {
+            return;
+        }
+        if self.manner == Manner::Repair {
+            return self.set_different("", tree, found);
+        }
+        // Another program may have set parameters since the inspection, and this `setParam` removes them. rosmaster
+        // answers `getParam` with the tree itself and encodes it when the multicall ends. So the answer also has what
+        // was set between the two calls.
+        if returnable::is_writable(found) && !self.found.is_inexact() {
+            self.push(Method::GetParam, [CALLER_ID, "/"]);
+        }
+        let params = [CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+        self.push(Method::SetParam, params);
+    }
+
+    /// Sets or deletes each parameter in the namespace `path` in which `tree` and `found` differ.
+    fn set_different(&mut self, path: &str, tree: Struct, found: &Struct) {
+        let is_nameable = |key: &str| !key.is_empty() && !key.contains('/');
+        let differs = |(key, value): (&String, &Value)| found.get(key) != Some(value);
+        let set = tree.iter().filter(|entry| differs(*entry));
+        let gone = found.keys().filter(|key| !tree.contains_key(*key));
+        let mut keys = set.map(|(key, _)| key).chain(gone.clone());
+        if !keys.all(|key| is_nameable(key)) {
+            let path = if path.is_empty() { "/" } else { path };
+            let params = [CALLER_ID.into(), path.into(), Value::Struct(tree)];
+            return self.push(Method::SetParam, params);
+        }
+        for key in gone {
+            self.push(Method::DeleteParam, [CALLER_ID, &format!("{path}/{key}")]);
+        }
+        for (key, value) in tree.iter() {
+            let path = format!("{path}/{key}");
+            match (value, found.get(key)) {
+                (value, Some(known)) if value == known => {}
+                (Value::Struct(inner), Some(Value::Struct(known))) => {
+                    self.set_different(&path, inner.clone(), known);
+                }
+                (value, _) => {
+                    let params = [CALLER_ID.into(), path.as_str().into(), value.clone()];
+                    self.push(Method::SetParam, params);
+                }
+            }
         }
     }
 
@@ -147,7 +197,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// The type with which to register a topic. A type that the new master has stays, unless the target's types win.
     fn topic_type(&self, topic: &str) -> &'a str {
         let known = self.found.type_of(topic);
-        let known = known.filter(|known| *known != "*" && !self.types_win);
+        let known = known.filter(|known| *known != "*" && self.manner != Manner::Replace);
         known.or_else(|| self.target.type_of(topic)).unwrap_or("*")
     }
 
@@ -380,7 +430,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         for (topic, topic_type) in target.topic_types() {
             let known = self.model.type_of(topic);
             let differs = known.is_some_and(|known| known != topic_type);
-            if self.types_win && differs && topic_type != "*" {
+            if self.manner == Manner::Replace && differs && topic_type != "*" {
                 self.set_type(topic, topic_type, true);
             }
         }
@@ -437,20 +487,48 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 }
 
-/// The calls that empty a master that holds `found`, so that it can get exactly `target`. Subscribers are removed
-/// first, so that they are not notified of the rest. Parameters that are already right stay.
-pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
+/// The calls that remove all registrations from a master that holds `found`. Subscribers are removed first, so that they
+/// are not notified of the rest.
+pub(super) fn removal(found: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
     let (publishers, mut first): (Vec<_>, Vec<_>) =
         calls.partition(|call| *call.method() == Method::UnregisterPublisher);
-    if !found.params().iter().eq(target.params()) {
-        let nothing = Value::Struct(Struct::new());
-        let params = [CALLER_ID.into(), "/".into(), nothing];
-        first.push(Request::new(Method::SetParam, params));
-    }
     first.extend(publishers);
     first
+}
+
+/// Makes the changes that lead from the parameter tree `from` to `to` in the tree `onto`. What `to` lacks is removed only
+/// where `onto` still has the value of `from`.
+pub(super) fn changed(from: &Struct, to: &Struct, onto: &Struct) -> Struct {
+    let nothing = Struct::new();
+    let inner = |value: Option<&Value>| match value {
+        Some(Value::Struct(inner)) => inner.clone(),
+        _ => nothing.clone(),
+    };
+    let mut tree = onto.clone();
+    tree.retain(|key, value| match (from.get(key), value) {
+        _ if to.contains_key(key) => true,
+        (Some(Value::Struct(from)), Value::Struct(value)) => {
+            *value = changed(from, &nothing, value);
+            !value.is_empty()
+        }
+        (before, value) => before != Some(value),
+    });
+    for (key, value) in to
+        .iter()
+        .filter(|(key, value)| from.get(*key) != Some(*value))
+    {
+        match (value, tree.get_mut(key)) {
+            (Value::Struct(value), Some(Value::Struct(known))) => {
+                *known = changed(&inner(from.get(key)), value, known);
+            }
+            _ => {
+                tree.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    tree
 }
 
 /// Merges two parameter trees namespace by namespace. `ours` wins over `theirs`.
