@@ -29,7 +29,7 @@ use crate::{
     limit::{Pair, alarm, all_clear, rarely},
     nodes::Nodes,
     process::{self, ProcessError, effort, listeners::Holder},
-    replay::{RUN_ID_AFTER, lacks_run_id},
+    replay::RUN_ID_AFTER,
     status::{
         Board,
         report::{AWAY, RecoveryOutcome, STARTED},
@@ -38,6 +38,10 @@ use crate::{
     wait,
     write_queue::WriteQueue,
 };
+
+/// Pause between two questions whether a roscore has set its run id. A roscore does so within 0.1 s after its master
+/// listens, if it gets enough CPU time.
+const RUN_ID_PAUSE: Duration = Duration::from_millis(100);
 
 /// Limits the log lines about the beginning and the end of a crash loop.
 static CRASH_LOOP: Pair = Pair::new();
@@ -539,21 +543,23 @@ impl Driver {
         }
     }
 
-    /// Sets the run id that the present master has not been given, once it has served for [`RUN_ID_AFTER`].
+    /// Sets the run id that the present master has not been given, as soon as a roscore has set its own, or after
+    /// [`RUN_ID_AFTER`].
     fn set_run_id_later(&self) {
         if self.examiner.lock_run_id().is_none() {
             return;
         }
-        let (examiner, nodes) = (self.examiner.clone(), self.nodes.clone());
-        let (write_queue, incarnation) = (self.write_queue.clone(), examiner.ledger.incarnation());
+        let (examiner, write_queue) = (self.examiner.clone(), self.write_queue.clone());
+        let incarnation = examiner.ledger.incarnation();
         crate::task::spawn(async move {
-            tokio::time::sleep(RUN_ID_AFTER).await;
-            // Otherwise the next opening of the gate begins the wait again.
-            if !nodes.gate.is_open() || examiner.ledger.incarnation() != incarnation {
-                return;
+            let until = Instant::now() + RUN_ID_AFTER;
+            while Instant::now() < until && !examiner.has_run_id().await {
+                tokio::time::sleep(RUN_ID_PAUSE).await;
             }
-            let set = examiner.lock_run_id().take();
-            if let Some(set) = set.filter(|_| examiner.ledger.with_mirror(lacks_run_id)) {
+            // The next master gets the run id in the same way.
+            if examiner.ledger.incarnation() == incarnation
+                && let Some(set) = examiner.take_run_id()
+            {
                 write_queue.call(set).await;
             }
         });

@@ -194,6 +194,22 @@ impl Examiner {
         self.run_id.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Takes the call that sets the run id that the present master has not been given.
+    pub(super) fn take_run_id(&self) -> Option<Request> {
+        self.lock_run_id().take()
+    }
+
+    /// Whether the present master has a run id. False if it does not answer.
+    pub(super) async fn has_run_id(&self) -> bool {
+        let asked = async {
+            let mut connection = self.upstream.connect().await?;
+            let reply = connection.call(&replay::has_run_id().into()).await?;
+            Ok::<_, ExamineError>(reply)
+        };
+        let reply = within(self.probe_timeout, asked).await;
+        reply.is_ok_and(|reply| replay::says_run_id(&reply))
+    }
+
     /// Lets calls pass to the present master.
     pub(super) fn open_gate(&self) {
         let incarnation = self.ledger.serve();

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use rustix::process::Signal;
@@ -134,7 +134,18 @@ pub(crate) struct Forkserver {
 
 impl Forkserver {
     pub(crate) fn new(scratch: &Scratch) -> Self {
-        let mut command = Command::new(FAILING_ROSMASTER);
+        Self::of(scratch, FAILING_ROSMASTER.as_ref())
+    }
+
+    /// Starts masters that seem to be those of a roscore.
+    pub(crate) fn roscore(scratch: &Scratch) -> Self {
+        let roscore = scratch.path("roscore");
+        std::os::unix::fs::symlink(FAILING_ROSMASTER, &roscore).unwrap();
+        Self::of(scratch, &roscore)
+    }
+
+    fn of(scratch: &Scratch, program: &Path) -> Self {
+        let mut command = Command::new(program);
         scratch.prepare(&mut command);
         let mut child = command
             .arg("--forkserver")

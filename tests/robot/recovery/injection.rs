@@ -25,8 +25,12 @@ struct Proxied {
 
 impl Proxied {
     fn new() -> Self {
+        Self::of(Forkserver::new)
+    }
+
+    fn of(forkserver: impl FnOnce(&Scratch) -> Forkserver) -> Self {
         let scratch = Scratch::new();
-        let mut forkserver = Forkserver::new(&scratch);
+        let mut forkserver = forkserver(&scratch);
         let port = free_port();
         forkserver.start(port, "");
         let rescue = Setup::proxy(&scratch, port).args(["--hold", "60"]).start();
@@ -334,4 +338,33 @@ fn parameters_that_another_program_sets_at_any_moment_of_an_injection_stay() {
     }
     let log = proxied.rescue.stderr().join("\n");
     assert!(!log.contains("please report"), "{log}");
+}
+
+/// roscore sets its run id as soon as its master listens, and ends if it finds another one.
+#[test]
+fn a_roscore_may_set_its_run_id_at_any_moment_and_the_master_gets_the_old_one() {
+    let mut proxied = Proxied::of(Forkserver::roscore);
+    let client = proxied.rescue.client();
+    client.set_param("/run_id", "old");
+    let mut pid = proxied.bare().master_pid().unwrap();
+    let old = Some(Value::from("old"));
+    for moment in 1..=READ + 6 {
+        proxied.forkserver.kill(pid);
+        pid = (proxied.forkserver).start(proxied.port, &format!("set {moment} /run_id"));
+        proxied.await_open(pid);
+        eventually("the run id is the old one", || {
+            (client.param("/run_id"), proxied.bare().param("/run_id")) == (old.clone(), old.clone())
+        });
+    }
+    // No roscore sets one.
+    proxied.forkserver.kill(pid);
+    proxied.live();
+    assert_eq!(
+        proxied.bare().param("/run_id"),
+        None,
+        "it waits for a roscore"
+    );
+    eventually("the run id is the old one", || {
+        proxied.bare().param("/run_id") == old
+    });
 }

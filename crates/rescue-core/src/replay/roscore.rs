@@ -8,15 +8,30 @@ use std::time::Duration;
 
 use super::{Bears, Treatment};
 use crate::master::{CALLER_ID, Master, Method, Request};
+use crate::xmlrpc::{Reply, Value};
 
 const RUN_ID: &str = "/run_id";
 
 /// The name of roscore's rosout.
 pub const ROSOUT: &str = "/rosout";
 
-/// How long after the rest of the state such a master gets the run id. roscore looks for it as soon as its master
-/// listens, and asks ten times a second whether it does.
+/// How long to wait at most for a roscore that sets its own run id, before the master gets the old one. roscore sets it as
+/// soon as its master listens, and asks ten times a second whether it does. It never looks at the run id again.
 pub const RUN_ID_AFTER: Duration = Duration::from_secs(5);
+
+/// Asks a master whether it has a run id.
+pub fn has_run_id() -> Request {
+    Request::new(Method::HasParam, [CALLER_ID, RUN_ID])
+}
+
+/// Whether `reply` to [`has_run_id`] says yes.
+pub fn says_run_id(reply: &Reply) -> bool {
+    let answer = match reply {
+        Reply::Value(answer) => answer.as_array(),
+        Reply::Fault { .. } => None,
+    };
+    answer.and_then(|answer| answer.get(2)) == Some(&Value::Bool(true))
+}
 
 /// The calls that remove the run id from `state` and set it again, if a new master must not get it at once: a roscore
 /// may have started the master, and has not set a run id in `found` yet.
@@ -33,11 +48,6 @@ pub fn withheld_run_id(
         let set = [CALLER_ID.into(), RUN_ID.into(), value];
         (remove, Request::new(Method::SetParam, set))
     })
-}
-
-/// Whether `state` has no run id.
-pub fn lacks_run_id(state: &Master) -> bool {
-    state.param(RUN_ID).is_none()
 }
 
 /// The address of the rosout in `state`, if rosout must be asked whether it lives before a new master gets the state. A
@@ -74,7 +84,10 @@ mod tests {
         let (remove, set) = calls.expect("the run id comes later");
         let mut master = old.clone();
         master.apply(&remove);
-        assert!(lacks_run_id(&master) && !lacks_run_id(&old));
+        for (state, says) in [(&master, false), (&old, true)] {
+            let reply = state.clone().apply(&has_run_id()).reply;
+            assert_eq!(says_run_id(&reply), says);
+        }
         master.apply(&set);
         assert_eq!(master.params(), old.params());
     }
