@@ -95,8 +95,8 @@ fn a_node_that_dies_during_an_outage_is_unregistered_after_the_recovery() {
     robot.kill_master();
     drop(dead);
     publisher.publish(&client, "/topic", "std_msgs/String");
-    eventually("the node is unreachable", || {
-        names(&status(&client)["unreachable"]) == ["/leaving"]
+    eventually("the node is known to be dead", || {
+        names(&status(&client)["dead_nodes"]) == ["/leaving"]
     });
     let stays = || knows(&client);
     assert!(
@@ -108,7 +108,10 @@ fn a_node_that_dies_during_an_outage_is_unregistered_after_the_recovery() {
     eventually("the node is unregistered from the master", || {
         !knows(&robot.bare())
     });
-    eventually("no node is unreachable any more", || {
-        names(&status(&client)["unreachable"]).is_empty()
+    eventually("no node is unreachable or dead any more", || {
+        let status = status(&client);
+        ["unreachable", "dead_nodes"]
+            .iter()
+            .all(|list| names(&status[*list]).is_empty())
     });
 }
