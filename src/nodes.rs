@@ -50,8 +50,8 @@ use crate::{
 /// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
-/// Delay before a restarted rosrescue sends the notifications that the dead one may not have sent. By then a master
-/// that still runs has sent its own notifications, unless it has a long backlog.
+/// Delay before a restarted rosrescue that adopts a living master sends the notifications that the dead rosrescue may not
+/// have sent. By then the master has sent its own, unless it has a long backlog.
 const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
 /// Maximum number of nodes that are remembered because they do not answer `paramUpdate`.
@@ -344,6 +344,31 @@ pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
         }
     });
     topics
+}
+
+/// Tells all subscribers the state: an earlier rosrescue of this session has ended, and may have owed them notifications.
+/// They are told again after [`ADOPTED_AFTER`], because a slow node may read an older notification of that rosrescue
+/// later than this one. Also begins to shut down nodes whose names other nodes have taken.
+pub(crate) fn notify_after_restart(nodes: &Arc<Nodes>) {
+    let now = Instant::now();
+    nodes
+        .ledger
+        .with_activity(|mirror, activity| activity.notice_all(mirror, now));
+    let (topics, params) = take_owed(nodes, now);
+    let again = now + ADOPTED_AFTER;
+    nodes.ledger.with_order(|order, mirror| {
+        let topics = topics.into_iter().flat_map(|topic| {
+            let subscribers = mirror.subscribers_of(&topic).into_iter();
+            subscribers.map(move |api| (api, Subject::Topic(topic.clone())))
+        });
+        let params = params.into_iter();
+        let params = params.map(|(api, key)| (api, Subject::Param(key.to_string())));
+        for (api, subject) in topics.chain(params) {
+            order.tell_state(port_of(&api), subject.clone());
+            order.tell_state_at(again, port_of(&api), subject);
+        }
+    });
+    notifications::send_waiting(nodes);
 }
 
 fn tell(nodes: &Arc<Nodes>, change: NotifyingChange) {

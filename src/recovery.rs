@@ -27,7 +27,7 @@ use crate::{
     ledger::history::Rescues,
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision, evidence::Sample},
     limit::{Pair, alarm, all_clear, rarely},
-    nodes::Nodes,
+    nodes::{self, Nodes},
     process::{self, ProcessError, effort, listeners::Holder},
     replay::RUN_ID_AFTER,
     status::{
@@ -62,6 +62,16 @@ enum Done {
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
+/// The notifications that an earlier rosrescue of this session may have owed to nodes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum News {
+    Owed,
+    /// Sent by this rosrescue before any master.
+    SentFirst,
+    /// There were none, or a master has been found since.
+    Sent,
+}
+
 /// Carries out what the [lifecycle](crate::lifecycle) decides: starts and watches the master, gives it its state, and
 /// lets calls pass to it.
 pub(crate) struct Driver {
@@ -75,6 +85,8 @@ pub(crate) struct Driver {
     rescues: Rescues,
     /// Number of the rescue in which the present master was restored. Set until calls pass to that master.
     restored: Option<u64>,
+    /// Whether nodes lack notifications that an earlier rosrescue of this session may have owed them.
+    news: News,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
@@ -119,6 +131,7 @@ impl Driver {
             process,
             rescues,
             restored: None,
+            news: News::Sent,
             spawn_error: None,
             sentinel: None,
             ended: None,
@@ -136,6 +149,20 @@ impl Driver {
     pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
         self.outage.cause = cause;
         self.start(true)
+    }
+
+    /// Notes that an earlier rosrescue of this session has ended. If there is no master, the nodes get the notifications
+    /// that it may have owed them. Otherwise the health check after the recovery sends these.
+    pub(crate) fn continues_session(&mut self) {
+        self.news = News::Owed;
+    }
+
+    /// Sends the notifications that an earlier rosrescue may have owed. No master is sending older ones.
+    fn send_news(&mut self) {
+        if self.news == News::Owed {
+            self.news = News::SentFirst;
+            nodes::notify_after_restart(&self.nodes);
+        }
     }
 
     /// Lets the mirror answer calls if the state is known, and returns the first actions of the recovery. `restored`
@@ -188,6 +215,9 @@ impl Driver {
                 Some(input) => input,
                 None => self.next_input(&stop).await,
             };
+            if matches!(now, Input::Refused | Input::Unreachable) {
+                self.send_news();
+            }
             self.end_contact(now);
             self.sample_for(now).await;
             actions = self.lifecycle.on(Instant::now(), now);
@@ -363,7 +393,10 @@ impl Driver {
                 "the master does not answer, but is not killed: there is no proof that it hangs"
             ),
             Action::OpenGate => self.open_gate(),
-            Action::Spawn => return self.spawn().await,
+            Action::Spawn => {
+                self.send_news();
+                return self.spawn().await;
+            }
             // The caller handles this action.
             Action::GiveUp => {}
             Action::Kill => {

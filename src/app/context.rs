@@ -130,6 +130,9 @@ impl Context {
             halt.cancel();
         });
         let mut driver = self.driver(process);
+        if restored {
+            driver.continues_session();
+        }
         let first = driver.start(restored);
         (driver, first)
     }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use tracing::Instrument;
 
 use super::{
-    Driver,
+    Driver, News,
     examine::Examination,
     master_process::MasterProcess,
     report_file::{self, ReportRecord},
@@ -147,7 +147,9 @@ impl Driver {
             );
         }
         self.restored = (report.outcome == RecoveryOutcome::Injected).then_some(report.number);
-        if !self.lifecycle.has_served() {
+        let news = std::mem::replace(&mut self.news, News::Sent);
+        let sent = news == News::SentFirst && report.outcome == RecoveryOutcome::Injected;
+        if !self.lifecycle.has_served() && !sent {
             // After a restart of rosrescue, the latest changes before the outage are unknown.
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());

@@ -87,6 +87,38 @@ fn unregistrations_while_rosrescue_starts_reach_the_adopted_master() {
     after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
+in_both_modes!(nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master);
+
+fn nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
+    let client = robot.client();
+    let listener = FakeNode::start("/listener");
+    listener.subscribe(&client, "/topic", "std_msgs/String");
+    client.set_param("/key", 1);
+    listener.watch_param(&client, "/key");
+    robot.take_master_away();
+    let port = listener.port();
+    // The port refuses the notifications.
+    drop(listener);
+    let talker = FakeNode::start("/talker");
+    talker.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/key", 2);
+    robot.rescue.kill();
+    let listener = FakeNode::start_at("/listener", port);
+    robot.rescue.start_again();
+    eventually("the listener knows the talker and the value", || {
+        let updates = listener.updates("/topic");
+        let values = listener.heard("paramUpdate");
+        let value = values.last().map(|params| &params[2]);
+        updates.last() == Some(&vec![talker.api.clone()]) && value == Some(&2.into())
+    });
+    assert!(!robot.is_open(), "there is a master");
+    assert!(listener.heard("shutdown").is_empty());
+    robot.revive_master();
+    robot.await_gate();
+    assert_eq!(robot.state().publishers_of("/topic"), ["/talker"]);
+}
+
 #[test]
 fn parameters_of_a_stopped_session_are_not_restored_the_next_day() {
     let mut robot = Robot::start(Mode::Core);
