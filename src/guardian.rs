@@ -71,7 +71,7 @@ pub fn run(listeners: &[TcpListener], words: &[OsString]) -> Result<i32, Guardia
     take_priority();
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
-    let mut worker = Worker::start(listeners, words, 0)?;
+    let mut worker = Worker::start(listeners, words, 0, false)?;
     let mut count = 0;
     loop {
         let end = worker.run_until_end(&signals, |signal| restarts.stop(signal));
@@ -94,7 +94,13 @@ pub fn run(listeners: &[TcpListener], words: &[OsString]) -> Result<i32, Guardia
         }
         let stop;
         count += 1;
-        (worker, stop) = start_again(listeners, words, &signals, pause, count)?;
+        (worker, stop) = start_again(
+            listeners,
+            words,
+            &signals,
+            pause,
+            (count, restarts.has_served()),
+        )?;
         if let Some(signal) = stop.or_else(|| restarts.stopped_by()) {
             restarts.stop(signal);
             worker.pass_on(signal);
@@ -109,11 +115,11 @@ fn start_again(
     words: &[OsString],
     signals: &Receiver<i32>,
     mut pause: Duration,
-    restarts: u64,
+    (restarts, continues): (u64, bool),
 ) -> Result<(Worker, Option<i32>), GuardianError> {
     loop {
         let stop = wait(signals, pause)?;
-        match Worker::start(listeners, words, restarts) {
+        match Worker::start(listeners, words, restarts, continues) {
             Ok(worker) => return Ok((worker, stop)),
             Err(error) if stop.is_some() => return Err(error),
             Err(error) => {
@@ -151,10 +157,12 @@ struct Worker {
 }
 
 impl Worker {
+    /// Starts a worker after `restarts` others. `continues` says whether one of these has answered calls.
     fn start(
         listeners: &[TcpListener],
         words: &[OsString],
         restarts: u64,
+        continues: bool,
     ) -> Result<Self, GuardianError> {
         let (link, of_worker) = UnixStream::pair()?;
         link.set_read_timeout(Some(START_TIME))?;
@@ -177,11 +185,15 @@ impl Worker {
             .env(handover::LISTEN_FDS, count)
             .env(handover::GUARDIAN, std::process::id().to_string())
             .env(handover::RESTARTS, restarts.to_string())
+            .env_remove(handover::CONTINUES)
             .env_remove(handover::LISTEN_PID)
             .env_remove(handover::LISTEN_FDNAMES)
             // The worker gets its own process group, so that terminal signals reach only the
             // guardian, which passes them on once.
             .process_group(0);
+        if continues {
+            command.env(handover::CONTINUES, "1");
+        }
         if sd_notify::watchdog_enabled().is_none() {
             // The variable is meant for another process.
             command.env_remove("WATCHDOG_USEC");

@@ -41,6 +41,7 @@ use crate::{
         standing::{Place, Standing},
     },
     gate::State,
+    guardian::handover,
     limit::rarely,
     master::{Master, Request},
     nodes::notifications,
@@ -213,6 +214,7 @@ impl ClusterDriver {
                     same_boot: self.setup.restored,
                     closed,
                     node_alive: false,
+                    restarted: handover::continues(),
                 };
                 let goes_on = true;
                 let otherwise = Input::Decided { seq, goes_on };

@@ -15,6 +15,7 @@ use crate::{
     },
     clock,
     config::Config,
+    guardian::handover,
     master::{Displaced, Master, Request},
     wait,
 };
@@ -103,6 +104,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             same_boot,
             closed: session.closed,
             node_alive: false,
+            restarted: handover::continues(),
         };
         if session::depends_on_nodes(config.restore, evidence) {
             evidence.node_alive = life::any_alive(&mirror, same_boot).await;

@@ -318,7 +318,7 @@ pub enum RestoreChoice {
     Auto,
     /// Always
     Always,
-    /// Never. The old file stays under another name
+    /// Not at a first start. The old file stays under another name
     Never,
 }
 

@@ -33,6 +33,8 @@ pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
 /// Environment variable with the number of workers that have died before this one.
 pub(super) const RESTARTS: &str = "ROSRESCUE_WORKER_RESTARTS";
+/// Environment variable that is set if an earlier worker of this guardian has answered calls.
+pub(super) const CONTINUES: &str = "ROSRESCUE_CONTINUES";
 /// Memory settings of the worker, unless the user has set others: a single heap, with large blocks outside of it. Then
 /// the memory of a large call goes back to the system. By default glibc uses a heap for each thread and keeps most of
 /// it.
@@ -177,6 +179,11 @@ pub fn restarts() -> u64 {
     restarts.and_then(|count| count.parse().ok()).unwrap_or(0)
 }
 
+/// Whether an earlier worker of this guardian has answered calls. Then this worker continues that one's session.
+pub fn continues() -> bool {
+    std::env::var_os(CONTINUES).is_some()
+}
+
 /// Hides from a child process the variables that the guardian and systemd have set for rosrescue.
 pub fn keep_from(command: &mut Command) {
     for name in [
@@ -185,6 +192,7 @@ pub fn keep_from(command: &mut Command) {
         LISTEN_FDNAMES,
         GUARDIAN,
         RESTARTS,
+        CONTINUES,
         "NOTIFY_SOCKET",
         "WATCHDOG_PID",
         "WATCHDOG_USEC",

@@ -84,6 +84,11 @@ impl Restarts {
         self.stop
     }
 
+    /// Whether any worker has answered calls.
+    pub fn has_served(&self) -> bool {
+        self.served
+    }
+
     /// Whether a worker died while it was stopping. It may have left its master running.
     fn died_stopping(&self, end: End) -> bool {
         match end {

@@ -476,6 +476,30 @@ fn after_a_kill_of_guardian_and_worker_a_new_start_restores_everything() {
     assert_eq!(scratch.survivors(), vec![]);
 }
 
+/// The option is about the first start, so the parameters survive although no node lives.
+#[test]
+fn a_worker_continues_its_session_although_a_first_start_would_not() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).args(["--no-rosout", "--restore", "never"]);
+    let mut rescue = setup.guarded().start();
+    let client = rescue.client();
+    client.set_param("/kept", "yes");
+    let (master, worker) = (client.master_pid().unwrap(), worker(&scratch));
+    // A stopped worker starts no new master, so both die at once.
+    signal(worker, Signal::STOP);
+    signal(master, Signal::KILL);
+    signal(worker, Signal::KILL);
+    worker_after(&scratch, worker);
+    eventually("there is a new master", || {
+        client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
+    });
+    assert_eq!(client.param("/kept"), Some("yes".into()));
+    assert_eq!(rescue.terminate().code(), Some(0));
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(client.param("/kept"), None);
+}
+
 /// As the first process of a container, the guardian becomes the parent of the master that a dead worker
 /// leaves behind. The master must still be recognised as left behind, and become no zombie when it ends.
 #[test]

@@ -11,9 +11,10 @@ use std::path::{Path, PathBuf};
 use std::thread;
 
 use crate::support::{
-    Client, Library, Mode, Netns, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
-    free_port, in_both_modes, params, signal,
+    Client, FakeNode, Library, Mode, Netns, Node, Robot, Rosmaster, Scratch, Setup, State, alive,
+    eventually, free_port, in_both_modes, params, signal,
 };
+use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// A file with the id of another boot, as the kernel shows it.
@@ -191,4 +192,35 @@ fn after_a_clean_stop_living_nodes_keep_their_session() {
     before.assert_same(&now, "after a clean stop and a start with nodes alive");
     listener.assert_no_message_lost("/talker");
     talker.assert_no_link_lost();
+}
+
+in_both_modes!(with_restore_never_a_session_continues_while_a_node_lives);
+
+fn with_restore_never_a_session_continues_while_a_node_lives(mode: Mode) {
+    let mut robot = Robot::start_with(mode, &["--restore", "never"]);
+    let client = robot.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/kept", 1);
+    cut_power(&mut robot);
+    robot.revive_proxied_master();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(client.param("/kept"), Some(Value::Int(1)));
+    assert_eq!(robot.state().publishers_of("/topic"), ["/node"]);
+    drop(node);
+    cut_power(&mut robot);
+    // The nodes die too, including rosout.
+    for pid in robot.processes() {
+        signal(pid, Signal::KILL);
+    }
+    eventually("every process has ended", || {
+        !robot.processes().into_iter().any(alive)
+    });
+    robot.revive_proxied_master();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(client.param("/kept"), None);
 }

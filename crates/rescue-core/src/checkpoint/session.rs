@@ -17,7 +17,8 @@ pub enum RestorePolicy {
     Auto,
     /// Always restore it.
     Always,
-    /// Never restore it. The old file is kept under another name.
+    /// Do not restore it at a first start, and keep the old file under another name. A rosrescue that is started again
+    /// after a crash continues its session.
     Never,
 }
 
@@ -30,6 +31,8 @@ pub struct SessionEvidence {
     pub closed: bool,
     /// Whether a registered node answers. After a reboot only nodes on other computers count.
     pub node_alive: bool,
+    /// Whether the guardian has started this process in place of one that had served calls.
+    pub restarted: bool,
 }
 
 /// Whether to restore a checkpoint, and why.
@@ -55,26 +58,34 @@ pub fn depends_on_nodes(policy: RestorePolicy, evidence: SessionEvidence) -> boo
 }
 
 /// Decides whether the session in a checkpoint continues. A session continues after a kill. After a clean stop or a
-/// reboot it continues only if one of its nodes is alive.
+/// reboot it continues only if one of its nodes is alive. [`RestorePolicy::Never`] is about first starts: after a kill,
+/// a start by the guardian is none, and neither is one that finds a node of the session alive, as after a restart by
+/// systemd.
 pub fn decide(policy: RestorePolicy, evidence: SessionEvidence) -> Decision {
     let SessionEvidence {
         same_boot,
         closed,
         node_alive,
+        restarted,
     } = evidence;
+    let crashed = same_boot && !closed;
     match policy {
         RestorePolicy::Always => Decision::Restore("--restore always"),
-        RestorePolicy::Never => Decision::Fresh("--restore never"),
-        RestorePolicy::Auto if same_boot && !closed => {
-            Decision::Restore("the session continues: rosrescue was not stopped cleanly")
+        RestorePolicy::Never if !crashed || !(restarted || node_alive) => {
+            Decision::Fresh("--restore never")
         }
-        RestorePolicy::Auto if node_alive => {
-            Decision::Restore("the session continues: nodes are alive")
+        RestorePolicy::Never | RestorePolicy::Auto if crashed => {
+            Decision::Restore("rosrescue was not stopped cleanly")
         }
-        RestorePolicy::Auto if closed => {
+        RestorePolicy::Never | RestorePolicy::Auto if node_alive => {
+            Decision::Restore("nodes are alive")
+        }
+        RestorePolicy::Never | RestorePolicy::Auto if closed => {
             Decision::Fresh("rosrescue was stopped cleanly and no node is alive")
         }
-        RestorePolicy::Auto => Decision::Fresh("the computer was rebooted and no node is alive"),
+        RestorePolicy::Never | RestorePolicy::Auto => {
+            Decision::Fresh("the computer was rebooted and no node is alive")
+        }
     }
 }
 
@@ -257,6 +268,7 @@ mod tests {
             same_boot,
             closed,
             node_alive,
+            restarted: false,
         };
         matches!(decide(policy, evidence), Decision::Restore(_))
     }
@@ -294,12 +306,15 @@ mod tests {
             (RestorePolicy::Auto, false, true, true),
             (RestorePolicy::Always, false, true, false),
             (RestorePolicy::Never, false, true, false),
+            (RestorePolicy::Never, true, true, false),
+            (RestorePolicy::Never, true, false, true),
         ] {
             for node_alive in [false, true] {
                 let evidence = SessionEvidence {
                     same_boot,
                     closed,
                     node_alive,
+                    restarted: false,
                 };
                 let depends = depends_on_nodes(policy, evidence);
                 assert_eq!(depends, matters, "{policy:?} {evidence:?}");
@@ -308,11 +323,28 @@ mod tests {
     }
 
     #[test]
-    fn restore_always_and_never_decide_without_asking_nodes() {
+    fn restore_always_restores_in_any_case() {
         for evidence in 0..8 {
             let [boot, closed, alive] = [1, 2, 4].map(|bit| evidence & bit != 0);
             assert!(restores(RestorePolicy::Always, boot, closed, alive));
-            assert!(!restores(RestorePolicy::Never, boot, closed, alive));
+        }
+    }
+
+    #[test]
+    fn restore_never_is_about_a_first_start() {
+        for evidence in 0..16 {
+            let [same_boot, closed, node_alive, restarted] =
+                [1, 2, 4, 8].map(|bit| evidence & bit != 0);
+            let evidence = SessionEvidence {
+                same_boot,
+                closed,
+                node_alive,
+                restarted,
+            };
+            let restores =
+                decide(RestorePolicy::Never, evidence) != Decision::Fresh("--restore never");
+            let goes_on = same_boot && !closed && (node_alive || restarted);
+            assert_eq!(restores, goes_on, "{evidence:?}");
         }
     }
 }
