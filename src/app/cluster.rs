@@ -424,7 +424,7 @@ impl ClusterDriver {
             return Input::WatchEnded;
         };
         let keys = self.replica.keys.clone();
-        let (mut entries, mut heard) = (Vec::new(), Vec::new());
+        let (mut entries, mut heard, mut deleted) = (Vec::new(), Vec::new(), None);
         for change in changes {
             if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
                 self.trouble.set(&error.into());
@@ -436,6 +436,10 @@ impl ClusterDriver {
                 change.kv.as_ref(),
             ));
             let seq = keys.seq_of(&change.key);
+            if change.kv.is_none() {
+                let snapshot = (change.key == keys.snapshot()).then_some(u64::MAX);
+                deleted = deleted.max(seq).max(snapshot);
+            }
             if let (Some(kv), Some(seq)) = (change.kv, seq) {
                 entries.push(entry(seq, &kv));
             }
@@ -444,6 +448,7 @@ impl ClusterDriver {
         Input::Watched {
             view,
             entries,
+            deleted,
             heard,
         }
     }
@@ -478,8 +483,12 @@ fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
             }
         },
     };
+    if let Some(error) = &loaded.damage {
+        rarely!(error, %error, "the journal in etcd is damaged; the state of a living computer will replace it");
+    }
     Some(Read {
         view: loaded.view,
+        is_readable: loaded.damage.is_none(),
         state,
         records: loaded.records,
         progress: loaded.progress,

@@ -1,12 +1,12 @@
 //! The robot's keys in etcd. Carries out the requests of the cluster's state machine as transactions on the keys
-//! `leader` and `alive`.
+//! `origin`, `leader` and `alive`.
 
 use std::{
     ops::{Deref, Range},
     time::Duration,
 };
 
-use etcd_kv::{Client, Txn, TxnOp};
+use etcd_kv::{Client, Compare, Txn, TxnOp};
 pub use etcd_kv::{
     Credentials, EtcdError, Found, KeyChange, Kv, MemberStatus, Options, Tls, Tried, Watch,
     WatchEnd,
@@ -106,7 +106,7 @@ impl Etcd {
         Ok(done.succeeded)
     }
 
-    /// Reads the keys `leader` and `alive`.
+    /// Reads the keys `origin`, `leader` and `alive`.
     ///
     /// # Errors
     ///
@@ -166,7 +166,7 @@ impl Etcd {
     }
 }
 
-/// Finds the keys `leader` and `alive` among all keys with the robot's prefix.
+/// Finds the keys `origin`, `leader` and `alive` among all keys with the robot's prefix.
 ///
 /// # Errors
 ///
@@ -226,14 +226,16 @@ fn write_json(key: String, value: &impl Serialize) -> TxnOp {
     TxnOp::Put { key, value }
 }
 
-fn both(keys: &Keys) -> Vec<TxnOp> {
-    vec![TxnOp::Get(keys.leader()), TxnOp::Get(keys.alive())]
+fn get_view(keys: &Keys) -> Vec<TxnOp> {
+    [keys.origin(), keys.leader(), keys.alive()]
+        .map(TxnOp::Get)
+        .into()
 }
 
-/// A transaction that reads `leader` and `alive`.
+/// A transaction that reads `origin`, `leader` and `alive`.
 fn look(keys: &Keys) -> Txn {
     Txn {
-        success: both(keys),
+        success: get_view(keys),
         ..Txn::default()
     }
 }
@@ -241,10 +243,22 @@ fn look(keys: &Keys) -> Txn {
 /// A transaction that makes `changes` only if `leader` has this term.
 fn guarded(keys: &Keys, term: u64, changes: Vec<TxnOp>) -> Txn {
     Txn {
-        compare: vec![(keys.leader(), term)],
+        compare: vec![Compare::Modified(keys.leader(), term)],
         success: changes,
         failure: Vec::new(),
     }
+}
+
+/// The condition that the journal is as `guard` says. Without its last entry, it cannot be read.
+fn unchanged(keys: &Keys, guard: &RevisionGuard) -> Vec<Compare> {
+    let keys_at = [
+        (keys.origin(), guard.origin),
+        (keys.leader(), guard.leader),
+        (keys.alive(), guard.alive),
+    ];
+    let last = (guard.seq > 0).then(|| Compare::Exists(keys.journal(guard.seq)));
+    let modified = keys_at.map(|(key, revision)| Compare::Modified(key, revision));
+    modified.into_iter().chain(last).collect()
 }
 
 /// Builds the transaction of `op`. Also returns the number of the journal's last record after it.
@@ -260,15 +274,16 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
         write_json(keys.alive(), &value)
     };
     let txn = |guard: &RevisionGuard, changes: Vec<TxnOp>| Txn {
-        compare: vec![(keys.leader(), guard.leader), (keys.alive(), guard.alive)],
+        compare: unchanged(keys, guard),
         success: changes,
-        failure: both(keys),
+        failure: get_view(keys),
     };
     match op {
         Op::Read => (look(keys), 0),
         Op::Claim {
             guard,
             claim,
+            begins,
             seq,
             settled,
         } => {
@@ -290,7 +305,13 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
                 version,
             };
             let alive = alive(0, *seq, &None, *settled);
-            let changes = vec![write_json(keys.leader(), &leader), alive];
+            let mut changes = vec![write_json(keys.leader(), &leader), alive];
+            if *begins {
+                let began_by = settings.name.clone().into_bytes();
+                let (key, value) = (keys.origin(), began_by);
+                changes.push(TxnOp::Put { key, value });
+                changes.extend(keys.of_journal().map(TxnOp::Delete));
+            }
             (txn(guard, changes), *seq)
         }
         Op::Beat {
@@ -333,7 +354,9 @@ fn view<'a>(
 
 /// Adds a key to a view, if it is one of the view's. `kv` is `None` if the key was deleted.
 fn absorb_key(view: &mut View, keys: &Keys, key: &str, kv: Option<&Kv>) -> Result<(), EtcdError> {
-    if key == keys.leader() {
+    if key == keys.origin() {
+        view.origin = kv.map_or(0, |kv| kv.revision);
+    } else if key == keys.leader() {
         view.leader = match kv {
             None => None,
             Some(kv) => {

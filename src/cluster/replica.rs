@@ -5,7 +5,7 @@ use std::time::Duration;
 use thiserror::Error;
 
 use super::{
-    etcd::{self, Etcd, EtcdError, Kv},
+    etcd::{self, Etcd, EtcdError, Found, Kv},
     journal::{self, JournalError, Keys, Manifest, Progress, Put},
     machine::{EtcdAnswer, Op, Settings, View},
 };
@@ -30,11 +30,21 @@ pub enum ReplicaError {
     Short { found: u64, expected: u64 },
 }
 
+impl ReplicaError {
+    /// Whether keys of the journal are missing, or are not what rosrescue has written.
+    fn is_damage(&self) -> bool {
+        let journal = matches!(self, Self::Journal(error) if error.is_damage());
+        journal || matches!(self, Self::Short { .. })
+    }
+}
+
 /// What [`Replica::load`] has read: the part of the state in etcd that its caller did not know yet.
 #[derive(Debug)]
 pub struct LoadedState {
-    /// The keys `leader` and `alive`, read at the same moment.
+    /// The keys `origin`, `leader` and `alive`, read at the same moment.
     pub view: View,
+    /// Why the journal cannot be read from its beginning, if it cannot. Then only `view` and `members` count.
+    pub damage: Option<ReplicaError>,
     /// The snapshot that the records follow. `None` if they follow the known state.
     pub checkpoint: Option<Checkpoint>,
     pub records: Vec<Record>,
@@ -76,6 +86,7 @@ impl Replica {
         let found = self.client.ranges(&unknown, None, self.limit).await?;
         let mut loaded = LoadedState {
             view: etcd::view_of(&found, &self.keys)?,
+            damage: None,
             checkpoint: None,
             records: Vec::new(),
             members: Vec::new(),
@@ -84,6 +95,20 @@ impl Replica {
         let members = self.keys.member("");
         let said = found.kvs.iter().filter(|kv| kv.key.starts_with(&members));
         loaded.members = said.cloned().collect();
+        match self.read_journal(&found, known, &mut loaded).await {
+            Err(error) if error.is_damage() => loaded.damage = Some(error),
+            read => read?,
+        }
+        Ok(loaded)
+    }
+
+    /// Adds the journal after `known` to `loaded`.
+    async fn read_journal(
+        &self,
+        found: &Found,
+        known: Progress,
+        loaded: &mut LoadedState,
+    ) -> Result<(), ReplicaError> {
         let snapshot = self.keys.snapshot();
         let snapshot = found.kvs.iter().find(|kv| kv.key == snapshot);
         let manifest = snapshot.map(|kv| self.manifest(kv)).transpose()?;
@@ -112,7 +137,7 @@ impl Replica {
         let (expected, found) = (loaded.view.seq(), loaded.progress.seq);
         match found < expected {
             true => Err(ReplicaError::Short { found, expected }),
-            false => Ok(loaded),
+            false => Ok(()),
         }
     }
 

@@ -45,10 +45,15 @@ impl Leader {
     async fn new(servers: &Servers) -> Self {
         let replica = replica(servers);
         let view = replica.client.view(&keys(), LIMIT).await.unwrap();
-        let (guard, seq) = (view.guard(), view.seq());
+        let guard = RevisionGuard {
+            seq: 0,
+            ..view.guard()
+        };
+        let seq = 0;
         let claim = Op::Claim {
             guard,
             claim: 1,
+            begins: true,
             seq,
             settled: true,
         };
@@ -57,8 +62,10 @@ impl Leader {
             panic!("{answer:?}");
         };
         let guard = RevisionGuard {
+            origin: revision,
             leader: revision,
             alive: revision,
+            seq: 0,
         };
         Self {
             replica,
@@ -91,7 +98,7 @@ impl Leader {
             let EtcdAnswer::Applied { revision, seq } = answer else {
                 panic!("{answer:?}");
             };
-            self.guard.alive = revision;
+            (self.guard.alive, self.guard.seq) = (revision, seq);
             rest = &rest[rest.iter().take_while(|record| record.seq <= seq).count()..];
         }
     }
@@ -262,11 +269,12 @@ async fn a_journal_with_a_gap_is_refused() {
             .await
             .unwrap()
     );
-    let error = follower.load(Progress::default()).await.unwrap_err();
-    assert!(
-        error.to_string().contains("record 4 where 3 was expected"),
-        "{error}"
-    );
+    let damage = || async {
+        let loaded = follower.load(Progress::default()).await.unwrap();
+        loaded.damage.unwrap().to_string()
+    };
+    let error = damage().await;
+    assert!(error.contains("record 4 where 3 was expected"), "{error}");
     let end = keys.journal(4)..keys.journal(5);
     assert!(
         follower
@@ -275,12 +283,47 @@ async fn a_journal_with_a_gap_is_refused() {
             .await
             .unwrap()
     );
-    let error = follower.load(Progress::default()).await.unwrap_err();
     let short = ReplicaError::Short {
         found: 2,
         expected: 4,
     };
-    assert_eq!(error.to_string(), short.to_string());
+    assert_eq!(damage().await, short.to_string());
+}
+
+/// A leader that goes on without a key of its journal would acknowledge what no computer can read.
+#[tokio::test]
+async fn no_transaction_of_the_leader_succeeds_once_a_key_that_makes_the_journal_is_gone() {
+    let servers = Servers::new(1).await;
+    let keys = keys();
+    let kinds = [
+        keys.origin(),
+        keys.leader(),
+        keys.alive(),
+        keys.journal(2),
+        keys.prefix().to_owned(),
+    ];
+    for gone in kinds {
+        let mut leader = Leader::new(&servers).await;
+        leader.commit(&[record(1, 1), record(2, 1)]).await;
+        let end = format!("{gone}\u{7f}");
+        let all = [gone.clone()..end];
+        let etcd = &leader.replica.client;
+        let deleted = etcd.delete(&keys, leader.guard.leader, &all, LIMIT).await;
+        assert!(deleted.unwrap());
+        let beat = Op::Beat {
+            guard: leader.guard,
+            beat: 9,
+            seq: 2,
+            released: None,
+            settled: true,
+        };
+        let answer = leader.replica.run(&settings("a"), &beat, None).await;
+        let EtcdAnswer::Is(view) = answer.unwrap() else {
+            panic!("{gone} is gone, and the leader goes on");
+        };
+        let last = gone == keys.journal(2);
+        assert!(view.is_torn() || view.leader.is_none() || last, "{view:?}");
+    }
 }
 
 #[tokio::test]
@@ -311,7 +354,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
     let EtcdAnswer::Applied { revision, seq: 3 } = answer.unwrap() else {
         panic!("no journal holds the state");
     };
-    leader.guard.alive = revision;
+    (leader.guard.alive, leader.guard.seq) = (revision, 3);
     leader.commit(&[record(4, 10)]).await;
     for known in [0, 2] {
         let progress = Progress::after_snapshot(known, 0);

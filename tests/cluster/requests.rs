@@ -35,6 +35,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     let claim = |claim| Op::Claim {
         guard: RevisionGuard::default(),
         claim,
+        begins: true,
         seq: 0,
         settled: false,
     };
@@ -112,7 +113,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     );
     assert!(
         client
-            .delete(&keys, term, &keys.behind(3), LIMIT)
+            .delete(&keys, term, &keys.behind(4), LIMIT)
             .await
             .unwrap()
     );
@@ -324,6 +325,7 @@ async fn the_robots_in_etcd_are_listed_without_keys_of_other_programs() {
     let claim = Op::Claim {
         guard: RevisionGuard::default(),
         claim: 1,
+        begins: true,
         seq: 0,
         settled: true,
     };

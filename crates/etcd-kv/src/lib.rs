@@ -27,7 +27,7 @@ use connection::Endpoint;
 pub use error::EtcdError;
 pub use tls::Tls;
 pub use watch::{KeyChange, Watch, WatchEnd};
-pub use wire::{Kv, Txn, TxnOp, TxnResult};
+pub use wire::{Compare, Kv, Txn, TxnOp, TxnResult};
 
 /// Time without an answer after which the next endpoint is asked as well. For comparison, a transaction takes 1 to 20
 /// ms.

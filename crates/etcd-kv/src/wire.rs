@@ -20,13 +20,21 @@ pub struct Kv {
 /// Writes and reads that run at one moment if a condition holds.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Txn {
-    /// The condition: keys, each with the revision of its last change, or 0 for a key that does not exist. All must
-    /// match.
-    pub compare: Vec<(String, u64)>,
+    /// The condition. All of it must hold.
+    pub compare: Vec<Compare>,
     /// Operations if the condition holds.
     pub success: Vec<TxnOp>,
     /// Operations if the condition is false.
     pub failure: Vec<TxnOp>,
+}
+
+/// A part of a transaction's condition.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Compare {
+    /// The key was last changed at this revision, or does not exist if the revision is 0.
+    Modified(String, u64),
+    /// The key exists.
+    Exists(String),
 }
 
 /// An operation of a transaction.
@@ -54,10 +62,7 @@ pub struct TxnResult {
 impl Txn {
     pub(super) fn request(&self) -> Value {
         let ops = |ops: &[TxnOp]| ops.iter().map(TxnOp::request).collect::<Vec<_>>();
-        let compare = self
-            .compare
-            .iter()
-            .map(|(key, revision)| is_at(key, *revision));
+        let compare = self.compare.iter().map(Compare::request);
         json!({
             "compare": compare.collect::<Vec<_>>(),
             "success": ops(&self.success),
@@ -109,10 +114,17 @@ pub(super) fn local_count(key: &str) -> Value {
     json!({ "key": base64(key), "serializable": true, "count_only": true })
 }
 
-fn is_at(key: &str, revision: u64) -> Value {
-    json!({
-        "key": base64(key), "target": "MOD", "result": "EQUAL", "mod_revision": revision.to_string(),
-    })
+impl Compare {
+    fn request(&self) -> Value {
+        match self {
+            Self::Modified(key, revision) => json!({
+                "key": base64(key), "target": "MOD", "result": "EQUAL", "mod_revision": revision.to_string(),
+            }),
+            Self::Exists(key) => json!({
+                "key": base64(key), "target": "CREATE", "result": "GREATER", "create_revision": "0",
+            }),
+        }
+    }
 }
 
 pub(super) fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EtcdError> {

@@ -1,6 +1,7 @@
 //! Records and snapshots to and from keys and values of etcd, within its limits.
 //!
 //! ```text
+//! ROBOT/origin                        written when the journal begins; its revision identifies the journal
 //! ROBOT/leader, ROBOT/alive           see `machine`
 //! ROBOT/journal/N                     the records up to number N; or a reference to a blob, if they are large; or
 //!                                     one to a snapshot, if record N replaced the whole state
@@ -50,6 +51,13 @@ pub enum JournalError {
     Gap { expected: u64, found: u64 },
 }
 
+impl JournalError {
+    /// Whether keys of the journal are missing, or are not what rosrescue has written.
+    pub fn is_damage(&self) -> bool {
+        matches!(self, Self::Damaged { .. } | Self::Gap { .. })
+    }
+}
+
 /// A key and its value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Put {
@@ -73,6 +81,11 @@ impl Keys {
 
     pub fn leader(&self) -> String {
         format!("{}leader", self.0)
+    }
+
+    /// The key that identifies the journal; see [`View::origin`](crate::cluster::machine::View::origin).
+    pub fn origin(&self) -> String {
+        format!("{}origin", self.0)
     }
 
     pub fn alive(&self) -> String {
@@ -106,13 +119,24 @@ impl Keys {
         self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)
     }
 
-    /// The keys to delete once there is a snapshot of the state after record `seq`: the journal up to that record, and
-    /// its blobs.
+    /// The keys to delete once there is a snapshot of the state after record `seq`: the journal before that record, and
+    /// the blobs up to it. The record itself stays, because each transaction requires the journal's last entry.
     pub fn behind(&self, seq: u64) -> [Range<String>; 2] {
         let next = seq.saturating_add(1);
         [
-            self.journal(0)..self.journal(next),
+            self.journal(0)..self.journal(seq),
             self.blob(0)..self.blob(next),
+        ]
+    }
+
+    /// The keys to delete before a new journal begins: all records, values, and the snapshot.
+    pub fn of_journal(&self) -> [Range<String>; 3] {
+        let key = |name: &str| format!("{}{name}", self.0);
+        // `0` follows `/` in ASCII.
+        [
+            key("journal/")..key("journal0"),
+            key("snapshot")..key("snapshot\0"),
+            key("values/")..key("values0"),
         ]
     }
 

@@ -75,6 +75,10 @@ pub struct Machine {
     peer: Option<(bool, Instant)>,
     releasing: Option<String>,
     claim_not_before: Option<Instant>,
+    /// What etcd showed when it had lost data. Unless that changes, this computer's next claim begins a new journal.
+    left: Option<RevisionGuard>,
+    /// The origin of a journal that cannot be read from its beginning, or 0. This computer's claim replaces it.
+    unreadable: u64,
 }
 
 impl Machine {
@@ -100,6 +104,8 @@ impl Machine {
             peer: None,
             releasing: None,
             claim_not_before: None,
+            left: None,
+            unreadable: 0,
         }
     }
 
@@ -190,6 +196,9 @@ impl Machine {
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
+            if let Input::Lost { view, .. } = &input {
+                self.left = Some(view.guard());
+            }
             return actions;
         }
         self.give_up_request(now);
@@ -265,9 +274,18 @@ impl Machine {
 
     /// The keys `leader` and `alive` after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
+        let mut origin = self.view.origin;
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
-            Op::Claim { claim, settled, .. } => {
+            Op::Claim {
+                claim,
+                settled,
+                begins,
+                ..
+            } => {
+                if *begins {
+                    origin = revision;
+                }
                 let Settings {
                     name,
                     id,
@@ -306,6 +324,7 @@ impl Machine {
         };
         View {
             revision,
+            origin,
             leader,
             alive: Some(alive),
         }
@@ -321,15 +340,35 @@ impl Machine {
         (self.peer, self.retry_at) = (None, None);
         self.session = JournalSession::GoesOn;
         self.claim_not_before = Some(until);
+        self.left = Some(view.guard());
         self.view = view;
         self.follow_to(0);
         self.stale = false;
-        actions.push(Action::CatchUp(self.view.seq()));
+        actions.push(Action::CatchUp(self.last()));
     }
 
     /// Makes this computer claim leadership no earlier than `until`.
     pub fn hold_claims(&mut self, until: Instant) {
         self.claim_not_before = Some(until);
+    }
+
+    /// Notes the origin of a journal that cannot be read from its beginning, or 0.
+    pub fn set_unreadable(&mut self, origin: u64) {
+        self.unreadable = origin;
+    }
+
+    /// Whether this computer's claim begins a new journal: there is none, or nobody can continue it.
+    fn begins_journal(&self) -> bool {
+        let guard = self.view.guard();
+        self.left == Some(guard) || [0, self.unreadable].contains(&guard.origin)
+    }
+
+    /// The last record to read. What is left of a lost journal is not read.
+    fn last(&self) -> u64 {
+        match self.begins_journal() {
+            true => 0,
+            false => self.view.seq(),
+        }
     }
 
     /// Handles the keys `leader` and `alive` as etcd shows them.
@@ -370,7 +409,7 @@ impl Machine {
             }
             (None, _) if self.role == Role::Joining && self.view.leader.is_some() => {
                 self.become_role(Role::Following, actions);
-                actions.push(Action::CatchUp(self.view.seq()));
+                actions.push(Action::CatchUp(self.last()));
             }
             (None, _) => {}
         }
@@ -470,7 +509,7 @@ impl Machine {
             _ => {}
         }
         self.become_role(Role::Following, actions);
-        actions.push(Action::CatchUp(self.view.seq()));
+        actions.push(Action::CatchUp(self.last()));
     }
 
     /// Has the member keep this computer's calls that are not in the journal.

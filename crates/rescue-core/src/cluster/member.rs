@@ -24,6 +24,7 @@ use crate::{
     master::{Master, Request},
 };
 
+mod data_loss;
 mod following;
 mod leading;
 mod notifying;
@@ -32,8 +33,8 @@ mod tests;
 mod types;
 
 use self::{
+    data_loss::DataLoss,
     following::{Merging, Reading},
-    leading::Lost,
     notifying::Notifying,
 };
 pub use self::{
@@ -113,7 +114,7 @@ pub struct Member {
     machine: Machine,
     told: Told,
     own: Own,
-    lost: Lost,
+    data_loss: DataLoss,
     journal: Journal,
     reading: Reading,
     place: Place,
@@ -151,7 +152,7 @@ impl Member {
                 has_master: false,
             },
             own,
-            lost: Lost::default(),
+            data_loss: DataLoss::default(),
             journal: Journal::default(),
             reading: Reading::default(),
             place: Place::default(),
@@ -169,17 +170,22 @@ impl Member {
 
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
-        self.hear(input.heard());
+        self.hear(now, input.heard());
         match input {
             Input::Begin => {
                 self.queue.start_by = Some(now + START_BY);
                 self.reading.load_by(now);
             }
             Input::Answer { number, answer } => {
-                self.doubt_etcd(now, &answer);
+                let answer = self.doubt_answer(now, answer);
                 self.tell_machine(machine::Input::Answer { number, answer });
             }
-            Input::Watched { view, entries, .. } => self.watched(now, view, entries),
+            Input::Watched {
+                view,
+                entries,
+                deleted,
+                ..
+            } => self.watched(now, view, entries, deleted),
             Input::WatchEnded => self.reading.ended(now),
             Input::Loaded(read) => self.loaded(now, read),
             Input::Recorded(changes) => self.recorded(changes),
@@ -268,7 +274,7 @@ impl Member {
 
     /// When this computer noticed that etcd has lost its data. `None` once a computer leads again.
     pub fn etcd_lost(&self) -> Option<Instant> {
-        self.lost.since()
+        self.data_loss.since()
     }
 
     /// Whether the previous leader gave up leadership by itself.
@@ -299,7 +305,8 @@ impl Member {
             role: self.machine.role().as_str().to_owned(),
             seq: self.seq(),
             boot: settings.boot.clone(),
-            holds: self.lost.holds(),
+            holds: self.data_loss.holds(),
+            unreadable: self.data_loss.unreadable(),
             notifies: self
                 .chores
                 .notifying
@@ -368,7 +375,7 @@ impl Member {
     /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and
     /// so on.
     fn update(&mut self, now: Instant) {
-        self.update_lost(now);
+        self.update_data_loss(now);
         self.update_master();
         self.check_for_namesake(now);
         self.update_standing();
@@ -504,6 +511,8 @@ struct Chores {
     say_at: Option<Instant>,
     /// Whether a snapshot is being written.
     snapshot: bool,
+    /// The last record that a snapshot of this computer holds or will hold. Its entry and those before are deleted.
+    replaced: u64,
     /// After a failed snapshot, when the next one may begin.
     snapshot_at: Option<Instant>,
     /// The revision up to which to compact etcd, and when.
@@ -566,6 +575,7 @@ impl Member {
         let progress = self.journal.progress;
         if !self.chores.snapshot && !is_early && progress.wants_snapshot() {
             self.chores.snapshot = true;
+            self.chores.replaced = progress.seq;
             self.act(Action::WriteSnapshot {
                 term,
                 progress,

@@ -32,6 +32,10 @@ pub(crate) enum Mutant {
     DeletesKeptWrites,
     /// An etcd that has lost its data is not recognised.
     TrustsLostEtcd,
+    /// Keys of the journal that were deleted in a living etcd, or replaced by older ones, are not noticed.
+    TrustsDeletedKeys,
+    /// After an older copy of etcd was restored, its values count as changes by others.
+    BelievesOldCopy,
     /// Two computers of one name do not notice each other.
     IgnoresNamesake,
     /// A request that never ends blocks the machine forever.

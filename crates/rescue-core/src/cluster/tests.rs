@@ -265,6 +265,89 @@ fn writes_kept_through_a_loss_of_etcd_replace_no_newer_ones() {
     assert!(lost_by_three > 0 && kept > 0 || schedules() < 20);
 }
 
+/// A schedule in which all or some keys of a living etcd are deleted. Sometimes a computer restarts at the same time.
+fn deleted(seed: u64) -> World {
+    let mut world = calm(seed);
+    for _ in 0..2 {
+        world.run(Duration::from_secs(2));
+        let (leader, all) = (world.leaders()[0], world.dice.one_in(2));
+        world.delete_keys(all);
+        match world.dice.below(4) {
+            0 => world.restart((leader + 1) % 3),
+            1 => world.restart(leader),
+            _ => {}
+        }
+        world.run(Duration::from_secs(10));
+    }
+    world
+}
+
+#[test]
+fn keys_that_are_deleted_in_a_living_etcd_come_back_and_no_write_is_lost() {
+    let mut noticed = 0;
+    for seed in first()..first() + schedules().min(10_000) {
+        let mut world = deleted(seed);
+        world.heal();
+        world.run(Duration::from_secs(15));
+        noticed += u64::from(world.counts.etcds_lost > 0);
+        world.check();
+    }
+    println!("in {noticed} schedules the loss was noticed");
+    assert!(noticed > 0);
+}
+
+/// A schedule in which an older copy of etcd is restored under living computers. If they are `alone`, etcd is away long
+/// enough for all to be cut off, and the nodes of one computer write.
+fn older_copy(seed: u64, alone: bool) -> World {
+    let mut world = calm(seed);
+    world.run(Duration::from_secs(1));
+    world.etcd.save();
+    world.run(Duration::from_secs(3));
+    let away = match alone {
+        true => Duration::from_secs(8),
+        false => Duration::from_millis(20 + world.dice.below(500)),
+    };
+    if alone {
+        // Each computer knows all writes when it is cut off.
+        world.writer = Some(usize::MAX);
+        world.run(Duration::from_secs(1));
+    }
+    world.restore_etcd(away, seed % 3 == 1);
+    world.writer = world.writer.map(|_| seed as usize % 3);
+    world.run(away + Duration::from_secs(10));
+    world
+}
+
+#[test]
+fn an_older_copy_of_etcd_replaces_nothing_that_living_computers_know() {
+    for seed in first()..first() + schedules().min(10_000) {
+        let mut world = older_copy(seed, false);
+        world.heal();
+        world.run(Duration::from_secs(15));
+        assert!(world.counts.etcds_lost > 0, "seed {seed}");
+        world.check();
+    }
+}
+
+#[test]
+fn an_older_copy_of_etcd_is_no_conflict_with_what_was_written_while_cut_off() {
+    let (mut merged, mut alone) = (0, 0);
+    for seed in first()..first() + schedules().min(10_000) {
+        let mut world = older_copy(seed, true);
+        world.heal();
+        world.run(Duration::from_secs(15));
+        // With `interval`, the leader goes on answering writes that the journal will never have.
+        let all = plan(seed).commit == Commit::Always;
+        let lost = world.counts.reported;
+        assert!(lost == 0 || !all, "seed {seed}: {lost} writes are lost");
+        world.check();
+        merged += world.counts.merged;
+        alone += world.counts.alone;
+    }
+    println!("cut off {alone} times, {merged} writes merged");
+    assert!(alone > 0 && (merged > 0 || schedules() < 20));
+}
+
 /// A schedule in which etcd loses its data while nothing else fails.
 fn lost(seed: u64) -> World {
     let mut world = calm(seed);
@@ -337,6 +420,22 @@ fn broken(seed: u64, mutant: Mutant, lives: bool) -> Option<String> {
             world.run(Duration::from_secs(15));
             world.verdict()
         }
+        Mutant::TrustsDeletedKeys => {
+            let mut world = deleted(seed);
+            world.heal();
+            world.run(Duration::from_secs(15));
+            world.verdict()
+        }
+        Mutant::BelievesOldCopy => {
+            let mut world = older_copy(seed, true);
+            world.heal();
+            world.run(Duration::from_secs(15));
+            let all = plan(seed).commit == Commit::Always;
+            match world.counts.reported {
+                lost if all && lost > 0 => Err(format!("{lost} writes are lost")),
+                _ => world.verdict(),
+            }
+        }
         Mutant::OwnDiskWins => dark(seed).verdict(),
         Mutant::IgnoresNamesake => twins(seed).verdict(),
         Mutant::WaitsForEver => succession(play(seed)),
@@ -378,6 +477,8 @@ fn every_defect_of_the_past_is_found_within_10_000_schedules() {
         Mutant::KeepsEachWrite,
         Mutant::DeletesKeptWrites,
         Mutant::TrustsLostEtcd,
+        Mutant::TrustsDeletedKeys,
+        Mutant::BelievesOldCopy,
         Mutant::IgnoresNamesake,
         Mutant::WaitsForEver,
     ];

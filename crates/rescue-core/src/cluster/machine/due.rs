@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::{
     ANSWER_LIMIT, Action, BEATS, COMMIT_INTERVAL, Commit, Flight, JournalSession, Leadership,
-    Machine, Op, PATIENCE, RETRY, Role, Settings,
+    Machine, Op, PATIENCE, RETRY, RevisionGuard, Role, Settings,
 };
 
 impl Machine {
@@ -80,10 +80,15 @@ impl Machine {
             None if self.observed.is_none() => Op::Read,
             None => {
                 self.claims += 1;
-                let (claim, seq) = (self.claims, self.view.seq());
+                let claim = self.claims;
+                let begins = self.begins_journal();
+                let seq = if begins { 0 } else { self.view.seq() };
+                // The last entry of a journal that is to be replaced may be gone.
+                let guard = RevisionGuard { seq, ..guard };
                 Op::Claim {
                     guard,
                     claim,
+                    begins,
                     seq,
                     settled: self.session.settled_by(seq),
                 }

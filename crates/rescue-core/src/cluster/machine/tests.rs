@@ -26,6 +26,7 @@ fn ms(milliseconds: u64) -> Duration {
 fn led(name: &str, term: u64, revision: u64) -> View {
     View {
         revision,
+        origin: 1,
         leader: Some(Leader {
             term,
             name: name.to_owned(),
@@ -84,6 +85,7 @@ fn leading(alone: WhenAlone) -> (Machine, Instant) {
     let claim = Op::Claim {
         guard: RevisionGuard::default(),
         claim: 1,
+        begins: true,
         seq: 0,
         settled: false,
     };
@@ -108,10 +110,13 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
     let (_, op) = sent(&machine.on(later + TTL, Input::Wake));
     let claim = Op::Claim {
         guard: RevisionGuard {
+            origin: 1,
             leader: 5,
             alive: 7,
+            seq: 10,
         },
         claim: 1,
+        begins: false,
         seq: 10,
         // This computer has seen the previous leader lead.
         settled: true,

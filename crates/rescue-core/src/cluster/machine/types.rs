@@ -78,21 +78,46 @@ pub struct Alive {
     pub settled: bool,
 }
 
-/// The keys `leader` and `alive` at one revision of etcd.
+/// The keys `origin`, `leader` and `alive` at one revision of etcd.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct View {
     pub revision: u64,
+    /// The revision of the key `origin`, which is written once per journal, so it identifies the journal. 0 if the key
+    /// is missing.
+    pub origin: u64,
     pub leader: Option<Leader>,
     pub alive: Option<Alive>,
 }
 
 impl View {
-    /// The revisions of the keys `leader` and `alive`, for a transaction that succeeds only if both are unchanged.
+    /// What a transaction requires, so that it succeeds only if no key was changed or deleted.
     pub fn guard(&self) -> RevisionGuard {
         RevisionGuard {
-            leader: self.leader.as_ref().map_or(0, |leader| leader.term),
+            origin: self.origin,
+            leader: self.term(),
             alive: self.alive.as_ref().map_or(0, |alive| alive.revision),
+            seq: self.seq(),
         }
+    }
+
+    /// The leader's term. 0 if there is no leader.
+    pub fn term(&self) -> u64 {
+        self.leader.as_ref().map_or(0, |leader| leader.term)
+    }
+
+    /// Whether this can be a later view of the journal of `earlier`. rosrescue never deletes a key of the journal, and
+    /// never writes an earlier value, so otherwise keys were deleted, or an older copy of etcd was restored.
+    pub fn continues(&self, earlier: &Self) -> bool {
+        let (after, before) = (self.guard(), earlier.guard());
+        let same = before.origin == 0 || after.origin == before.origin;
+        let later = after.leader >= before.leader && after.alive >= before.alive;
+        same && later && after.seq >= before.seq && self.revision >= earlier.revision
+    }
+
+    /// Whether some of the keys are missing. Each journal has all of them.
+    pub fn is_torn(&self) -> bool {
+        let is_there = [self.origin > 0, self.leader.is_some(), self.alive.is_some()];
+        is_there.contains(&true) && is_there.contains(&false)
     }
 
     /// The number of the journal's last record.
@@ -101,22 +126,28 @@ impl View {
     }
 }
 
-/// The revisions that the keys `leader` and `alive` must have for a transaction to succeed. 0 stands for a missing key.
+/// The revisions that the keys `origin`, `leader` and `alive` must have for a transaction to succeed. 0 stands for a
+/// missing key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct RevisionGuard {
+    pub origin: u64,
     pub leader: u64,
     pub alive: u64,
+    /// The number of the journal's last record, whose entry must exist. 0 if that is not required.
+    pub seq: u64,
 }
 
 /// A request to etcd. Only one is under way at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Op {
-    /// Read the keys `leader` and `alive`. The answer must not come from a member of etcd that may be behind.
+    /// Read the keys `origin`, `leader` and `alive`. The answer must not come from a member of etcd that may be behind.
     Read,
     /// Write `leader` with this claim, and `alive` with heartbeat number 0 and the journal's last record `seq`.
     Claim {
         guard: RevisionGuard,
         claim: u64,
+        /// Whether to begin a new journal: write `origin`, and delete what is left of an earlier journal.
+        begins: bool,
         seq: u64,
         settled: bool,
     },
@@ -136,7 +167,7 @@ pub enum Op {
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
-    /// The keys `leader` and `alive`, as the answer to a read or to a transaction that failed.
+    /// The keys `origin`, `leader` and `alive`, as the answer to a read or to a transaction that failed.
     Is(View),
     /// There was no usable answer. The transaction may have succeeded, or may still do so.
     Silence,

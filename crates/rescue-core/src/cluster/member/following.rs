@@ -11,6 +11,7 @@ use super::{AGAIN, Action, Entry, Heard, Member, News, Read};
 use crate::{
     checkpoint::format::Record,
     cluster::{
+        journal::Progress,
         machine::{self, JournalSession, Leader, Role, View},
         merge::{
             self, Changes, TELLER, parameter_of, weight,
@@ -35,8 +36,12 @@ pub(super) struct Reading {
     reported: u64,
     /// Whether a read is under way.
     loading: bool,
-    /// The newest revision of etcd that was known when the read under way began.
-    floor: u64,
+    /// What etcd had shown when the read under way began.
+    before: View,
+    /// Whether the next read is to check the whole journal.
+    check_due: bool,
+    /// Whether the read under way checks the whole journal.
+    checks: bool,
     /// When the next read is due.
     load_at: Option<Instant>,
     /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
@@ -52,6 +57,12 @@ impl Reading {
     /// Makes the next read due at `at` at the latest.
     pub(super) fn load_by(&mut self, at: Instant) {
         self.load_at = Some(self.load_at.map_or(at, |before| before.min(at)));
+    }
+
+    /// Asks for a check whether the journal can be read from its beginning.
+    pub(super) fn check_all(&mut self, now: Instant) {
+        self.check_due = true;
+        self.load_by(now);
     }
 
     /// Asks for a read that begins after `now`. What the watch on etcd delivers may be much older.
@@ -79,6 +90,7 @@ impl Reading {
     pub(super) fn forget(&mut self, view: &View) {
         (self.wanted, self.reported) = (None, 0);
         (self.watching, self.view) = (false, view.clone());
+        self.check_due = false;
     }
 
     pub(super) fn view(&self) -> &View {
@@ -105,8 +117,13 @@ impl Member {
         }
         if self.reading.due().is_some_and(|at| at <= now) {
             (self.reading.load_at, self.reading.loading) = (None, true);
-            self.reading.floor = self.view().revision;
-            self.act(Action::Load(self.journal.progress));
+            self.reading.before = self.view_to_continue();
+            self.reading.checks = std::mem::take(&mut self.reading.check_due);
+            let after = match self.reading.checks {
+                true => Progress::default(),
+                false => self.journal.progress,
+            };
+            self.act(Action::Load(after));
         }
     }
 
@@ -128,7 +145,23 @@ impl Member {
     }
 
     /// Handles the keys `leader` and `alive` and the journal entries that the watch on etcd delivered.
-    pub(super) fn watched(&mut self, now: Instant, view: View, entries: Vec<Entry>) {
+    ///
+    /// `deleted` is the number of the last journal entry that was deleted.
+    pub(super) fn watched(
+        &mut self,
+        now: Instant,
+        view: View,
+        entries: Vec<Entry>,
+        deleted: Option<u64>,
+    ) {
+        // What the watch delivers late is older than the answers to requests, and says nothing.
+        if view.revision >= self.view().revision && self.doubts(now, &view) {
+            return;
+        }
+        let leads = self.told.role == Role::Leading && !Mutant::TrustsDeletedKeys.lives();
+        if leads && deleted.is_some_and(|seq| seq > self.chores.replaced) {
+            self.reading.check_all(now);
+        }
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
         self.see(now, view);
         let progress = &mut self.journal.progress;
@@ -168,9 +201,10 @@ impl Member {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
         let leads = other.is_some_and(|leader| !self.was_self(leader));
-        let leads = leads && !self.lost.waits_for(self.journal.progress);
+        let leads = leads && !self.data_loss.waits_for(self.journal.progress);
         // A request of this computer's earlier process may reach the journal after the first read.
-        let has_more = !self.is_whole(self.journal.progress.seq) && self.lost.since().is_none();
+        let has_more =
+            !self.is_whole(self.journal.progress.seq) && self.data_loss.since().is_none();
         if self.journal.own_wins && (leads || has_more) {
             self.journal.own_wins = false;
             self.adopt();
@@ -215,17 +249,29 @@ impl Member {
         if earlier {
             self.reading.fresh = Some(1);
         }
-        let Some(read) = read else {
+        let checks = std::mem::take(&mut self.reading.checks);
+        let Some(mut read) = read else {
             self.reading.load_at = Some(now + AGAIN);
+            self.reading.check_due |= checks;
             return;
         };
-        // The term in a checkpoint is a revision of etcd, too.
-        let floor = match self.reading.loaded {
-            true => self.reading.floor,
-            false => self.reading.floor.max(self.own.term),
-        };
-        if self.has_lost(&read.view, floor) {
+        let before = std::mem::take(&mut self.reading.before);
+        self.note_readable(read.view.origin, read.is_readable);
+        if self.has_lost(&read.view, &before, read.is_readable) {
             return self.start_over(now, &read.view);
+        }
+        if self.data_loss.is_left(&read.view) {
+            read = Read {
+                view: read.view,
+                ..Read::empty()
+            };
+        } else if !read.is_readable {
+            // The leader of this journal repairs it.
+            self.reading.load_at = Some(now + AGAIN);
+            return self.see(now, read.view);
+        } else if checks {
+            // The records are known.
+            (read.state, read.records) = (None, Vec::new());
         }
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);
@@ -243,7 +289,11 @@ impl Member {
             let leader = read.view.leader.as_ref();
             let whole = self.is_whole(read.view.seq());
             let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
-            self.journal.own_wins = own || self.lost.since().is_some();
+            self.journal.own_wins = own || self.data_loss.since().is_some();
+            // etcd is not new, so its keys may just have been deleted. Computers that hold the state say so now.
+            if leader.is_none() && read.view.revision > 1 {
+                self.machine.hold_claims(now + self.settings().ttl);
+            }
         } else {
             self.see(now, read.view.clone());
         }
@@ -273,9 +323,9 @@ impl Member {
                 Err(_) => is_new_state = false,
             }
         }
-        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. An empty
-        // journal after a loss says nothing of what others have changed.
-        if first && (!self.is_starting_over() || self.journal.progress.seq > 0) {
+        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. After a
+        // loss, what is left of the old journal says nothing of what others have changed.
+        if first && !self.data_loss.waits_for(self.journal.progress) {
             self.cut_off.note_difference(None, &self.journal.state);
         }
         if is_new_state {
@@ -313,7 +363,7 @@ impl Member {
         let seq = self.journal.progress.seq;
         // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
         // lacks.
-        let lost = self.lost.since().is_some();
+        let lost = self.data_loss.since().is_some();
         let differs = self.own.seq > seq || lost || !self.cut_off.is_empty();
         if self.journal.own_wins && differs && !self.records() {
             return;
@@ -323,7 +373,7 @@ impl Member {
         let whole = self.reading.loaded && seq >= view.seq();
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.place.term, |leader| leader.term);
-        let epoch = self.lost.times;
+        let epoch = self.data_loss.times;
         // A former leader's mirror still has the changes that the journal may lack.
         let own = view
             .leader
@@ -337,14 +387,15 @@ impl Member {
     }
 
     /// Handles what computers have written into their entries among the members.
-    pub(super) fn hear(&mut self, heard: &[Heard]) {
-        let own = self.machine.settings();
-        for heard in heard.iter().filter(|heard| heard.name == own.name) {
-            self.namesake.sign = heard.sign_of_namesake(own);
-        }
+    pub(super) fn hear(&mut self, now: Instant, heard: &[Heard]) {
         let mut outdated = false;
-        for heard in heard.iter().filter(|heard| heard.name != own.name) {
-            self.lost.hear(heard);
+        for heard in heard {
+            let own = self.machine.settings();
+            if heard.name == own.name {
+                self.namesake.sign = heard.sign_of_namesake(own);
+                continue;
+            }
+            self.hear_of_loss(now, heard);
             outdated |= self.chores.notifying.hear(heard);
         }
         if outdated && self.told.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
@@ -376,7 +427,8 @@ impl Member {
             // Only one process runs on a computer at a time, so this leader is another computer.
             if leader.id == own.id {
                 self.namesake.led = true;
-            } else if self.namesake.led && leader.name == own.name {
+            } else if self.namesake.led && leader.name == own.name && !self.data_loss.is_left(view)
+            {
                 there = there.or_else(|| Some(leader.uri.clone()));
             }
         }
@@ -480,6 +532,7 @@ impl Member {
     /// `None` if no leader is known.
     fn merges_to(&self) -> Option<Option<(String, u64)>> {
         match self.machine.role() {
+            Role::Following if self.data_loss.since().is_some() => None,
             Role::Following if self.reading.wanted.is_none() && self.reading.loaded => {
                 let (uri, term) = self.leader()?;
                 Some(Some((uri.to_owned(), term)))

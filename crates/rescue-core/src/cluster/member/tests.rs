@@ -28,6 +28,7 @@ fn led(seq: u64) -> View {
     let revision = seq + 1;
     View {
         revision,
+        origin: 1,
         leader: Some(Leader {
             term: 1,
             name: "b".to_owned(),
@@ -126,6 +127,7 @@ impl Merges {
         self.journal.take(records.clone(), 1).unwrap();
         self.inputs.push_back(Input::Loaded(Some(Read {
             view: led(seq),
+            is_readable: true,
             state: None,
             records,
             progress: self.journal,
@@ -169,6 +171,7 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
     let watched = Input::Watched {
         view,
         entries,
+        deleted: None,
         heard,
     };
     let last = i32::try_from(first + 49).unwrap();
@@ -237,6 +240,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
     assert_eq!(followed(Input::Begin), None);
     let loaded = Input::Loaded(Some(Read {
         view: own_view(1),
+        is_readable: true,
         state: None,
         records: records(1),
         progress,
@@ -249,6 +253,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
             records: records(2),
             bytes: 1,
         }],
+        deleted: None,
         heard: Vec::new(),
     };
     assert_eq!(followed(late), Some(2.into()));

@@ -43,6 +43,9 @@ pub struct Said {
     /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
     #[serde(default)]
     pub holds: Option<Holds>,
+    /// The origin of a journal that this computer could not read from its beginning, or 0. Its leader checks that.
+    #[serde(default)]
+    pub unreadable: u64,
     /// Changes when this process stops notifying nodes, because it no longer leads or is no longer cut off, and with
     /// each start. The leader then notifies all nodes of the present state, because they may have heard an older one
     /// last. Empty until the leader has the writes that this computer answered while cut off: before, its nodes would
@@ -96,14 +99,30 @@ pub enum Entry {
 /// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {
-    /// The keys `leader` and `alive` at the same revision.
+    /// The keys `origin`, `leader` and `alive` at the same revision.
     pub view: View,
+    /// Whether the journal could be read from its beginning. If not, only `view` and `heard` count.
+    pub is_readable: bool,
     /// The state before the records, and the nodes that lost their names to other nodes shortly before. `None` if the
     /// records follow the known journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
     pub heard: Vec<Heard>,
+}
+
+impl Read {
+    /// A read that found no journal.
+    pub(super) fn empty() -> Self {
+        Self {
+            view: View::default(),
+            is_readable: true,
+            state: None,
+            records: Vec::new(),
+            progress: Progress::default(),
+            heard: Vec::new(),
+        }
+    }
 }
 
 /// An event that the member must handle.
@@ -117,10 +136,12 @@ pub enum Input {
     Begin,
     /// The answer to request `number` of the machine.
     Answer { number: u64, answer: EtcdAnswer },
-    /// The watch on etcd delivers the keys `leader` and `alive`, new journal entries, and changed member entries.
+    /// The watch on etcd delivers the keys `origin`, `leader` and `alive`, new journal entries, and changed member entries.
     Watched {
         view: View,
         entries: Vec<Entry>,
+        /// The number of the last journal entry that was deleted, or `u64::MAX` if the snapshot was.
+        deleted: Option<u64>,
         heard: Vec<Heard>,
     },
     /// The watch on etcd has ended.

@@ -130,11 +130,11 @@ pub(super) struct Computer {
     pub(super) left: Option<Place>,
     /// The place in the journal up to which the mirror is current.
     pub(super) followed: Place,
-    /// Whether there is a watch. Its number, time and content follow.
+    /// Whether there is a watch. Its number, time and last revision follow.
     pub(super) watching: bool,
     pub(super) watch: u64,
     pub(super) watch_at: u64,
-    pub(super) watched: (u64, u64),
+    pub(super) watched: u64,
 }
 
 fn member(name: &str, index: usize, life: u64, plan: &Plan, disk: &Disk) -> Member {
@@ -194,7 +194,7 @@ impl Computer {
             watching: false,
             watch: 0,
             watch_at: 0,
-            watched: (0, 0),
+            watched: 0,
         }
     }
 
@@ -255,8 +255,10 @@ impl Computer {
     pub(super) fn write_disk(&mut self) {
         let own = &mut self.disk.own;
         own.state = self.ledger.mirror.clone();
-        if let Some(sharing) = &self.ledger.sharing {
-            own.seq = sharing.last();
-        }
+        own.seq = match &self.ledger.sharing {
+            Some(sharing) => sharing.last(),
+            None if self.member.seq() > 0 => self.member.seq(),
+            None => own.seq,
+        };
     }
 }

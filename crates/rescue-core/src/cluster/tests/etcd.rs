@@ -8,7 +8,7 @@ use crate::{
     checkpoint::format::{self, Record, RecordContent as JournalEntry},
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
-        machine::{Alive, EtcdAnswer, Leader, Op, Settings, View},
+        machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
         member::{Entry, Heard, Read, Said},
     },
     master::{Displaced, Master, Request},
@@ -36,6 +36,16 @@ pub(super) enum Held {
     State(Box<Master>),
 }
 
+/// A copy of etcd's data.
+#[derive(Clone, Debug)]
+struct Copy {
+    view: View,
+    entries: BTreeMap<u64, (Held, usize)>,
+    snapshot: Option<(u64, Master, Vec<Displaced>)>,
+    state: Master,
+    values: BTreeMap<String, Vec<u8>>,
+}
+
 #[derive(Debug)]
 pub(super) struct Etcd {
     pub(super) keys: Keys,
@@ -43,6 +53,14 @@ pub(super) struct Etcd {
     /// The journal's entries and their sizes, by the last record of each.
     entries: BTreeMap<u64, (Held, usize)>,
     snapshot: Option<(u64, Master, Vec<Displaced>)>,
+    /// What a watch delivers: each journal entry with its number and revision.
+    puts: Vec<(u64, u64, Held, usize)>,
+    /// The revisions and numbers of deleted journal entries.
+    deletes: Vec<(u64, u64)>,
+    /// A watch from before this revision ends.
+    compacted: u64,
+    /// A backup.
+    saved: Option<Box<Copy>>,
     /// The state that the journal leads to.
     pub(super) state: Master,
     values: BTreeMap<String, Vec<u8>>,
@@ -67,6 +85,10 @@ impl Etcd {
             view: View::default(),
             entries: BTreeMap::new(),
             snapshot: None,
+            puts: Vec::new(),
+            deletes: Vec::new(),
+            compacted: 0,
+            saved: None,
             state: Master::default(),
             values: BTreeMap::new(),
             members: BTreeMap::new(),
@@ -136,6 +158,72 @@ impl Etcd {
         };
     }
 
+    /// Makes a backup.
+    pub(super) fn save(&mut self) {
+        self.saved = Some(Box::new(Copy {
+            view: self.view.clone(),
+            entries: self.entries.clone(),
+            snapshot: self.snapshot.clone(),
+            state: self.state.clone(),
+            values: self.values.clone(),
+        }));
+    }
+
+    /// Restores the backup. etcd can give a restored copy a higher revision than before.
+    pub(super) fn restore(&mut self, is_bumped: bool) {
+        let Copy {
+            view,
+            entries,
+            snapshot,
+            state,
+            values,
+        } = *self.saved.clone().unwrap();
+        let revision = match is_bumped {
+            true => self.view.revision + 1000,
+            false => view.revision,
+        };
+        self.compacted = revision;
+        (self.puts, self.deletes) = (Vec::new(), Vec::new());
+        self.members.clear();
+        (self.view, self.entries, self.snapshot) = (view, entries, snapshot);
+        (self.state, self.values) = (state, values);
+        self.view.revision = revision;
+    }
+
+    /// Deletes all keys, or those that `deletes` names.
+    pub(super) fn delete(&mut self, mut deletes: impl FnMut(&str) -> bool) {
+        self.view.revision += 1;
+        let revision = self.view.revision;
+        if deletes("origin") {
+            self.view.origin = 0;
+        }
+        if deletes("leader") {
+            self.view.leader = None;
+        }
+        if deletes("alive") {
+            self.view.alive = None;
+        }
+        if self.snapshot.is_some() && deletes("snapshot") {
+            self.snapshot = None;
+            self.deletes.push((revision, u64::MAX));
+        }
+        if deletes("members") {
+            self.members.clear();
+        }
+        let gone = self.entries.keys().filter(|_| deletes("journal"));
+        for seq in gone.copied().collect::<Vec<_>>() {
+            self.entries.remove(&seq);
+            self.deletes.push((revision, seq));
+        }
+    }
+
+    /// The number of the last journal entry that was deleted after revision `after`, up to revision `upto`.
+    pub(super) fn deleted(&self, after: u64, upto: u64) -> Option<u64> {
+        let deletes = self.deletes.iter();
+        let new = deletes.filter(|(revision, _)| (after + 1..=upto).contains(revision));
+        new.map(|(_, seq)| *seq).max()
+    }
+
     /// Writes the parts of a large value.
     pub(super) fn put(&mut self, parts: Vec<Put>) {
         for part in parts {
@@ -157,7 +245,12 @@ impl Etcd {
             Op::Read => return EtcdAnswer::Is(self.view.clone()),
             Op::Claim { guard, .. } | Op::Beat { guard, .. } => *guard,
         };
-        if self.view.guard() != expected {
+        let has_last = expected.seq == 0 || self.entries.contains_key(&expected.seq);
+        let guard = RevisionGuard {
+            seq: expected.seq,
+            ..self.view.guard()
+        };
+        if guard != expected || !has_last {
             return EtcdAnswer::Is(self.view.clone());
         }
         self.view.revision += 1;
@@ -166,11 +259,19 @@ impl Etcd {
             Op::Read => {}
             Op::Claim {
                 claim,
+                begins,
                 seq,
                 settled,
                 ..
             } => {
-                assert_eq!(*seq, self.seq(), "a claim knows the journal's end");
+                if *begins {
+                    self.view.origin = revision;
+                    self.entries.clear();
+                    (self.snapshot, self.state) = (None, Master::default());
+                    self.values.clear();
+                } else {
+                    assert_eq!(*seq, self.seq(), "a claim knows the journal's end");
+                }
                 self.claims.push(sent.from);
                 let of = sent.settings.clone();
                 self.view.leader = Some(Leader {
@@ -240,7 +341,8 @@ impl Etcd {
         match &held {
             Held::State(state) => self.state = (**state).clone(),
             Held::Records(records) => {
-                assert_eq!(records[0].seq, self.seq() + 1, "the journal has no gap");
+                let next = self.view.seq() + 1;
+                assert_eq!(records[0].seq, next, "the journal has no gap");
                 for record in records {
                     if let JournalEntry::Call { call, .. } = &record.entry {
                         let call = Request::from(call.clone());
@@ -252,23 +354,34 @@ impl Etcd {
         self.log.push((self.now, held.clone()));
         self.terms.push(self.view.guard().leader);
         self.writers.push(*self.claims.last().unwrap());
+        let revision = self.view.revision;
+        self.puts.push((revision, seq, held.clone(), bytes));
         self.entries.insert(seq, (held, bytes));
         seq
     }
 
-    /// Replaces the journal by a snapshot.
+    /// Replaces the journal by a snapshot. The last entry stays.
     pub(super) fn compact(&mut self) {
-        if self.seq() > 0 {
+        let seq = self.seq();
+        if self.entries.contains_key(&seq) && self.is_readable() {
+            self.compacted = self.view.revision;
             self.view.revision += 1;
-            self.snapshot = Some((self.seq(), self.state.clone(), Vec::new()));
-            self.entries.clear();
+            self.snapshot = Some((seq, self.state.clone(), Vec::new()));
+            self.entries.retain(|of, _| *of == seq);
+            self.puts.clear();
         }
+    }
+
+    /// Whether the journal can be read from its beginning.
+    pub(super) fn is_readable(&self) -> bool {
+        self.read(Progress::default()).is_readable
     }
 
     /// Reads the journal after `known`.
     pub(super) fn read(&self, known: Progress) -> Read {
         let mut read = Read {
             view: self.view.clone(),
+            is_readable: true,
             state: None,
             records: Vec::new(),
             progress: known,
@@ -287,26 +400,28 @@ impl Etcd {
                     read.state = Some(((**state).clone(), Vec::new()));
                     read.records.clear();
                 }
-                Held::Records(records) => {
-                    let new = read.progress.take(records.clone(), *bytes);
-                    read.records.extend(new.unwrap());
-                }
+                Held::Records(records) => match read.progress.take(records.clone(), *bytes) {
+                    Ok(new) => read.records.extend(new),
+                    Err(_) => {
+                        read.is_readable = false;
+                        return read;
+                    }
+                },
             }
         }
+        read.is_readable = read.progress.seq >= self.seq();
         read
     }
 
-    /// The entries of the journal after `seq`, as a watch shows them. `None` if a snapshot has replaced them.
-    pub(super) fn entries_after(&self, seq: u64, upto: u64) -> Option<Vec<Entry>> {
-        let first = self.snapshot.as_ref().map_or(0, |(seq, ..)| *seq);
-        if seq < first {
+    /// The entries of the journal after revision `after`, up to revision `upto`, as a watch shows them. `None` if a
+    /// snapshot has replaced them.
+    pub(super) fn entries_after(&self, after: u64, upto: u64) -> Option<Vec<Entry>> {
+        if after < self.compacted {
             return None;
         }
-        let entries = self
-            .entries
-            .range(seq + 1..)
-            .take_while(|(of, _)| **of <= upto);
-        let entries = entries.map(|(seq, (held, bytes))| match held {
+        let new = self.puts.iter();
+        let new = new.filter(|(revision, ..)| (after + 1..=upto).contains(revision));
+        let entries = new.map(|(_, seq, held, bytes)| match held {
             Held::State(_) => Entry::Apart(*seq),
             Held::Records(records) => Entry::Records {
                 records: records.clone(),

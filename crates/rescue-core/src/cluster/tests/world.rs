@@ -105,6 +105,8 @@ pub(super) struct World {
     /// The highest term in which a call was answered.
     term: u64,
     pub(super) counts: Counts,
+    /// The only computer whose nodes write, if set.
+    pub(super) writer: Option<usize>,
 }
 
 impl World {
@@ -131,6 +133,7 @@ impl World {
             owed: Default::default(),
             term: 0,
             counts: Counts::default(),
+            writer: None,
         };
         for index in 0..COMPUTERS {
             let computer = &mut world.computers[index];
@@ -403,21 +406,23 @@ impl World {
             computer.watch += 1;
             return;
         }
-        let (seq, revision) = computer.watched;
+        let revision = computer.watched;
         if self.etcd.view().revision < revision || view.revision > self.etcd.view().revision {
             // The watch waits for a later revision.
             return;
         }
-        let entries = self.etcd.entries_after(seq, view.seq());
+        let entries = self.etcd.entries_after(revision, view.revision);
         let Some(entries) = entries else {
             computer.watching = false;
             return self.input(at, Input::WatchEnded);
         };
         let heard = self.etcd.heard(revision);
-        computer.watched = (seq.max(view.seq()), view.revision);
+        let deleted = self.etcd.deleted(revision, view.revision);
+        computer.watched = view.revision;
         let input = Input::Watched {
             view,
             entries,
+            deleted,
             heard,
         };
         self.input(at, input);
@@ -528,7 +533,7 @@ impl World {
                 let computer = &mut self.computers[at];
                 computer.watch += 1;
                 computer.watching = true;
-                computer.watched = (view.seq(), view.revision);
+                computer.watched = view.revision;
                 if *self.etcd.view() != view {
                     self.show_watch(at);
                 }
@@ -565,7 +570,6 @@ impl World {
                     {
                         let call = Request::from(call.clone());
                         computer.ledger.mirror.apply_telling(&call, &mut ());
-                        computer.disk.own.seq += 1;
                     }
                 }
             }
@@ -782,6 +786,9 @@ impl World {
                 return Err(format!("{refused} of two computers of one name have ended"));
             }
             return Ok(());
+        }
+        if !self.etcd.is_readable() || self.etcd.view().is_torn() {
+            return Err("the journal cannot be read from its beginning".to_owned());
         }
         self.history.check(&self.etcd, self.plan.commit)
     }

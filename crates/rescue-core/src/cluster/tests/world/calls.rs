@@ -7,7 +7,7 @@ impl World {
         let computer = &self.computers[at];
         let behind = computer.watching
             && computer.watch_at < self.now
-            && computer.watched.1 != self.etcd.view().revision;
+            && computer.watched != self.etcd.view().revision;
         if behind && self.network.reaches_etcd(at) {
             // A new watch replaces the silent one.
             self.computers[at].watch += 1;
@@ -230,7 +230,7 @@ impl World {
             return;
         }
         let key = self.dice.below(KEYS as u64) as usize;
-        if self.dice.one_in(3) {
+        if self.dice.one_in(3) || self.writer.is_some_and(|writer| writer != at) {
             return self.begin_read(at, key);
         }
         let again = self.dice.one_in(3).then(|| self.dice.below(4));

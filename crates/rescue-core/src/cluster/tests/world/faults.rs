@@ -249,6 +249,26 @@ impl World {
         self.term = 0;
     }
 
+    /// Restores the backup of etcd, which stops for `time`.
+    pub(in super::super) fn restore_etcd(&mut self, time: Duration, is_bumped: bool) {
+        self.strike(Fault::EtcdAway, time.as_micros() as u64);
+        self.etcd.restore(is_bumped);
+        self.term = 0;
+    }
+
+    /// Deletes all keys of a living etcd, or some.
+    pub(in super::super) fn delete_keys(&mut self, all: bool) {
+        let dice = &mut self.dice;
+        self.etcd.delete(|_| all || dice.one_in(3));
+        self.show_watches();
+    }
+
+    /// Kills a computer, and starts it again at once.
+    pub(in super::super) fn restart(&mut self, at: usize) {
+        self.kill(at);
+        self.start(at);
+    }
+
     pub(super) fn end(&mut self, fault: Fault) {
         match fault {
             Fault::Kill(at) | Fault::PowerCut(at) => self.start(at),

@@ -1,0 +1,252 @@
+//! An etcd that has lost data of the journal: its members are new, an older copy was restored, or keys were deleted.
+//!
+//! What etcd shows then does not continue what it showed before, or the journal cannot be read from its beginning. The
+//! most recent state of a living computer becomes the new truth. Each computer writes into its member entry what it
+//! holds. A leader begins a new journal at once. Otherwise the computer that holds the most does so after the time to
+//! live, and the others wait longer. What is left of the old journal is never read.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use super::{Action, Heard, Holds, Member, News};
+use crate::cluster::{
+    journal::Progress,
+    machine::{self, EtcdAnswer, RevisionGuard, Role, View},
+    mutant::Mutant,
+    standing::Place,
+};
+
+/// How long a computer that holds less of the lost journal waits for the one that holds the most, in times to live.
+const PATIENCE: u32 = 3;
+
+/// A loss that no new journal has made good yet.
+#[derive(Clone, Copy, Debug)]
+struct Loss {
+    /// When this computer noticed the loss.
+    since: Instant,
+    /// How much of the lost journal this computer holds.
+    holds: Holds,
+    /// The keys as etcd showed them when the loss was noticed. A living leader changes them.
+    left: RevisionGuard,
+}
+
+/// What is known of the journal that etcd has lost.
+#[derive(Debug, Default)]
+pub(super) struct DataLoss {
+    present: Option<Loss>,
+    /// How much of the lost journal the other computers hold, by their names.
+    others: BTreeMap<String, Holds>,
+    /// Whether another computer is known to hold more of the lost journal.
+    is_second: bool,
+    /// How often etcd has lost data.
+    pub(super) times: u64,
+    /// The origin of a journal that this computer could not read from its beginning.
+    unreadable: u64,
+}
+
+impl DataLoss {
+    pub(super) fn holds(&self) -> Option<Holds> {
+        self.present.map(|loss| loss.holds)
+    }
+
+    pub(super) fn since(&self) -> Option<Instant> {
+        self.present.map(|loss| loss.since)
+    }
+
+    /// Whether the new journal, read up to `progress`, still lacks the state that its first leader writes first.
+    pub(super) fn waits_for(&self, progress: Progress) -> bool {
+        self.present.is_some() && progress.seq == 0
+    }
+
+    /// Whether `view` shows nothing but what is left of the lost journal.
+    pub(super) fn is_left(&self, view: &View) -> bool {
+        let shown = view.guard();
+        let left = self.present.is_some_and(|loss| loss.left == shown);
+        left && !Mutant::BelievesOldCopy.lives()
+    }
+
+    /// The origin of the journal that this computer could not read, for its member entry.
+    pub(super) fn unreadable(&self) -> u64 {
+        self.unreadable
+    }
+}
+
+impl Member {
+    /// Returns `answer`, or silence if it contradicts what etcd showed before. Then etcd is read again.
+    pub(super) fn doubt_answer(&mut self, now: Instant, answer: EtcdAnswer) -> EtcdAnswer {
+        let EtcdAnswer::Is(view) = &answer else {
+            return answer;
+        };
+        if view.revision < self.view().revision {
+            // Either the answer is late, which is harmless, or etcd has lost its data.
+            self.reading.load_by(now);
+            return answer;
+        }
+        match self.doubts(now, view) {
+            true => EtcdAnswer::Silence,
+            false => answer,
+        }
+    }
+
+    /// Whether `view` contradicts what etcd showed before. If so, etcd is read again.
+    pub(super) fn doubts(&mut self, now: Instant, view: &View) -> bool {
+        let doubts = self.contradicts(view, self.view());
+        if doubts {
+            self.reading.load_by(now);
+        }
+        doubts
+    }
+
+    /// What a later view of etcd must continue. After a loss, only etcd's revision counts.
+    pub(super) fn view_to_continue(&self) -> View {
+        let view = self.view();
+        let revision = view.revision;
+        match self.data_loss.present {
+            None => view.clone(),
+            Some(_) => View {
+                revision,
+                ..View::default()
+            },
+        }
+    }
+
+    fn contradicts(&self, view: &View, before: &View) -> bool {
+        // After a loss, a new journal does not continue the lost one.
+        let is_lost = self.data_loss.present.is_some();
+        !is_lost && !view.continues(before) && !Mutant::TrustsDeletedKeys.lives()
+    }
+
+    /// Whether etcd has lost data, if a read that began when etcd had shown `before` shows `view`.
+    pub(super) fn has_lost(&self, view: &View, before: &View, is_readable: bool) -> bool {
+        // The term in a checkpoint is a revision of etcd, too.
+        let known = match self.reading.loaded {
+            true => 0,
+            false => self.own.term,
+        };
+        let floor = before.revision.max(known);
+        let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
+        if self.data_loss.present.is_some() {
+            // Nobody else can repair a journal that this computer is to continue.
+            return older || !is_readable && self.machine.role() == Role::CatchingUp;
+        }
+        let torn = view.is_torn() || view.term() < known || !is_readable;
+        let torn = torn && !Mutant::TrustsDeletedKeys.lives();
+        older || torn || self.contradicts(view, before)
+    }
+
+    /// Starts over with the etcd that shows `view`, and with this computer's state.
+    pub(super) fn start_over(&mut self, now: Instant, view: &View) {
+        let holds = match self.reading.loaded {
+            true => Holds {
+                term: self.place.term,
+                seq: self.journal.progress.seq,
+            },
+            false => Holds {
+                term: self.own.term,
+                seq: self.own.seq,
+            },
+        };
+        let holds = self.data_loss.holds().unwrap_or(holds);
+        self.tell(News::EtcdLost);
+        // A leader holds the most, as long as no other computer can lead.
+        let leads = self.told.role == Role::Leading && self.machine.is_sole(now);
+        let wait = if leads {
+            Duration::ZERO
+        } else {
+            self.settings().ttl
+        };
+        let until = now + wait;
+        let view = view.clone();
+        self.reading.forget(&view);
+        let left = view.guard();
+        self.drive(now, machine::Input::Lost { view, until });
+        self.machine.hold_claims(until);
+        self.data_loss.times += 1;
+        let epoch = self.data_loss.times;
+        let journal = std::mem::take(&mut self.journal);
+        if std::mem::take(&mut self.reading.loaded) {
+            // Before the new journal has the state, it holds nothing.
+            if !journal.own_wins && journal.progress.seq > 0 {
+                (self.own.state, self.own.restored) = (journal.state, true);
+            }
+            // The mirror goes on answering. That of a process which has just started may be older than the new journal.
+            self.place = Place {
+                epoch,
+                ..Place::default()
+            };
+        }
+        (self.journal.own_wins, self.own.term) = (true, 0);
+        self.reading.load_by(now);
+        let since = now;
+        self.data_loss.present = Some(Loss { since, holds, left });
+        self.data_loss.is_second = false;
+        self.act(Action::Say);
+    }
+
+    /// Notes whether the journal with this `origin` could be read from its beginning.
+    pub(super) fn note_readable(&mut self, origin: u64, is_readable: bool) {
+        let unreadable = if is_readable { 0 } else { origin };
+        if std::mem::replace(&mut self.data_loss.unreadable, unreadable) != unreadable {
+            self.machine.set_unreadable(unreadable);
+            self.act(Action::Say);
+        }
+    }
+
+    /// Notes how much another computer holds of a journal that etcd has lost, and whether it cannot read the present
+    /// one.
+    pub(super) fn hear_of_loss(&mut self, now: Instant, heard: &Heard) {
+        let said = heard.said.as_ref();
+        let holds = said.and_then(|said| said.holds);
+        match holds {
+            Some(holds) => self.data_loss.others.insert(heard.name.clone(), holds),
+            None => self.data_loss.others.remove(&heard.name),
+        };
+        let (leads, view) = (self.told.role == Role::Leading, self.view());
+        let shown = Holds {
+            term: view.term(),
+            seq: view.seq(),
+        };
+        let unreadable = said.map_or(0, |said| said.unreadable);
+        if leads && unreadable != 0 && unreadable == view.origin {
+            self.reading.check_all(now);
+        }
+        // This computer has not noticed the loss, because it has just started. It leaves the claim to the others.
+        if !leads && self.data_loss.present.is_none() && holds.is_some_and(|holds| holds > shown) {
+            let until = now + self.settings().ttl * PATIENCE;
+            self.machine.hold_claims(until);
+        }
+    }
+
+    /// Lets a computer that holds more of the lost journal claim leadership first.
+    pub(super) fn update_data_loss(&mut self, now: Instant) {
+        let Some(Loss { since, holds, .. }) = self.data_loss.present else {
+            return;
+        };
+        if !self.journal.own_wins || self.told.role == Role::Leading {
+            self.data_loss.present = None;
+            return self.chores.say_at(now);
+        }
+        let name = &self.settings().name;
+        let mine = (holds, name);
+        let others = self.data_loss.others.iter();
+        let mut others = others.map(|(name, holds)| (*holds, name));
+        if !self.data_loss.is_second && others.any(|other| other > mine) {
+            self.data_loss.is_second = true;
+            let until = since + self.settings().ttl * PATIENCE;
+            self.machine.hold_claims(until);
+        }
+        if self.data_loss.is_left(self.view()) {
+            return;
+        }
+        // Another computer has led since, so its journal counts. Those that have read it claim first.
+        let patience = self.settings().ttl * PATIENCE;
+        if let Some(seen) = self.machine.observed() {
+            self.machine.hold_claims(seen + patience);
+        }
+        if self.reading.loaded && self.journal.progress.seq < self.view().seq() {
+            self.reading.load_by(now);
+        }
+    }
+}
