@@ -258,6 +258,18 @@ impl Computer {
         fs::remove_dir_all(self.path("etcd")).unwrap();
     }
 
+    /// Copies the data of this computer's etcd, which must not run.
+    pub(crate) fn save_etcd(&self) {
+        assert!(self.etcd.is_none(), "etcd runs");
+        copy_folder(&self.path("etcd"), &self.path("etcd.saved"));
+    }
+
+    /// Puts back the data of [`Self::save_etcd`].
+    pub(crate) fn restore_etcd(&self) {
+        self.wipe_etcd();
+        copy_folder(&self.path("etcd.saved"), &self.path("etcd"));
+    }
+
     /// The ids, in the test's PID namespace, of all processes of the computer except its init process, and of the
     /// `nsenter` processes that started them.
     pub(crate) fn processes(&self) -> Vec<u32> {
@@ -484,6 +496,11 @@ pub(crate) fn endpoints() -> Vec<String> {
 }
 
 /// The child of `ip netns exec … unshare` or `nsenter`, which stay as the parents of what they start.
+fn copy_folder(from: &std::path::Path, to: &std::path::Path) {
+    let copied = Command::new("cp").arg("-a").args([from, to]).status();
+    assert!(copied.unwrap().success());
+}
+
 fn child_of(parent: &Process) -> Option<u32> {
     children(parent.pid()).first().copied()
 }

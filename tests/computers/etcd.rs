@@ -1,7 +1,10 @@
 use std::time::Instant;
 
+use rustix::process::Signal;
+
+use crate::computer::endpoints;
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
-use crate::support::eventually;
+use crate::support::{eventually, params, signal};
 use crate::traffic::Traffic;
 use crate::turn;
 
@@ -77,5 +80,133 @@ fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
         });
         assert!(!computer.logged("etcd has lost its data").is_empty());
     }
+    fleet.assert_nodes_live();
+}
+
+/// Deletes all keys that begin with `prefix`, as `etcdctl del --prefix` does.
+fn delete_keys(fleet: &Fleet, prefix: &str) {
+    let range = prefix.to_owned()..format!("{prefix}\u{7f}");
+    fleet.computers[0].within(|| {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        runtime.block_on(async {
+            let options = etcd_kv::Options {
+                endpoints: endpoints(),
+                access: etcd_kv::Credentials::default(),
+            };
+            let client = etcd_kv::Client::new(&options).unwrap();
+            let txn = etcd_kv::Txn {
+                success: vec![etcd_kv::TxnOp::Delete(range)],
+                ..etcd_kv::Txn::default()
+            };
+            client.txn(&txn, READ).await.unwrap();
+        });
+    });
+}
+
+/// The leader used to go on with a journal that began with record 1 and without the state. When a follower started
+/// again, everything older was gone on all computers.
+#[test]
+fn keys_that_are_deleted_in_a_living_etcd_come_back_and_no_write_is_lost() {
+    let _turn = turn();
+    let mut fleet = Fleet::start(&[]);
+    fleet.await_whole();
+    for (round, prefix) in [
+        "/robot/",
+        "/robot/journal/",
+        "/robot/leader",
+        "/robot/alive",
+        "/robot/origin",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let leader = fleet.await_whole();
+        let key = format!("/before{round}");
+        for value in 1..=20 {
+            fleet.computers[leader].set_param(&key, value);
+        }
+        fleet.await_same_state();
+        let mark = Instant::now();
+        delete_keys(&fleet, prefix);
+        // A write that the former journal did not get is closed, as in a takeover.
+        eventually("a write is answered", || {
+            let computer = &fleet.computers[leader];
+            let params = params!["/test", format!("/after{round}"), 1];
+            computer.within(|| computer.client().ask("setParam", params).is_some())
+        });
+        println!("{prefix} is gone: a write takes {:.2?}", mark.elapsed());
+        let follower = &fleet.computers[(leader + 1) % 3];
+        signal(follower.worker(), Signal::KILL);
+        fleet.await_whole();
+        fleet.await_same_state();
+        for computer in &fleet.computers {
+            for round in 0..=round {
+                let [before, after] = ["before", "after"].map(|key| format!("/{key}{round}"));
+                let what = format!("{prefix}: {} has what was written", computer.name);
+                eventually(&what, || {
+                    computer.param(&before) == Some(20.into())
+                        && computer.param(&after) == Some(1.into())
+                });
+            }
+        }
+        let lost = fleet.computers[leader].ever_logged("etcd has lost its data");
+        assert!(!lost.is_empty(), "{prefix}");
+    }
+    fleet.assert_nodes_live();
+}
+
+/// The older copy lacks what was written after it was made. That used to count as a change by others.
+#[test]
+fn an_older_copy_of_etcd_is_no_conflict_with_what_was_written_while_cut_off() {
+    let _turn = turn();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    fleet.computers[leader].set_param("/before", 1);
+    fleet.await_same_state();
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+    }
+    for computer in &mut fleet.computers {
+        computer.save_etcd();
+        computer.start_etcd();
+    }
+    let leader = fleet.await_whole();
+    for value in 1..=20 {
+        fleet.computers[leader].set_param("/later", value);
+    }
+    fleet.await_same_state();
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+    }
+    for computer in &fleet.computers {
+        let what = format!("{} is alone", computer.name);
+        eventually(&what, || computer.role_is("alone"));
+    }
+    for value in 1..=11 {
+        fleet.computers[leader].set_param(&format!("/leader{value}"), value);
+        fleet.computers[(leader + 1) % 3].set_param(&format!("/follower{value}"), value);
+    }
+    fleet.computers[(leader + 1) % 3].set_param("/later", 100);
+    for computer in &mut fleet.computers {
+        computer.restore_etcd();
+        computer.start_etcd();
+    }
+    fleet.await_whole();
+    for computer in &fleet.computers {
+        let has_all = || {
+            let alone = (1..=11).all(|value| {
+                let keys = [format!("/leader{value}"), format!("/follower{value}")];
+                keys.iter()
+                    .all(|key| computer.param(key) == Some(value.into()))
+            });
+            let later = computer.param("/later") == Some(100.into());
+            alone && later && computer.param("/before") == Some(1.into())
+        };
+        let what = format!("{} has what was written", computer.name);
+        eventually(&what, has_all);
+        let lost = computer.status().unwrap()["cluster"]["lost_writes"].as_u64();
+        assert_eq!(lost, Some(0), "{}", computer.name);
+    }
+    fleet.await_same_state();
     fleet.assert_nodes_live();
 }
