@@ -181,7 +181,7 @@ impl<'a> Wanted<'a> {
             let body = std::str::from_utf8(line.body()).unwrap_or_default();
             let is_named = self.all || self.words.iter().any(|word| body.contains(word));
             count += usize::from(is_named && self.has_time(line.time()));
-            is_named || !body.contains("Param: [")
+            is_named || !line.is_about_param()
         });
         let text = thinned.map_err(|error| error.to_string())?;
         Ok(Thin { text, count })

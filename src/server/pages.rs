@@ -5,12 +5,14 @@
 //! | `/` | the page for a browser, the status as text for other clients |
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
 //! | `/state.json` | nodes, topics, services and parameters, now or at an earlier time |
+//! | `/history.json` | when nodes died and restarted |
 //! | `/events` | what changes, as it happens |
 //! | `/metrics` | metrics in Prometheus' text format, or OpenMetrics |
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master, the mirror or another computer, else 503 |
 
 mod events;
+mod history;
 mod params;
 mod past;
 mod robot;
@@ -139,6 +141,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         "/page.js" => script(include_str!("pages/web/page.js")),
         "/graph.js" => script(include_str!("pages/web/graph.js")),
         "/time.js" => script(include_str!("pages/web/time.js")),
+        "/overview.js" => script(include_str!("pages/web/overview.js")),
         "/layout.js" => script(include_str!("pages/web/layout.js")),
         "/dagre.js" => script(include_str!("pages/web/vendor/dagre.js")),
         "/status.json" => json(serde_json::to_string_pretty(&pages.status())),
@@ -146,6 +149,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
             asked @ Asked { at: Some(_), .. } => past::state(server, asked).await,
             asked => state(server, asked).await,
         },
+        "/history.json" => history::history(server, Asked::read(uri)).await,
         "/events" => {
             let mut events = events::listen(server);
             if events.status() == StatusCode::OK {
@@ -177,7 +181,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         ),
         _ => text(
             StatusCode::NOT_FOUND,
-            "no such page; there are /, /status.json, /state.json, /events, /metrics, /live and /ready\n"
+            "no such page; there are /, /status.json, /state.json, /history.json, /events, /metrics, /live and /ready\n"
                 .to_owned(),
         ),
     }
@@ -212,6 +216,8 @@ struct Asked {
     at: Option<String>,
     /// Show also how that state differs from the one at this time.
     with: Option<String>,
+    /// Show what happened since this time.
+    since: Option<String>,
 }
 
 impl Asked {
@@ -225,6 +231,7 @@ impl Asked {
                 "search" => asked.search = Some(value),
                 "at" => asked.at = Some(value),
                 "with" => asked.with = Some(value),
+                "since" => asked.since = Some(value),
                 _ => {}
             }
         }

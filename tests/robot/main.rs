@@ -116,6 +116,7 @@ mod page {
     mod answers;
     mod browser;
     mod computers;
+    mod graph;
     mod past;
 }
 

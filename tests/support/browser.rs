@@ -181,8 +181,16 @@ impl Browser {
 
     /// Presses a key like a user.
     pub(crate) fn press(&mut self, key: &str) {
+        // Only with its code does a key do what it does in a browser.
+        let (code, text) = match key {
+            "Tab" => (9, ""),
+            "Enter" => (13, "\r"),
+            _ => panic!("the code of {key} is missing here"),
+        };
         for kind in ["keyDown", "keyUp"] {
-            self.call("Input.dispatchKeyEvent", json!({"type": kind, "key": key}));
+            let event =
+                json!({"type": kind, "key": key, "windowsVirtualKeyCode": code, "text": text});
+            self.call("Input.dispatchKeyEvent", event);
         }
     }
 

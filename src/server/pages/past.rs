@@ -45,8 +45,7 @@ pub(super) async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
     };
     let turn = server.pages.state.reading_past.clone();
     let Ok(turn) = turn.try_acquire_owned() else {
-        let why = "rosrescue is reading an earlier state; try again\n".to_owned();
-        return text(StatusCode::SERVICE_UNAVAILABLE, why);
+        return busy();
     };
     let server = server.clone();
     let work = move || {
@@ -57,6 +56,12 @@ pub(super) async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
         }
     };
     in_background(work).await
+}
+
+/// The answer while the log is read for another request.
+pub(super) fn busy() -> HttpReply {
+    let why = "rosrescue is reading an earlier state; try again\n".to_owned();
+    text(StatusCode::SERVICE_UNAVAILABLE, why)
 }
 
 fn answer(pages: &Pages, asked: &Asked, at: When, with: Option<When>) -> Result<HttpReply, String> {

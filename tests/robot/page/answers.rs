@@ -56,8 +56,10 @@ fn a_browser_gets_the_page_and_curl_gets_text() {
         ("/page.css", "text/css"),
         ("/graph.js", "text/javascript"),
         ("/layout.js", "text/javascript"),
+        ("/overview.js", "text/javascript"),
         ("/dagre.js", "text/javascript"),
         ("/state.json", "application/json"),
+        ("/history.json", "application/json"),
     ] {
         let page = get(&client, path, &[]);
         assert_eq!(
@@ -74,7 +76,7 @@ fn a_browser_gets_the_page_and_curl_gets_text() {
     assert_eq!((live.code, ready.code), (200, 200));
     assert_eq!(get(&client, "/favicon.ico", &[]).code, 404);
     // A page of another site could take the few places for listeners.
-    for path in ["/events", "/state.json"] {
+    for path in ["/events", "/state.json", "/history.json"] {
         let refused = get(&client, path, &["Origin: http://evil.example"]);
         assert_eq!(refused.code, 403);
     }
@@ -101,6 +103,7 @@ fn no_answer_holds_a_hidden_value() {
         "/state.json?search=pin",
         "/state.json?search=log",
         "/state.json?search=hunter2",
+        "/history.json",
     ] {
         let page = get(&client, path, &["Accept: text/html"]).text();
         assert!(

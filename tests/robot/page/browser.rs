@@ -45,20 +45,27 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
     browser.screen(1280, 900, false);
     open(&mut browser, &robot);
     browser.shows("the robot is protected", &condition_is("Protected"));
-    for (kind, name) in [
-        ("node", "/talker"),
-        ("topic", "/chatter"),
-        ("node", "/listener"),
-    ] {
-        browser.shows("the graph shows the robot", &draws(kind, name));
+    let lines = "document.querySelectorAll('#picture .line').length";
+    for name in ["/talker", "/listener"] {
+        browser.shows("the graph shows the robot", &draws("node", name));
     }
+    browser.shows(
+        "one line from the publisher to the subscriber, which names the topic",
+        &format!("{lines} === 1 && document.querySelector('#picture .line title').textContent.includes('/chatter')"),
+    );
+    assert_eq!(
+        browser.js(&draws("topic", "/chatter")),
+        serde_json::Value::Null
+    );
+    browser.js("document.querySelector('#graph-topics').click()");
+    browser.shows("topics on request", &draws("topic", "/chatter"));
     assert_eq!(
         browser.js(&draws("node", "/rosout")),
         serde_json::Value::Null
     );
     browser.shows(
         "a publisher has a line to its topic and the topic one to its subscriber",
-        "document.querySelectorAll('#picture .lines path').length === 2",
+        &format!("{lines} === 2"),
     );
     browser.js(&format!(
         "{}.dispatchEvent(new MouseEvent('click', {{bubbles: true}}))",
@@ -151,7 +158,7 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
 }
 
 /// Registers a robot of `count` nodes without processes.
-fn paper_robot(client: &Client, count: usize) {
+pub(super) fn paper_robot(client: &Client, count: usize) {
     let parts = ["camera", "lidar", "arm", "base", "planner"];
     let name = |index: usize| format!("/{}/n{index}", parts[index % parts.len()]);
     for index in 0..count {
@@ -205,35 +212,28 @@ fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
     browser.screen(390, 844, true);
     open(&mut browser, &robot);
     let boxes = "document.querySelectorAll('#picture .node').length";
-    browser.shows("all nodes are drawn", &format!("{boxes} === 82"));
-    let frame = "const frame = document.querySelector('#picture').getBoundingClientRect();";
-    let inside = "box.left >= frame.left - 1 && box.right <= frame.right + 1 && box.top >= frame.top - 1 \
-                  && box.bottom <= frame.bottom + 1";
-    let all =
-        "[...document.querySelectorAll('#picture .box')].map((of) => of.getBoundingClientRect())";
+    browser.shows("all nodes have a tile", &format!("{boxes} === 82"));
+    browser.js("document.querySelector('#graph-overview').click()");
     browser.shows(
-        "some of the graph, although all of it would be too small to read",
-        &format!("(() => {{ {frame} return {all}.some((box) => {inside}) }})()"),
+        "the namespaces of many nodes are folded",
+        &format!("{boxes} === 2 && document.querySelectorAll('#picture .space').length === 5"),
     );
-    let leaf = draws("topic", "/planner/n79/out");
-    let rosout = draws("topic", "/rosout");
-    assert_eq!(browser.js(&leaf), serde_json::Value::Null);
-    browser.js("document.querySelector('#graph-leaves').click()");
-    browser.shows("a topic without a subscriber on request", &leaf);
-    assert_eq!(browser.js(&rosout), serde_json::Value::Null);
-    browser.js("document.querySelector('#graph-debug').click()");
-    browser.shows("and rosout", &rosout);
-    browser.js("document.querySelector('#graph-debug').click()");
-    browser.js("document.querySelector('#graph-leaves').click()");
-    browser.shows("and not any more", &format!("!{leaf} && !{rosout}"));
+    browser.js(&format!(
+        "{}.dispatchEvent(new MouseEvent('click', {{bubbles: true}}))",
+        draws("space", "/planner")
+    ));
     browser.shows(
-        "a person can read it",
-        "document.querySelector('#picture .node text').getBoundingClientRect().height > 8",
+        "one is open",
+        &format!(
+            "{} && !{}",
+            draws("node", "/planner/n79"),
+            draws("node", "/arm/n77")
+        ),
     );
-    browser.js("document.querySelector('#zoom-all').click()");
+    browser.js("document.querySelector('[data-fold=\"/planner\"]').dispatchEvent(new MouseEvent('click', {bubbles: true}))");
     browser.shows(
-        "the whole graph fits",
-        &format!("(() => {{ {frame} return {all}.every((box) => {inside}) }})()"),
+        "and folded again",
+        &format!("!{}", draws("node", "/planner/n79")),
     );
     let type_into = |browser: &mut Browser, field: &str, text: &str| {
         browser.js(&format!("document.querySelector('{field}').focus()"));
@@ -248,6 +248,20 @@ fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
         &format!("{boxes} < 8"),
     );
     browser.shows("the match is there", &draws("node", "/camera/n40"));
+    let leaf = draws("topic", "/camera/n40/out");
+    assert_eq!(browser.js(&leaf), serde_json::Value::Null);
+    browser.js("document.querySelector('#graph-topics').click()");
+    browser.shows(
+        "a topic without a subscriber, because the filter names it",
+        &leaf,
+    );
+    let rosout = draws("topic", "/rosout");
+    assert_eq!(browser.js(&rosout), serde_json::Value::Null);
+    browser.js("document.querySelector('#graph-everything').click()");
+    browser.shows("rosout on request", &rosout);
+    browser.js("document.querySelector('#graph-everything').click()");
+    browser.shows("and not any more", &format!("!{rosout}"));
+    browser.js("document.querySelector('#graph-topics').click()");
     type_into(&mut browser, "#graph-filter", "<img");
     browser.shows(
         "hostile names are text",

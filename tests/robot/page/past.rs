@@ -58,6 +58,7 @@ fn the_time_line_shows_an_earlier_robot_and_what_has_changed() {
     let mut browser = Browser::start(&robot.scratch);
     browser.screen(1280, 900, false);
     open(&mut browser, &robot);
+    browser.js("document.querySelector('#graph-topics').click()");
     browser.shows("the present robot", &draws("node", "/new"));
     let ask = |field: &str| {
         format!(
@@ -91,7 +92,7 @@ fn the_time_line_shows_an_earlier_robot_and_what_has_changed() {
     );
     browser.shows(
         "one line of two is marked",
-        "document.querySelectorAll('#picture .lines path.changed').length === 1",
+        "document.querySelectorAll('#picture .line.changed').length === 1",
     );
     for text in ["/arm/gain: 1 -> 2", "node /new at"] {
         browser.shows(

@@ -1,10 +1,13 @@
 // The page of rosrescue. Names of nodes, topics and parameters come from the network: they are only ever set
 // as text, never as markup.
 
-import { abandon, draw, layOut, measure, select } from "/graph.js";
-import { begin as beginTimeLine, changed, past, query, readPast } from "/time.js";
+import { abandon, draw, dress, layOut, measure, namespaces, nodesOf, select, shapeOf } from "/graph.js";
+import { countIll, tiles } from "/overview.js";
+import { begin as beginTimeLine, changed, past, query, readHistory, readPast, showMarks } from "/time.js";
 
 const $ = (id) => document.getElementById(id);
+/** Nodes in trouble that are named at once. */
+const TROUBLES = 8;
 /** Rows of a list; more are found by searching. */
 const ROWS = 300;
 /** Seconds without any event after which the connection counts as lost; there is one every 15. */
@@ -193,8 +196,10 @@ async function readState() {
     const answer = await fetch("/state.json");
     if (answer.ok) {
       const before = robot;
-      robot = await answer.json();
+      robot = remember(await answer.json(), before);
       showCounts();
+      showTrouble();
+      readHistory();
       const isOther = before?.registrations !== robot.registrations;
       const isNew = isOther || JSON.stringify(before.params) !== JSON.stringify(robot.params);
       if (isNew) readPast();
@@ -208,6 +213,16 @@ async function readState() {
     reading = false;
     if (again) readState();
   }, PAUSE);
+}
+
+/** A dead node that was unregistered keeps its topics here, so that it stays where it was. */
+function remember(state, before) {
+  const rows = new Map(before?.nodes.map((node) => [node.name, node]));
+  for (const node of state.nodes) {
+    const { publishes = [], subscribes = [] } = rows.get(node.name) ?? {};
+    if (node.removed_at) Object.assign(node, { publishes, subscribes });
+  }
+  return state;
 }
 
 // ---- condition, figures, rescues
@@ -225,8 +240,17 @@ function showStatus() {
   say("version", `${status.version} ${status.mode}, process ${status.pid}`);
   $("version").title = `guarded by ${status.guarded_by}`;
   showRescues();
+  showMarks();
   showTimes();
   showCounts();
+}
+
+/** Rescues, and deaths of which the log knows nothing yet, for the time line. */
+function happened() {
+  const rescues = (status?.last_rescues ?? []).map((rescue) => (
+    { at: rescue.detected_at, what: "rescued", text: `rescue in ${ms(rescue.phases.total_ms)}: ${rescue.cause}` }));
+  const dead = (robot?.nodes ?? []).filter(({ health, removed_at: removed }) => health === "dead" && !removed);
+  return [...rescues, ...dead.map(({ name, since }) => ({ at: since, what: "died", text: `${name} died` }))];
 }
 
 function showNow() {
@@ -292,6 +316,20 @@ function showCounts() {
   }).filter(Boolean);
   say("sick", parts.length ? parts.join(", ") : robot ? "all alive" : "");
   $("sick").dataset.is = robot?.nodes.some((node) => node.health in ILL && node.health !== "unchecked") ? "bad" : "";
+}
+
+/** Dead and unreachable nodes, which come before everything but the condition. */
+function showTrouble() {
+  const ill = worstFirst(robot.nodes.filter(({ health }) => health === "dead" || health === "unreachable"));
+  const rows = ill.map((node) => el("li", {}, nameButton("node", node.name), " ", health(node)));
+  const rest = rows.splice(TROUBLES);
+  if (rest.length) {
+    const more = el("li", {}, el("button", { type: "button", onclick: () => more.replaceWith(...rest) }, `${rest.length} more`));
+    rows.push(more);
+  }
+  $("trouble").hidden = !ill.length;
+  say("trouble-title", ill.length === 1 ? "A node is in trouble" : `${ill.length} nodes are in trouble`);
+  $("trouble-list").replaceChildren(...rows);
 }
 
 function showRescues() {
@@ -387,42 +425,115 @@ function countCalls() {
 // ---- the graph
 
 const picture = $("picture");
-let view = null;
-let whole = null;
-/** The graph that is shown, as text, and where its boxes and lines are. */
-let last = {};
+/** From this many nodes on, an overview comes first. */
+const MANY = 60;
+/** Whether the overview is wanted; null while the number of nodes decides. */
+let overview = null;
+/** The node or topic whose neighbourhood is shown, as in `["node", "/a"]`. */
+let focus = null;
+/** For namespaces that were folded or opened by hand: whether they are folded. */
+const folds = new Map();
+/** What the picture depends on besides health, as text. */
+let drawn = null;
 let drawing = false;
 let redraw = false;
-/** The smallest scale at which a picture is shown at first: small enough to see much, large enough to read. */
-const least = () => (isTall() ? 0.75 : 0.4);
 
-const isTall = () => window.innerHeight > window.innerWidth;
-
-/** Draws the graph, or draws it again when the drawing under way is done. */
+/** Shows the graph, or shows it again when the layout under way is done. */
 async function showGraph() {
-  if (!shownState()) return;
+  const robot = shownState();
+  if (!robot) return;
+  const filter = $("graph-filter").value.trim();
+  const everything = $("graph-everything").checked;
+  const nodes = nodesOf(robot, everything);
+  $("graph-overview").checked = overview ?? nodes.length > MANY;
+  const isOverview = $("graph-overview").checked && !focus;
+  const folded = new Map(folds);
+  const graph = isOverview
+    ? overviewOf(nodes, filter)
+    : select(robot, changed, { filter, focus, topics: $("graph-topics").checked, everything, folds: folded });
+  $("graph-back").hidden = !focus;
+  $("graph-topics").disabled = isOverview;
+  say("graph-note", noteOf(graph));
+  // Colours need no layout.
+  paint(graph);
   redraw = drawing;
   if (drawing) return;
+  const width = Math.max(240, picture.parentElement.clientWidth);
+  const shape = isOverview ? JSON.stringify([graph.spaces, [...folded]]) : JSON.stringify([width, measure(graph) && shapeOf(graph)]);
+  if (shape === drawn) return;
+  if (isOverview) {
+    drawn = shape;
+    keepPlace(() => picture.replaceChildren(tiles(el, graph, folded)));
+    return paint(graph);
+  }
   drawing = true;
-  const graph = measure(select(shownState(), changed, {
-    filter: $("graph-filter").value.trim(),
-    leaves: $("graph-leaves").checked,
-    debug: $("graph-debug").checked,
-  }));
   try {
-    const key = JSON.stringify([isTall(), graph.lines, graph.boxes.map(({ kind, name, ill }) => [kind, name, ill])]);
-    // A tall picture is as narrow as the screen of a phone.
-    const placed = key === last.key ? last.placed : await layOut(graph, isTall() ? 400 : 1240, 600);
-    last = { key, placed };
-    showPicture(draw(graph, placed));
+    const svg = draw(graph, await layOut(graph, width));
+    const isFirst = !picture.querySelector("svg");
+    drawn = shape;
+    keepPlace(() => picture.replaceChildren(svg));
+    // Without trouble a picture begins at its left.
+    const begin = focus ? boxOf(focus) : ".box:is(.dead, .unreachable)";
+    if (focus || isFirst) show(picture.querySelector(begin) ?? leftmost());
   } catch (error) {
-    last = {};
-    whole = null;
-    picture.style.height = "auto";
+    drawn = null;
     if (!redraw) picture.replaceChildren(el("p", { class: "quiet" }, error.message));
   }
   drawing = false;
   if (redraw) showGraph();
+}
+
+function paint(graph) {
+  dress(picture, graph);
+  if (graph.spaces) countIll(picture, graph);
+}
+
+/** The nodes as tiles, by namespace. */
+function overviewOf(nodes, filter) {
+  const boxes = nodes.filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase())).map(({ name, health }) => (
+    { key: `node ${name}`, kind: "node", name, health, changed: changed.has(`node ${name}`) }));
+  const spaces = new Map();
+  for (const [name, space] of namespaces(boxes.map(({ name }) => name))) spaces.set(space, [...(spaces.get(space) ?? []), name]);
+  return { boxes, lines: [], left: [], spaces: [...spaces].sort(([a], [b]) => (a < b ? -1 : 1)) };
+}
+
+function noteOf({ boxes, left }) {
+  if (focus) return `${focus[1]} and its ${plural(Math.max(0, boxes.length - 1), "neighbour")}`;
+  return left.length ? `Without the lines of ${left.join(", ")}, which connect nearly everything.` : "";
+}
+
+const boxOf = ([kind, name]) => `[data-${kind}="${CSS.escape(name)}"]`;
+
+const leftmost = () => stops().reduce((best, next) => (best && best.getBoundingClientRect().left <= next.getBoundingClientRect().left ? best : next), null);
+
+/** Scrolls the picture, but not the page, until `box` is in its middle. */
+function show(box) {
+  if (!box) return;
+  const [a, b] = [box.getBoundingClientRect(), picture.getBoundingClientRect()];
+  picture.scrollBy(a.left - b.left - (b.width - a.width) / 2, a.top - b.top - (b.height - a.height) / 2);
+}
+
+/** Draws such that what has the focus keeps it, and what is chosen stays marked. */
+function keepPlace(work) {
+  const { key, fold, space = fold } = picture.contains(document.activeElement) ? document.activeElement.dataset : {};
+  // A namespace is another box when it has been folded or opened.
+  const same = (box) => (space === undefined ? box.dataset.key === key : (box.dataset.space ?? box.dataset.fold) === space);
+  const isFocused = key !== undefined || space !== undefined;
+  work();
+  const stop = isFocused ? stops().find(same) : null;
+  rove(stop);
+  if (isFocused) (stop ?? stops()[0])?.focus({ preventScroll: true });
+  if (space !== undefined) show(stop);
+  if (chosen) choose(chosen, false);
+}
+
+/** One of the boxes can be reached by Tab; the arrow keys go to the others. */
+const stops = () => [...picture.querySelectorAll("[tabindex]")];
+
+function rove(to) {
+  const all = stops();
+  const next = to ?? all[0];
+  for (const stop of all) stop.tabIndex = stop === next ? 0 : -1;
 }
 
 function selectGraph() {
@@ -430,115 +541,71 @@ function selectGraph() {
   showGraph();
 }
 
-function showPicture({ svg, size, first }) {
-  const isSame = whole?.width === size.width && whole?.height === size.height;
-  whole = { ...size, first };
-  // On a wide screen as high as the graph needs, so that all of it is visible.
-  const needed = Math.ceil(size.height * Math.max(least(), Math.min(1, picture.clientWidth / size.width)));
-  picture.style.height = `${Math.max(160, Math.min(needed, isTall() ? 0.6 * window.innerHeight : 1600))}px`;
-  picture.replaceChildren(svg);
-  if (isSame) show(view);
-  else fit(least());
-  if (chosen) choose(chosen, false);
+/** Shows the neighbourhood of a node or topic, or all nodes again. */
+function setFocus(next) {
+  focus = next;
+  choose(next);
+  selectGraph();
 }
 
-/** The whole picture, but no larger than its own size, and at first no smaller than one can make out. */
-function fit(smallest = 0) {
-  const { clientWidth, clientHeight } = picture;
-  if (!whole || !clientWidth || !clientHeight) return;
-  const scale = Math.max(smallest, Math.min(1, clientWidth / whole.width, clientHeight / whole.height));
-  const width = clientWidth / scale;
-  const height = clientHeight / scale;
-  // A graph that is too large is shown around the box that matters first.
-  const from = (start, length, shown, at) => {
-    if (shown >= length) return start - (shown - length) / 2;
-    return at === undefined ? start : Math.max(start, Math.min(at - shown / 2, start + length - shown));
-  };
-  show({ x: from(whole.x, whole.width, width, whole.first?.x), y: from(whole.y, whole.height, height, whole.first?.y), width, height });
-}
-
-function show(next) {
-  view = next;
-  picture.firstElementChild?.setAttribute("viewBox", `${view.x} ${view.y} ${view.width} ${view.height}`);
-}
-
-/** Zooms such that what is at this place of the picture stays there. */
-function zoom(factor, atX = picture.clientWidth / 2, atY = picture.clientHeight / 2) {
-  if (!view) return;
-  const scale = view.width / picture.clientWidth;
-  const wanted = Math.min(Math.max(scale / factor, 0.2), 40);
-  const change = wanted / scale;
-  show({
-    x: view.x + atX * scale * (1 - change),
-    y: view.y + atY * scale * (1 - change),
-    width: view.width * change,
-    height: view.height * change,
-  });
-}
-
-function pan(dx, dy) {
-  if (!view) return;
-  const scale = view.width / picture.clientWidth;
-  show({ ...view, x: view.x - dx * scale, y: view.y - dy * scale });
-}
-
-const pointers = new Map();
-let travelled = 0;
+let dragged = null;
 
 picture.addEventListener("pointerdown", (event) => {
-  if (pointers.size === 0) travelled = 0;
-  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  // A finger scrolls anyway.
+  dragged = event.pointerType === "mouse" && event.button === 0 ? { x: event.clientX, y: event.clientY, moved: false } : null;
 });
 picture.addEventListener("pointermove", (event) => {
-  const last = pointers.get(event.pointerId);
-  if (!last) return;
-  const [dx, dy] = [event.clientX - last.x, event.clientY - last.y];
-  travelled += Math.abs(dx) + Math.abs(dy);
-  if (travelled > 6 && !picture.hasPointerCapture(event.pointerId)) picture.setPointerCapture(event.pointerId);
-  picture.classList.add("moved");
-  const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
-  if (other) {
-    const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y);
-    const box = picture.getBoundingClientRect();
-    const at = { x: event.clientX, y: event.clientY };
-    zoom(distance(at) / Math.max(1, distance(last)), (at.x + other.x) / 2 - box.left, (at.y + other.y) / 2 - box.top);
-    pan(dx / 2, dy / 2);
-  } else {
-    pan(dx, dy);
-  }
-  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  if (!dragged || !(event.buttons & 1)) return;
+  const [dx, dy] = [event.clientX - dragged.x, event.clientY - dragged.y];
+  if (!dragged.moved && Math.hypot(dx, dy) < 5) return;
+  if (!dragged.moved) picture.setPointerCapture(event.pointerId);
+  dragged = { x: event.clientX, y: event.clientY, moved: true };
+  picture.scrollBy(-dx, -dy);
 });
-for (const name of ["pointerup", "pointercancel"]) {
+picture.addEventListener("click", (event) => {
+  if (dragged?.moved) return;
+  press(event.target.closest?.(".box, .fold"));
+});
+for (const [name, isNear] of [["pointerover", true], ["pointerout", false]]) {
   picture.addEventListener(name, (event) => {
-    pointers.delete(event.pointerId);
-    if (pointers.size === 0) picture.classList.remove("moved");
+    const id = event.target.closest?.(".box")?.dataset.id;
+    for (const line of picture.querySelectorAll(`.line:is([data-from="${id}"], [data-to="${id}"])`)) line.classList.toggle("over", isNear);
   });
 }
-picture.addEventListener("click", (event) => {
-  if (travelled > 6) return;
-  const box = event.target.closest?.(".box");
-  choose(box ? idOf(box) : null);
-});
-// Without a key the wheel scrolls the page, until the picture has been clicked.
-picture.addEventListener("wheel", (event) => {
-  if (!event.ctrlKey && !event.metaKey && !picture.contains(document.activeElement)) return;
-  event.preventDefault();
-  const box = picture.getBoundingClientRect();
-  zoom(Math.exp(-event.deltaY / 400), event.clientX - box.left, event.clientY - box.top);
-}, { passive: false });
-picture.addEventListener("keydown", (event) => {
-  const step = 60;
-  const actions = {
-    "+": () => zoom(1.3), "=": () => zoom(1.3), "-": () => zoom(1 / 1.3), 0: () => fit(),
-    ArrowLeft: () => pan(step, 0), ArrowRight: () => pan(-step, 0), ArrowUp: () => pan(0, step), ArrowDown: () => pan(0, -step),
-    Escape: () => choose(null),
-  };
-  if (event.ctrlKey || event.metaKey || event.altKey || !actions[event.key]) return;
-  event.preventDefault();
-  actions[event.key]();
-});
 
-const idOf = (box) => ("node" in box.dataset ? ["node", box.dataset.node] : ["topic", box.dataset.topic]);
+/** A click on a box or a namespace. */
+function press(box) {
+  if (!box) return choose(null);
+  rove(box);
+  box.focus({ preventScroll: true });
+  const { node, topic, space, fold } = box.dataset;
+  const name = fold ?? space;
+  if (name !== undefined) {
+    folds.set(name, box.getAttribute("aria-expanded") === "true");
+    return selectGraph();
+  }
+  const next = node === undefined ? ["topic", topic] : ["node", node];
+  if ($("graph-overview").checked) setFocus(next);
+  else choose(next);
+}
+
+picture.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const all = stops();
+  const at = all.indexOf(document.activeElement);
+  const to = { ArrowLeft: at - 1, ArrowUp: at - 1, ArrowRight: at + 1, ArrowDown: at + 1, Home: 0, End: all.length - 1 }[event.key];
+  if (at >= 0 && to !== undefined) {
+    event.preventDefault();
+    const next = all[Math.min(Math.max(to, 0), all.length - 1)];
+    rove(next);
+    next.focus();
+  } else if (event.key === "Escape") {
+    choose(null);
+  } else if (at >= 0 && (event.key === "Enter" || event.key === " ")) {
+    event.preventDefault();
+    press(all[at]);
+  }
+});
 
 // ---- details of a node or a topic
 
@@ -547,14 +614,13 @@ let chosen = null;
 
 function choose(next, isNew = true) {
   chosen = next;
-  const svg = picture.querySelector("svg");
   for (const marked of picture.querySelectorAll(".chosen, .near")) marked.classList.remove("chosen", "near");
-  const box = next && [...picture.querySelectorAll(".box")].find((of) => of.dataset[next[0]] === next[1]);
-  svg?.classList.toggle("choice", Boolean(box));
+  const box = next && picture.querySelector(boxOf(next));
+  picture.classList.toggle("choice", Boolean(box?.dataset.id));
   if (box) {
     box.classList.add("chosen");
     const { id } = box.dataset;
-    for (const line of picture.querySelectorAll(".lines path")) {
+    for (const line of id ? picture.querySelectorAll(".line") : []) {
       const { from, to } = line.dataset;
       if (from !== id && to !== id) continue;
       line.classList.add("near");
@@ -564,14 +630,32 @@ function choose(next, isNew = true) {
   if (isNew || next) showDetails();
 }
 
+/** Shows a node or topic that was chosen outside of the graph. */
+function goTo(next) {
+  if (focus || !picture.querySelector(boxOf(next)) || $("graph-overview").checked) setFocus(next);
+  else choose(next);
+  $("graph").scrollIntoView({ block: "start" });
+  show(picture.querySelector(boxOf(next)));
+}
+
 function nameButton(kind, name) {
-  return el("button", { type: "button", class: "name", onclick: () => choose([kind, name]) }, name);
+  return el("button", { type: "button", class: "name", onclick: () => goTo([kind, name]) }, name);
 }
 
 function nameList(title, kind, names) {
   if (!names.length) return [];
   const items = names.map((name) => el("li", {}, kind ? nameButton(kind, name) : name));
   return [el("h4", {}, title), el("ul", {}, ...items)];
+}
+
+/** Topics of a node, each with the nodes at the other end. */
+function topicList(title, names, others) {
+  const items = names.map((name) => {
+    const topic = shownState().topics.find((of) => of.name === name);
+    const [word, nodes] = topic ? others(topic) : ["", []];
+    return el("li", {}, nameButton("topic", name), nodes.length ? el("small", {}, ` ${word} ${nodes.slice(0, 5).join(", ")}${nodes.length > 5 ? ` and ${nodes.length - 5} more` : ""}`) : null);
+  });
+  return items.length ? [el("h4", {}, title), el("ul", {}, ...items)] : [];
 }
 
 function showDetails() {
@@ -582,13 +666,15 @@ function showDetails() {
   const [kind, name] = chosen;
   const found = (kind === "node" ? robot.nodes : robot.topics).find((of) => of.name === name);
   const parts = [el("h3", {}, name)];
+  const isFocus = focus?.[0] === kind && focus[1] === name;
+  if (!isFocus) parts.push(el("button", { type: "button", onclick: () => setFocus(chosen) }, "only its neighbours"));
   if (!found) {
     parts.push(el("p", {}, past ? "It was not registered then." : "It is no longer registered."));
   } else if (kind === "node") {
     parts.push(
       el("p", {}, health(found), found.api ? ` ${found.api}` : "", found.pid ? `, process ${found.pid}` : ""),
-      ...nameList("publishes", "topic", found.publishes),
-      ...nameList("subscribes", "topic", found.subscribes),
+      ...topicList("publishes", found.publishes, (topic) => ["to", topic.subscribers]),
+      ...topicList("subscribes", found.subscribes, (topic) => ["from", topic.publishers]),
       ...nameList("serves", null, found.serves));
   } else {
     parts.push(
@@ -757,13 +843,15 @@ for (const name of tabs) {
 }
 $("list-filter").addEventListener("input", debounced(showList, 150));
 $("graph-filter").addEventListener("input", debounced(selectGraph, 200));
-$("graph-leaves").addEventListener("change", selectGraph);
-$("graph-debug").addEventListener("change", selectGraph);
-$("zoom-in").addEventListener("click", () => zoom(1.4));
-$("zoom-out").addEventListener("click", () => zoom(1 / 1.4));
-$("zoom-all").addEventListener("click", () => fit());
+$("graph-topics").addEventListener("change", selectGraph);
+$("graph-everything").addEventListener("change", selectGraph);
+$("graph-overview").addEventListener("change", () => {
+  overview = $("graph-overview").checked;
+  setFocus(null);
+});
+$("graph-back").addEventListener("click", () => setFocus(null));
 $("details-close").addEventListener("click", () => choose(null));
-new ResizeObserver(() => fit(least())).observe(picture);
+new ResizeObserver(debounced(showGraph, 200)).observe(picture.parentElement);
 
 setInterval(() => {
   countCalls();
@@ -774,7 +862,7 @@ setInterval(() => {
   }
 }, 1000);
 beginTimeLine({
-  el, say, moment, robotTime,
+  el, say, moment, robotTime, happened,
   redraw: () => {
     showGraph();
     showList();

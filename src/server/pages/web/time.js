@@ -1,5 +1,5 @@
 // The time line: the state at an earlier moment, and what differs between two moments. The answers come from
-// `/state.json?at=…&with=…`.
+// `/state.json?at=…&with=…`. Marks show when nodes died and restarted, from `/history.json`, and when the robot was rescued.
 
 const $ = (id) => document.getElementById(id);
 /** Steps of a slider. */
@@ -9,6 +9,11 @@ const PAUSE = 300;
 /** Changes that are listed. */
 const LISTED = 100;
 const SLIDERS = ["at", "with"];
+/** Marks that are closer than this part of the time line become one. */
+const CLOSE = 0.012;
+/** Pause between two readings of the history, in milliseconds. */
+const REST = 3000;
+const LANES = { died: "died", restarted: "restarted", rescued: "rescues" };
 /** What is shown of a moment that the log does not have. */
 const NOTHING = { nodes: [], topics: [], services: [], totals: {}, params: { members: [], more: 0 }, changes: [] };
 
@@ -25,7 +30,10 @@ let tools;
 let reading = false;
 let again = false;
 
-/** Begins with functions of the page. `tools.redraw` is called when `past` or `changed` has another value. */
+/**
+ * Begins with functions of the page. `tools.redraw` is called when `past` or `changed` has another value. `tools.happened` lists
+ * rescues and present deaths as `{ at, what, text }`.
+ */
 export function begin(given) {
   tools = given;
   for (const name of SLIDERS) {
@@ -43,6 +51,17 @@ export function begin(given) {
   $("time-span").addEventListener("change", () => {
     end = 1000 * tools.robotTime();
     place();
+    readHistory();
+  });
+  $("lanes").addEventListener("keydown", (event) => {
+    const marks = [...$("lanes").querySelectorAll(".mark")];
+    const at = marks.indexOf(document.activeElement);
+    const to = { ArrowLeft: at - 1, ArrowUp: at - 1, ArrowRight: at + 1, ArrowDown: at + 1 }[event.key];
+    if (at < 0 || to === undefined) return;
+    event.preventDefault();
+    const next = marks[Math.min(Math.max(to, 0), marks.length - 1)];
+    for (const mark of marks) mark.tabIndex = mark === next ? 0 : -1;
+    next.focus();
   });
   $("time-now").addEventListener("click", () => {
     [chosen.at, chosen.with] = [null, null];
@@ -51,6 +70,93 @@ export function begin(given) {
   });
   place();
   setInterval(() => isLive() && place(), 1000);
+}
+
+/** What happened to nodes since `since`, in seconds since 1970, oldest first. */
+let known = { since: Infinity, nodes: [] };
+/** Until when the history was read. */
+let readUntil = 0;
+let resting = null;
+
+/** Reads what has happened since the last reading, or in the whole span if it is longer now. */
+export async function readHistory() {
+  if (resting) {
+    resting = "again";
+    return;
+  }
+  resting = "reading";
+  const begin = end / 1000 - $("time-span").value;
+  const isMore = begin < known.since - 1;
+  const since = isMore ? begin : readUntil - 2;
+  const until = tools.robotTime();
+  try {
+    const answer = await fetch(`/history.json?since=${new Date(1000 * since).toISOString()}`);
+    if (answer.ok) {
+      const read = await answer.json();
+      const before = isMore ? [] : known.nodes.filter((event) => event.at < read.since);
+      known = { since: isMore ? begin : known.since, nodes: [...before, ...read.nodes] };
+      readUntil = until;
+      showMarks();
+    } else if (answer.status === 503) {
+      resting = "again";
+    }
+  } catch {
+    // The next change of the robot asks again.
+  }
+  setTimeout(() => {
+    const isWanted = resting === "again";
+    resting = null;
+    if (isWanted) readHistory();
+  }, REST);
+}
+
+/** Shows what happened in the span of the time line, one lane for each kind. */
+export function showMarks() {
+  const nodes = known.nodes.map(({ at, node, what }) => ({ at, what, text: `${node} ${what}` }));
+  const all = [...nodes, ...tools.happened()].sort((a, b) => a.at - b.at);
+  const of = (event) => 1 - (end - 1000 * event.at) / span();
+  const drawn = Object.entries(LANES).map(([kind, title]) => {
+    const groups = [];
+    for (const event of all) {
+      const place = of(event);
+      if (event.what !== kind || place < 0 || place > 1) continue;
+      const last = groups.at(-1);
+      if (last && place - last.to < CLOSE) {
+        last.to = place;
+        last.events.push(event);
+      } else {
+        groups.push({ from: place, to: place, events: [event] });
+      }
+    }
+    return { kind, title, groups };
+  });
+  const text = JSON.stringify(drawn.map(({ groups }) => groups.map(({ from, events }) => [Math.round(1000 * from), events])));
+  if (text === $("lanes").dataset.drawn) return;
+  $("lanes").dataset.drawn = text;
+  const hadFocus = $("lanes").contains(document.activeElement) && document.activeElement.dataset.at;
+  $("lanes").replaceChildren(...drawn.map(({ kind, title, groups }) =>
+    tools.el("div", { class: `lane ${kind}` }, tools.el("span", {}, title), tools.el("div", {}, ...groups.map(mark)))));
+  const marks = [...$("lanes").querySelectorAll(".mark")];
+  const kept = marks.find((one) => one.dataset.at === hadFocus);
+  const stop = kept ?? marks.at(-1);
+  if (stop) stop.tabIndex = 0;
+  kept?.focus();
+}
+
+function mark({ from, to, events }) {
+  const words = events.slice(-8).map(({ at, text }) => `${tools.moment(at)} ${text}`);
+  if (events.length > words.length) words.unshift(`${events.length - words.length} more`);
+  const { at } = events.at(-1);
+  const made = tools.el("button", { type: "button", class: "mark", tabindex: -1, title: words.join("\n"), "aria-label": words.join(", "), "data-at": at,
+    onclick: () => {
+      // The state after it, and what it changed.
+      [chosen.at, chosen.with] = [1000 * at + 1000, 1000 * events[0].at - 1000];
+      place();
+      readPast();
+    } });
+  made.style.left = `${100 * from}%`;
+  made.style.width = `max(8px, ${100 * (to - from)}% + 8px)`;
+  return made;
 }
 
 /** Whether both moments are now. */
@@ -74,6 +180,7 @@ function place(dragged) {
     $(`time-${name}`).setAttribute("aria-valuetext", chosen[name] === null ? "now" : tools.moment(at / 1000));
     if (document.activeElement !== $(`clock-${name}`)) $(`clock-${name}`).value = local(at);
   }
+  showMarks();
 }
 
 /** The text of a moment in a field of the type datetime-local. */

@@ -291,6 +291,12 @@ impl<'a> Line<'a> {
     pub fn body(&self) -> &'a [u8] {
         self.body
     }
+
+    /// Whether the record is about a parameter.
+    pub fn is_about_param(&self) -> bool {
+        let body = std::str::from_utf8(self.body);
+        body.is_ok_and(|body| body.contains("Param: ["))
+    }
 }
 
 impl<'a> Framed<'a> {
