@@ -74,6 +74,11 @@ def main():
                 if time.monotonic() > end:
                     sys.exit(f"screenshot.py: {uri} does not show a robot")
                 time.sleep(0.2)
+            # Marks of the last minutes are far enough apart to see.
+            page.value("""document.querySelector('#time-span').value = 600;
+                document.querySelector('#time-span').dispatchEvent(new Event('change'))""")
+            while not page.value("Boolean(document.querySelector('.mark'))"):
+                time.sleep(0.2)
             # On a phone the graph is below the edge of the screen.
             bottom = page.value("document.querySelector('#picture').getBoundingClientRect().bottom + 24")
             clip = {"x": 0, "y": 0, "width": width, "height": max(height, bottom if width < 600 else 0), "scale": 1}

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes docs/page.png: the page of examples/robot after two rescues. Needs everything that the tests need, and pngquant.
+# Makes docs/page.png: the page of examples/robot after two rescues, with a dead node. Needs everything that the tests need, and pngquant.
 #
 #     tests/page/screenshot.sh [FILE]
 
@@ -25,9 +25,19 @@ for recoveries in 2 3; do
     within 60 status last_recovery.health_check_ms || give_up "the nodes were not asked"
 done
 
+step "kill -9 of a lidar's driver"
+node_pid() { # NAME
+    curl -s "${ROS_MASTER_URI%/}/state.json" | /usr/bin/python3 -c '
+import json, sys
+print(next(node["pid"] for node in json.load(sys.stdin)["nodes"] if node["name"] == sys.argv[1]))' "$1"
+}
+is_dead() { status dead_nodes | grep -q "$1"; }
+kill -9 "$(node_pid /lidar/rear/driver)"
+within 60 is_dead /lidar/rear/driver || give_up "nobody noticed"
+
 file=${1:-docs/page.png}
 step "$file"
-/usr/bin/python3 tests/page/screenshot.py "$ROS_MASTER_URI" "$scratch/page.png" 1280 1280 ||
+/usr/bin/python3 tests/page/screenshot.py "$ROS_MASTER_URI" "$scratch/page.png" 1280 1060 ||
     give_up "no picture"
 pngquant --force --output "$file" 64 "$scratch/page.png"
 took "$(stat -c %s "$file") bytes"
