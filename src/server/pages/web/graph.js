@@ -121,6 +121,12 @@ export function select(robot, changed, { filter, focus, topics: withTopics, ever
       }
     }
   }
+  // A topic between the nodes of one namespace is in its frame.
+  for (const [key, at] of places) {
+    if (!key.startsWith("topic ")) continue;
+    const ends = [...lines.values()].filter(({ from, to }) => from === at || to === at).map(({ from, to }) => boxes[from === at ? to : from]);
+    if (ends.length && ends.every(({ space }) => space === ends[0].space)) boxes[at].space = ends[0].space;
+  }
   // A namespace around a single box is only in the way.
   const counts = new Map();
   for (const { space } of boxes) if (space) counts.set(space, (counts.get(space) ?? 0) + 1);
@@ -142,7 +148,8 @@ function label(name) {
 export function measure(graph) {
   ruler.font = FONT;
   for (const box of graph.boxes) {
-    const name = box.group >= 0 ? box.name.slice(box.space.length + 1) : box.name;
+    const isInside = box.group >= 0 && box.name.startsWith(`${box.space}/`);
+    const name = isInside ? box.name.slice(box.space.length + 1) : box.name;
     box.label = box.kind === "space" ? `▸ ${label(name)} (${box.nodes.size})` : label(name);
     // Ill nodes have bold letters.
     [box.width, box.height] = [ruler.measureText(box.label).width * 1.06 + 18, box.kind === "topic" ? 22 : 28];
