@@ -226,6 +226,7 @@ impl Ledger {
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
+            origin.note_in(&mut inner.mirror, answered.call);
             if !answered.agrees(&outcome, index < last_write) {
                 if !is_inexact {
                     self.stats.divergences.count();
@@ -417,10 +418,10 @@ impl Ledger {
         let entries: Vec<RecordContent> =
             records.iter().map(|record| record.entry.clone()).collect();
         for entry in &entries {
-            if let RecordContent::Call { call, .. } = entry {
-                inner
-                    .mirror
-                    .apply_telling(&Request::from(call.clone()), &mut ());
+            if let RecordContent::Call { call, label, .. } = entry {
+                let call = Request::from(call.clone());
+                inner.mirror.apply_telling(&call, &mut ());
+                label.origin.note_in(&mut inner.mirror, &call);
                 inner.version += 1;
             }
         }

@@ -7,6 +7,7 @@ mod identify;
 pub(crate) mod liveness;
 pub(crate) mod local;
 pub(crate) mod notifications;
+pub(crate) mod origin;
 mod removed;
 pub(crate) mod served;
 mod visits;
@@ -124,12 +125,14 @@ impl Nodes {
         self.alone.store(alone, Ordering::Relaxed);
     }
 
-    /// Whether the node at `port` may be notified. A computer that is cut off does not notify nodes of other computers,
+    /// Whether the node at `port` may be notified. At a loopback address of another computer's node, a stranger would get
+    /// the notification. A computer that is cut off does not notify nodes of other computers,
     /// because the leader notifies those nodes.
     pub(super) async fn may_tell(&self, port: &str) -> bool {
-        !self.alone.load(Ordering::Relaxed)
+        let may_tell = !self.alone.load(Ordering::Relaxed)
             || self.served.has(port)
-            || !resolver::is_elsewhere(port, self.timeout).await
+            || !resolver::is_elsewhere(port, self.timeout).await;
+        may_tell && self.leads_to_node(port).await
     }
 
     fn lock(&self) -> MutexGuard<'_, Unreachable> {
@@ -166,7 +169,11 @@ impl Nodes {
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes();
-            let nodes = nodes.filter(|(_, api)| unreachable.contains(port_of(api)));
+            let nodes = nodes.filter(|(name, api)| {
+                let from = mirror.registered_from(name);
+                unreachable.contains(port_of(api))
+                    && self.local.reach(port_of(api), from).answer_counts()
+            });
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
         names.sort();

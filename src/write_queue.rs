@@ -21,6 +21,7 @@ use tokio::{
 use self::batch::{CallAnswer, Item, Precondition};
 pub(crate) use self::{drain::Drain, evict::MoveJudge};
 use crate::{
+    checkpoint::format::Origin,
     cluster::merge::wire::{self, Ask},
     gate,
     ledger::Ledger,
@@ -63,10 +64,10 @@ impl WriteQueue {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes the writes in `ask`, which another computer answered while it was cut off. Leaves out those that conflict
-    /// with changes by other computers. `None` if there is no answer.
-    pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::MergeAnswer> {
-        let (item, answered, judged) = merge::item(ask);
+    /// Makes the writes in `ask`, which the computer `origin` answered while it was cut off. Leaves out those that
+    /// conflict with changes by other computers. `None` if there is no answer.
+    pub(crate) async fn merge(&self, ask: Ask, origin: Origin) -> Option<wire::MergeAnswer> {
+        let (item, answered, judged) = merge::item(ask, origin);
         self.items.send(item).await.ok()?;
         let reply = match answered.await.ok()?.0 {
             CallAnswer::Made(reply) => reply,

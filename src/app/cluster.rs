@@ -9,6 +9,7 @@ mod trouble;
 
 use std::{
     collections::VecDeque,
+    net::IpAddr,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -25,7 +26,7 @@ use self::{facts::Known, kept::Kept, trouble::Trouble};
 use super::{RunError, context::MasterDuties, life};
 use crate::{
     checkpoint::{
-        format::Checkpoint,
+        format::{Checkpoint, Origin},
         session::{self, Decision, RestorePolicy, SessionEvidence},
     },
     cluster::{
@@ -48,7 +49,7 @@ use crate::{
     process::ProcessError,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
-    server::others::{Forwarded, Handover, Shown},
+    server::others::{self, Forwarded, Handover, Shown},
     status::cluster::MemberFacts,
     task::boxed,
     upstream::{Head, peer::Peers},
@@ -281,10 +282,11 @@ impl ClusterDriver {
             Action::KeepNothing => self.kept.remove(&context.checkpoint).await,
             Action::Merge { number, ask, to } => {
                 let (peers, queue) = (self.peers.clone(), context.write_queue.clone());
+                let own = others::own_address(&self.member.settings().uri);
                 let answer = None;
                 let otherwise = Input::Merged { number, answer };
                 self.spawn(otherwise, async move {
-                    let answer = merge(ask, to, peers, queue).await;
+                    let answer = merge(ask, to, peers, queue, own).await;
                     Input::Merged { number, answer }
                 });
             }
@@ -552,9 +554,10 @@ async fn merge(
     to: Option<(String, u64)>,
     peers: Arc<Peers>,
     queue: WriteQueue,
+    own: IpAddr,
 ) -> Option<wire::MergeAnswer> {
     let Some((uri, term)) = to else {
-        return queue.merge(ask).await;
+        return queue.merge(ask, Origin::At(own)).await;
     };
     let uri = MasterUri::parse(&uri).ok()?;
     let leader = peers.at(&uri);

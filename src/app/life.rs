@@ -1,13 +1,20 @@
 //! Checks whether nodes of a recorded session are still alive.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::{
+    collections::BTreeSet,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use tokio::task::JoinSet;
 
 use crate::{
-    health::port_of,
+    health::{Reach, port_of},
     master::{self, Master},
-    nodes::client::{self, Reaction},
+    nodes::{
+        client::{self, Reaction},
+        origin,
+    },
     resolver,
 };
 
@@ -21,11 +28,15 @@ const LIFE_SIGN: Duration = Duration::from_secs(3);
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     let call = master::get_pid();
     let mut questions = JoinSet::new();
-    let ports: BTreeSet<_> = state.nodes().map(|(_, api)| port_of(api)).collect();
-    for port in ports {
+    let nodes = state.nodes();
+    let ports: BTreeSet<_> = nodes
+        .map(|(name, api)| (port_of(api), state.registered_from(name)))
+        .collect();
+    for (port, from) in ports {
         let (api, call) = (port.to_owned(), call.clone());
         questions.spawn(async move {
             (same_boot || resolver::is_elsewhere(&api, LIFE_SIGN).await)
+                && answer_counts(&api, from).await
                 && client::ask(&api, &call, LIFE_SIGN).await == Reaction::Alive
         });
     }
@@ -35,4 +46,14 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
         }
     }
     false
+}
+
+/// Whether an answer from `api` may be that of a node which has registered from the computer `from`.
+async fn answer_counts(api: &str, from: Option<IpAddr>) -> bool {
+    let at = match from {
+        Some(_) => origin::addresses(api, LIFE_SIGN).await,
+        None => None,
+    };
+    let at: Vec<_> = at.iter().flatten().map(SocketAddr::ip).collect();
+    Reach::of(from, &at, resolver::is_own).answer_counts()
 }

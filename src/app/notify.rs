@@ -73,6 +73,7 @@ impl Context {
         let situation = Situation {
             feuds: self.nodes.local.feuds(),
             lost_addresses: self.nodes.lost_addresses(),
+            misaddressed: self.nodes.local.misaddressed(),
             gate: self.gate.state(),
             gate_since: self.gate.since().into_std(),
             unprotected: self.ledger.unprotected(),

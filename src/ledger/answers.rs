@@ -164,6 +164,7 @@ impl Ledger {
         let changes = inner.mirror.would_change(call);
         let before = call.ends_early().then(|| inner.mirror.clone());
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
+        origin.note_in(&mut inner.mirror, call);
         let mut writes: Vec<&Request> = match reply {
             // The answer cannot be encoded, so it does not show which writes were accepted. All count as accepted,
             // because a master refuses a refused write again.

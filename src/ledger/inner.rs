@@ -138,7 +138,8 @@ impl Inner {
         }
         let (python, old) = (self.mirror.python(), self.mirror.is_old());
         // An equal `state` replaces the mirror too, because the new one may be known more exactly.
-        self.mirror = state;
+        let before = std::mem::replace(&mut self.mirror, state);
+        self.mirror.keep_origins(&before);
         self.mirror.set_python(python);
         self.mirror.set_old(old);
         if differs {

@@ -14,7 +14,7 @@ use rustix::{
 };
 use tokio::net::unix::pipe::Receiver;
 
-use super::{Nodes, liveness::addresses_here, notifications};
+use super::{Nodes, notifications, origin};
 use crate::{clock, health::port_of, limit::rarely, resolver, status::summary::LostAddress, wait};
 
 /// When to look after a change. A route or a Wi-Fi connection may come a little later than the address.
@@ -152,8 +152,8 @@ impl Nodes {
 async fn look(nodes: &Arc<Nodes>) {
     for port in nodes.local.lost_ports() {
         // The name may have another address by now.
-        if let Some(here) = addresses_here(&port, nodes.timeout).await {
-            nodes.local.set_here(&port, here);
+        if let Some(addresses) = origin::addresses(&port, nodes.timeout).await {
+            nodes.local.set_addresses(&port, addresses);
         }
     }
     let changes = nodes.local.look_at_addresses(resolver::is_own);

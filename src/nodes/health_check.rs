@@ -24,7 +24,7 @@ use tracing::Instrument;
 use crate::{
     gate::State,
     health::{
-        IdentityVerdict, Reconciliation, Refusal, RegisteredName, Registration, judge,
+        IdentityVerdict, Reach, Reconciliation, Refusal, RegisteredName, Registration, judge,
         judge_refusal, port_of,
     },
     ledger::activity::LastCalls,
@@ -163,7 +163,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
             tokio::time::sleep(SECOND_QUESTION).await;
         }
         let admitted = nodes.visits.admit(port, nodes.timeout).await;
-        let asked = Asked::all(nodes, port);
+        let asked = Asked::all(nodes, port, &nodes.reaches(port).await);
         if asked.is_empty() {
             nodes.clear(port);
             break;
@@ -194,7 +194,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
                     Refusal::Dead => outcome.removed = remove_all(nodes, asked).await,
                     _ => {}
                 }
-                if outcome.removed.is_empty() {
+                if outcome.removed.len() < outcome.names.len() {
                     tracing::debug!(names = ?outcome.names, "a port refuses connections; its nodes stay registered");
                     nodes.mark_unreachable(port, in_check);
                 } else {
@@ -252,6 +252,8 @@ struct Asked {
     api: String,
     names: Vec<RegisteredName>,
     unregistered: Vec<u64>,
+    /// Names about which a refused connection proves nothing.
+    doubtful: BTreeSet<String>,
 }
 
 /// What a node's answers mean for the names at its address.
@@ -262,11 +264,16 @@ struct Findings {
 }
 
 impl Asked {
-    /// The names registered at this port, for each address that has it.
-    fn all(nodes: &Nodes, port: &str) -> Vec<Self> {
+    /// The names registered at this port, for each address that has it. `reaches` says what the address proves about
+    /// each name. Names about which it proves nothing at all are left out.
+    fn all(nodes: &Nodes, port: &str, reaches: &BTreeMap<String, Reach>) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
             let mut all = BTreeMap::<_, Self>::new();
             for (node, api) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
+                let reach = reaches.get(node);
+                let Some(reach) = reach.filter(|reach| reach.answer_counts()) else {
+                    continue;
+                };
                 let pid = activity.pid_of(node, api);
                 let last_calls = activity.last_calls(node);
                 let asked = all.entry(api).or_insert_with(|| Self {
@@ -280,6 +287,9 @@ impl Asked {
                     registered: last_calls.registered,
                 });
                 asked.unregistered.push(last_calls.unregistered);
+                if !reach.refusal_proves(pid.is_some()) {
+                    asked.doubtful.insert(node.to_owned());
+                }
             }
             all.into_values().collect()
         })
@@ -457,11 +467,15 @@ fn is_done(reply: &Reply) -> bool {
     replies.iter().any(master::is_success)
 }
 
-/// Unregisters all nodes of `asked`, because their port refuses connections. Returns the unregistered names.
+/// Unregisters the nodes of `asked`, because their port refuses connections, except those about which that proves
+/// nothing. Returns the unregistered names.
 async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     let mut removals = JoinSet::new();
     for asked in asked {
-        for (node, before) in asked.calls() {
+        let dead = asked
+            .calls()
+            .filter(|(node, _)| !asked.doubtful.contains(node));
+        for (node, before) in dead {
             let (nodes, api) = (nodes.clone(), asked.api.clone());
             removals.spawn(async move {
                 let same = |last_calls| last_calls == before && nodes.gate.is_open();

@@ -75,8 +75,12 @@ async fn identify(nodes: Arc<Nodes>, port: String) {
         let admitted = nodes.visits.admit(&port, nodes.timeout).await;
         // This includes names that were added meanwhile.
         let names = nodes.new.lock().get_mut(&port).map(std::mem::take);
+        let mut names = names.unwrap_or_default();
+        let reaches = nodes.reaches(&port).await;
+        names.retain(|name| reaches.get(&name.node).is_some_and(|of| of.answer_counts()));
         // The health check asks unreachable nodes again.
-        let answer = match admitted.is_some() && !nodes.is_unreachable(&port) {
+        let asks = admitted.is_some() && !names.is_empty() && !nodes.is_unreachable(&port);
+        let answer = match asks {
             true => {
                 client::ask_for(&port, &master::get_pid(), nodes.timeout)
                     .await
@@ -88,7 +92,7 @@ async fn identify(nodes: Arc<Nodes>, port: String) {
             continue;
         };
         nodes.ledger.with_activity(|_, activity| {
-            for name in names.into_iter().flatten() {
+            for name in names {
                 activity.remember_pid(&name.node, &name.api, name.registered, pid);
             }
         });

@@ -10,13 +10,14 @@ use std::{
 
 use tokio::{
     sync::Semaphore,
-    time::{MissedTickBehavior, interval, timeout},
+    time::{MissedTickBehavior, interval},
 };
 
 use super::{
     Nodes,
     client::{self, Reaction},
     local::{self, Listening},
+    origin,
 };
 use crate::{
     gate::State,
@@ -25,7 +26,6 @@ use crate::{
     master,
     replay::Token,
     resolver,
-    ros_env::MasterUri,
     upstream::sockets,
 };
 
@@ -85,17 +85,22 @@ impl Nodes {
         let now = Instant::now();
         // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
-        let nodes: Vec<_> = self.ledger.with_mirror(|mirror| {
+        let nodes: Vec<_> = self.ledger.with_activity(|mirror, activity| {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-            nodes
-                .map(|(name, api)| (name.to_owned(), port_of(api).to_owned()))
-                .collect()
+            let nodes = nodes.map(|(name, api)| {
+                let answered = activity.pid_of(name, api).is_some();
+                let from = mirror.registered_from(name);
+                (name.to_owned(), port_of(api).to_owned(), from, answered)
+            });
+            nodes.collect()
         });
         let known = self.liveness.lock();
-        let lives = nodes.into_iter().map(|(name, port)| {
+        let lives = nodes.into_iter().map(|(name, port, from, answered)| {
             let seen = known.liveness.seen(&port);
             let evidence = self.local.evidence(&name);
-            let health = Health::of(seen, unreachable.contains(&port), now).with(evidence);
+            let reach = self.local.reach(&port, from);
+            let health = Health::of(seen, unreachable.contains(&port), now);
+            let health = health.as_proved(reach, answered).with(evidence);
             let noted = known.since.get(&name).filter(|(noted, _)| *noted == health);
             let life = Life {
                 process: self.local.process(&name, &port),
@@ -184,28 +189,37 @@ fn is_among(addresses: &[SocketAddr], listening: &Listening) -> bool {
 async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
     // The semaphore is never closed.
     let permit = nodes.liveness.permits.acquire().await;
-    let here = addresses_here(&port, nodes.timeout).await;
-    let sign = match &here {
+    let addresses = origin::addresses(&port, nodes.timeout).await;
+    if let Some(addresses) = &addresses {
+        nodes.local.set_addresses(&port, addresses.clone());
+        nodes.local.registered.notify_one();
+    }
+    let mut reaches = nodes.reaches(&port).await;
+    reaches.retain(|_, reach| reach.answer_counts());
+    let sign = match &addresses {
         None => None,
-        Some(here) if is_among(here, &listening) => Some(Reaction::Alive),
+        // Whoever listens there is none of them.
+        Some(_) if reaches.is_empty() => None,
+        Some(at) if is_among(&own(at), &listening) => Some(Reaction::Alive),
         Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {
             Some(_admitted) => Some(client::ask(&port, &master::get_pid(), nodes.timeout).await),
             None => None,
         },
     };
     drop(permit);
-    if let Some(here) = here {
-        nodes.local.set_here(&port, here);
-        nodes.local.registered.notify_one();
-    }
     let mut known = nodes.liveness.lock();
     let has_died = known.liveness.answered(&port, sign, Instant::now());
     drop(known);
     // Nothing is logged while the mirror stands in: the health check afterwards reports dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
-        let names: Vec<_> = nodes.ledger.with_mirror(|mirror| {
+        let names: Vec<_> = nodes.ledger.with_activity(|mirror, activity| {
             let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
-            nodes.map(|(name, _)| name.to_owned()).collect()
+            let dead = nodes.filter(|(name, api)| {
+                let answered = activity.pid_of(name, api).is_some();
+                let reach = reaches.get(*name);
+                reach.is_some_and(|reach| reach.refusal_proves(answered))
+            });
+            dead.map(|(name, _)| name.to_owned()).collect()
         });
         // The log has named those that the kernel proves dead.
         let is_new = |name: &&String| !matches!(nodes.local.evidence(name), Evidence::Ended(_));
@@ -221,21 +235,19 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
     }
 }
 
-/// The addresses of `api` that belong to this computer. `None` if it has no address within `limit`.
-pub(super) async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
-    let MasterUri { host, port } = MasterUri::parse(api).ok()?;
-    let found = timeout(limit, resolver::addresses(&host, port)).await;
-    let mut found = found.ok()?.ok()?;
-    for address in &mut found {
-        address.set_ip(address.ip().to_canonical());
-    }
-    found.retain(|address| resolver::is_own(address.ip()));
-    Some(found)
+/// Those of `addresses` that belong to this computer.
+pub(super) fn own(addresses: &[SocketAddr]) -> Vec<SocketAddr> {
+    let own = addresses.iter().filter(|at| resolver::is_own(at.ip()));
+    own.copied().collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
+        Some(own(&origin::addresses(api, limit).await?))
+    }
 
     #[tokio::test]
     async fn the_table_of_sockets_tells_who_listens_on_this_computer() {

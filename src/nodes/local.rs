@@ -10,18 +10,23 @@ use std::{
 
 use tokio::sync::Notify;
 
-use super::{Nodes, health_check};
+use super::{
+    Nodes, health_check, liveness,
+    origin::{Misaddressed, say_misaddressed},
+};
 use crate::{
+    checkpoint::format::Origin,
     clock,
     health::{
         AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
-        Reap, Registrants, first_taking, port_of,
+        Reach, Reap, Registrants, first_taking, port_of,
     },
     ledger::{Ledger, activity::LastCalls},
     limit::rarely,
     master::{Master, Request},
     process::listeners,
     replay::Token,
+    resolver,
     status::stats::Stats,
     upstream::sockets,
     write_queue::MoveJudge,
@@ -43,8 +48,12 @@ pub(crate) struct LocalNodes {
 
 #[derive(Debug, Default)]
 struct Known {
-    /// For each port of a node on this computer, the addresses at which the node may listen.
+    /// For each port of a node, the addresses to which it led when it was last looked up.
+    at: BTreeMap<String, Vec<IpAddr>>,
+    /// For each port that leads to this computer, the addresses at which a node may listen.
     here: BTreeMap<String, Vec<SocketAddr>>,
+    /// Nodes of other computers that are registered under an address of this one, and that nobody can reach there.
+    misaddressed: BTreeMap<String, Misaddressed>,
     registrants: Registrants,
     evidence: BTreeMap<String, Evidence>,
     /// Dead nodes that were reported or unregistered, each with the number of its last registration.
@@ -61,6 +70,8 @@ pub(super) struct Named {
     registered: u64,
     /// The process id that the node has answered since its last registration.
     said: Option<i32>,
+    /// The computer from which the node has registered; `None` for this one.
+    from: Option<IpAddr>,
 }
 
 /// All registered names, without rosrescue's own.
@@ -72,6 +83,7 @@ pub(super) fn names(ledger: &Ledger) -> Vec<Named> {
             api: api.to_owned(),
             port: port_of(api).to_owned(),
             registered: activity.last_calls(node).registered,
+            from: mirror.registered_from(node),
             said: match activity.pid_of(node, api) {
                 Some((pid, false)) => Some(pid),
                 // An answer from before the last registration may be another process's.
@@ -97,17 +109,31 @@ impl LocalNodes {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes the addresses of this computer at which the node at `port` may listen. Empty for a node of another
-    /// computer.
-    pub(super) fn set_here(&self, port: &str, addresses: Vec<SocketAddr>) {
+    /// Notes the addresses to which `port` leads.
+    pub(super) fn set_addresses(&self, port: &str, addresses: Vec<SocketAddr>) {
+        let here = liveness::own(&addresses);
+        let at = addresses.iter().map(SocketAddr::ip).collect();
         let mut known = self.lock();
-        known
-            .addresses
-            .set(port, addresses.iter().map(SocketAddr::ip));
-        match addresses.is_empty() {
+        known.at.insert(port.to_owned(), at);
+        known.addresses.set(port, here.iter().map(SocketAddr::ip));
+        match here.is_empty() {
             true => known.here.remove(port),
-            false => known.here.insert(port.to_owned(), addresses),
+            false => known.here.insert(port.to_owned(), here),
         };
+    }
+
+    /// What the address with this `port` proves about a node that has registered from the computer `from`; `None` for
+    /// this one.
+    pub(super) fn reach(&self, port: &str, from: Option<IpAddr>) -> Reach {
+        match from {
+            None => Reach::Certain,
+            Some(_) => self.lock().reach(port, from),
+        }
+    }
+
+    /// Nodes of other computers that are registered under an address that leads to whoever uses it.
+    pub(crate) fn misaddressed(&self) -> Vec<Misaddressed> {
+        self.lock().misaddressed.values().cloned().collect()
     }
 
     /// Looks at all nodes, with `listening` as the socket table, which must be read after `names`. Returns whether a
@@ -126,6 +152,9 @@ impl LocalNodes {
         }
         let registered: BTreeSet<_> = names.iter().map(|name| name.port.as_str()).collect();
         known
+            .at
+            .retain(|port, _| registered.contains(port.as_str()));
+        known
             .here
             .retain(|port, _| registered.contains(port.as_str()));
         known.addresses.retain(|port| registered.contains(port));
@@ -133,8 +162,21 @@ impl LocalNodes {
         let sockets: BTreeMap<_, _> = here
             .map(|(port, addresses)| (port.as_str(), accepting(listening, addresses)))
             .collect();
-        let local: Vec<_> = names.iter().map(Named::local).collect();
+        // The sockets at the address of a node that is elsewhere are not the node's.
+        let (local, foreign): (Vec<&Named>, Vec<_>) = names
+            .iter()
+            .partition(|name| known.reach(&name.port, name.from).answer_counts());
         let at = |port| sockets.get(port).map(Vec::as_slice);
+        let misaddressed = foreign
+            .iter()
+            .filter_map(|name| known.misaddressed(name, at(name.port.as_str())));
+        let misaddressed: BTreeMap<_, _> = misaddressed.map(|it| (it.node.clone(), it)).collect();
+        let new = misaddressed.values();
+        let new = new.filter(|it| known.misaddressed.get(&it.node) != Some(it));
+        say_misaddressed(&new.cloned().collect::<Vec<_>>());
+        known.misaddressed = misaddressed;
+        let names = local;
+        let local: Vec<_> = names.iter().map(|name| name.local()).collect();
         if proves {
             known.registrants.look(&local, at);
         }
@@ -212,13 +254,18 @@ impl LocalNodes {
         process.map(|process| process.pid)
     }
 
-    /// What the kernel shows about `node` at `port` now.
-    fn evidence_now(&self, node: &str, port: &str) -> Evidence {
+    /// What the kernel shows now about the node at the old address.
+    fn evidence_now(&self, moving: &Moving) -> Evidence {
+        let (node, port) = (moving.node.as_str(), port_of(&moving.from));
         let known = &mut *self.lock();
         let Some(addresses) = known.here.get(port) else {
             return Evidence::Unknown;
         };
         let sockets = accepting(&sockets::listening(), addresses);
+        let reach = known.reach(port, moving.computer);
+        if let Some(evidence) = Moving::evidence_elsewhere(reach, !sockets.is_empty()) {
+            return evidence;
+        }
         let ended = listeners::has_ended;
         known
             .registrants
@@ -257,23 +304,51 @@ impl LocalNodes {
     }
 }
 
+impl Known {
+    fn reach(&self, port: &str, from: Option<IpAddr>) -> Reach {
+        let at = self.at.get(port).map_or(&[][..], Vec::as_slice);
+        Reach::of(from, at, resolver::is_own)
+    }
+
+    /// The facts about `name`, if nobody can reach the node at its address. `sockets` listen there. A container's port
+    /// may be forwarded from an address of this computer.
+    fn misaddressed(&self, name: &Named, sockets: Option<&[u64]>) -> Option<Misaddressed> {
+        let from = name.from?;
+        let is_forwarded = sockets.is_some_and(|sockets| !sockets.is_empty());
+        let reaches_nobody = match self.reach(&name.port, name.from) {
+            Reach::Elsewhere { loopback } => loopback || !is_forwarded,
+            Reach::Certain | Reach::Doubtful => false,
+        };
+        reaches_nobody.then(|| Misaddressed {
+            node: name.node.clone(),
+            api: name.api.clone(),
+            from,
+        })
+    }
+}
+
 impl MoveJudge for LocalNodes {
     fn reaps_all(&self) -> bool {
         self.reap == Reap::All
     }
 
-    fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
-        let moving = calls.iter().position(|call| Moving::is_any(mirror, call));
+    fn first_apart(&self, mirror: &Master, calls: &[(&Request, Origin)]) -> Option<usize> {
+        let mut moves = calls.iter();
+        let moving = moves.position(|(call, _)| Moving::is_any(mirror, call));
+        let calls = calls.iter();
+        let calls = calls.map(|(call, origin)| (*call, origin.other_computer()));
         let taking = match self.reaps_all() {
-            true => first_taking(mirror, calls.iter().copied()),
+            true => first_taking(mirror, calls),
             false => None,
         };
         moving.into_iter().chain(taking).min()
     }
 
-    fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
+    fn judge(&self, ledger: &Ledger, call: &Request, origin: Origin) -> Option<Option<Eviction>> {
+        let from = origin.other_computer();
         let (moving, taking) = ledger.with_mirror(|mirror| {
-            let taking = self.reaps_all().then(|| Eviction::before(mirror, call));
+            let taking = self.reaps_all();
+            let taking = taking.then(|| Eviction::before(mirror, call, from));
             (Moving::by(mirror, call), taking.flatten())
         });
         if moving.is_empty() && taking.is_none() {
@@ -282,7 +357,7 @@ impl MoveJudge for LocalNodes {
         let taken = taking.map(|taking| taking.nodes).unwrap_or_default();
         let mut gone: BTreeSet<_> = taken.into_iter().collect();
         for moving in moving {
-            let evidence = self.evidence_now(&moving.node, port_of(&moving.from));
+            let evidence = self.evidence_now(&moving);
             self.note_feud(&moving, evidence);
             let hits_another = moving.hits_another(evidence);
             if moving.is_unregistered_first(self.reap, evidence) {

@@ -190,6 +190,10 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             if is_taken(&nodes, &displaced.api) {
                 return;
             }
+            let reach = nodes.reach(port_of(&displaced.api), displaced.from).await;
+            if !reach.answer_counts() {
+                return;
+            }
             // The permit is held until the node has been told.
             let Some(_admitted) = nodes
                 .visits

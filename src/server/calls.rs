@@ -1,7 +1,7 @@
 //! Answers calls, from the master or from the mirror.
 
 use std::{
-    net::{IpAddr, SocketAddr},
+    net::{IpAddr, Ipv4Addr, SocketAddr},
     pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
@@ -31,6 +31,7 @@ use crate::{
     ledger::{Ledger, delivery::Delivery},
     limit::rarely,
     master::{Kind, Master, Method, Request},
+    resolver,
     status::stats::Stats,
     upstream::{Head, pool::Pool},
     write_queue::{
@@ -116,9 +117,12 @@ pub(super) struct Incoming {
 }
 
 impl Incoming {
-    /// A call from `source`, made at the address `caller`.
-    pub(super) fn of(source: Source, caller: IpAddr) -> Self {
-        let origin = Origin::At(caller.to_canonical());
+    /// A call from `source`, made at the address `caller`. `own` is the address that stands for this computer.
+    pub(super) fn of(source: Source, caller: IpAddr, own: IpAddr) -> Self {
+        let caller = caller.to_canonical();
+        // This computer may lose the address later, and its nodes are still its own.
+        let is_here = resolver::is_own(caller);
+        let origin = Origin::At(if is_here { own } else { caller });
         Self { source, origin }
     }
 }
@@ -159,7 +163,8 @@ impl Calls {
         }
         match &self.others {
             None => {
-                let incoming = Incoming::of(Source::Here, peer.ip());
+                let own = IpAddr::V4(Ipv4Addr::LOCALHOST);
+                let incoming = Incoming::of(Source::Here, peer.ip(), own);
                 Ok(self.answer_here(head, body, call, incoming).await?)
             }
             Some(others) => others.answer(self, peer, head, body, call).await,

@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    net::{IpAddr, SocketAddr},
+    net::{IpAddr, Ipv4Addr, SocketAddr},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -20,9 +20,11 @@ mod forwarded;
 pub(crate) use self::forwarded::Forwarded;
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
+    listener,
     replies::{HttpReply, UntilWritten, forwarded, text, xml},
 };
 use crate::{
+    checkpoint::format::Origin,
     cluster::{
         journal::RECORD_BYTES_MAX,
         merge::wire::Ask,
@@ -243,7 +245,7 @@ impl Others {
                 return Ok(not_leading(term));
             }
             if let (Some(term), Some(ask)) = (asked_term, call.merges()) {
-                let merged = self.merge(call.calls, ask).await;
+                let merged = self.merge(call.calls, ask, Origin::At(call.from)).await;
                 return Ok(merged.unwrap_or_else(|| not_leading(term)));
             }
             let mut by_mirror = false;
@@ -268,7 +270,7 @@ impl Others {
                         Some(_) => Source::Forwarded,
                         None => Source::Here,
                     };
-                    let incoming = Incoming::of(source, call.from);
+                    let incoming = Incoming::of(source, call.from, own_address(&calls.uri));
                     let answered = tokio::select! {
                         biased;
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
@@ -358,12 +360,12 @@ impl Others {
     }
 
     /// Makes the writes of a computer that was cut off. `None` if this computer no longer leads.
-    async fn merge(&self, calls: &Calls, ask: Ask) -> Option<HttpReply> {
+    async fn merge(&self, calls: &Calls, ask: Ask, origin: Origin) -> Option<HttpReply> {
         let mut standing = self.standing.clone();
         tokio::select! {
             biased;
             _ = standing.wait_for(|now| *now == Standing::Alone) => None,
-            answer = calls.write_queue.merge(ask) => Some(xml(&answer?.to_reply())),
+            answer = calls.write_queue.merge(ask, origin) => Some(xml(&answer?.to_reply())),
         }
     }
 
@@ -376,6 +378,15 @@ impl Others {
                 .unwrap_or_else(|_| Err("rosrescue is stopping".to_owned())),
         )
     }
+}
+
+/// The address that stands for this computer in the robot's journal, which other computers read. `uri` is its advertised
+/// address.
+pub(crate) fn own_address(uri: &str) -> IpAddr {
+    let advertised = MasterUri::parse(uri).ok();
+    let advertised = advertised.and_then(|uri| uri.host.parse().ok());
+    let local = || listener::local_address().unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
+    advertised.unwrap_or_else(local)
 }
 
 /// The answer to a handover request.

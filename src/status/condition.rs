@@ -2,7 +2,7 @@
 
 mod computers;
 
-use std::time::Instant;
+use std::{collections::BTreeMap, net::IpAddr, time::Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +10,7 @@ use super::{
     Facts, Guarded, Mode,
     summary::{LostAddress, some},
 };
-use crate::{clock, gate::State, health::Feud};
+use crate::{clock, gate::State, health::Feud, nodes::origin::Misaddressed};
 
 /// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -132,6 +132,8 @@ pub(crate) struct Situation {
     pub(crate) feuds: Vec<Feud>,
     /// Addresses that this computer has lost, and at which nodes are registered.
     pub(crate) lost_addresses: Vec<LostAddress>,
+    /// Nodes that no computer but their own can reach.
+    pub(crate) misaddressed: Vec<Misaddressed>,
 }
 
 /// Derives the condition from the situation and the facts.
@@ -221,6 +223,19 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
             )
         });
     }
+    for (from, nodes) in by_computer(&now.misaddressed) {
+        let addresses: Vec<_> = nodes
+            .iter()
+            .map(|it| format!("{} as {}", it.node, it.api))
+            .collect();
+        text += &format!(
+            " No other computer can reach nodes of {from}, and they cannot be checked from here: they have registered under an address that means each computer itself ({}).",
+            some(&addresses)
+        );
+        action.get_or_insert_with(|| {
+            format!("run `export ROS_IP={from}` on {from}, and restart these nodes there.")
+        });
+    }
     if !now.feuds.is_empty() {
         let names: Vec<_> = now.feuds.iter().map(ToString::to_string).collect();
         text += &format!(
@@ -237,6 +252,15 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         text,
         action,
     }
+}
+
+/// Groups nodes by the computer from which they have registered.
+fn by_computer(nodes: &[Misaddressed]) -> BTreeMap<IpAddr, Vec<&Misaddressed>> {
+    let mut computers = BTreeMap::<_, Vec<_>>::new();
+    for node in nodes {
+        computers.entry(node.from).or_default().push(node);
+    }
+    computers
 }
 
 fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
@@ -297,6 +321,7 @@ mod tests {
             unprotected: unprotected.map(str::to_owned),
             feuds: Vec::new(),
             lost_addresses: Vec::new(),
+            misaddressed: Vec::new(),
             master: "http://robot:11312/".to_owned(),
         };
         condition(&situation, facts)
@@ -365,6 +390,34 @@ mod tests {
         assert!(condition.text.contains(said), "{condition:?}");
         assert!(!condition.text.contains("Every change is recorded"));
         assert!(condition.action.unwrap().contains("ROS_MASTER_URI"));
+    }
+
+    #[test]
+    fn nodes_that_no_other_computer_can_reach_are_named_with_the_command_that_helps() {
+        let facts = Facts::new(Mode::Core);
+        let node = |node: &str| Misaddressed {
+            node: node.to_owned(),
+            api: "http://localhost:4001/".to_owned(),
+            from: [10, 0, 0, 9].into(),
+        };
+        let situation = Situation {
+            gate: OPEN,
+            gate_since: facts.started,
+            unprotected: None,
+            master: "http://robot:11312/".to_owned(),
+            feuds: Vec::new(),
+            lost_addresses: Vec::new(),
+            misaddressed: vec![node("/joy"), node("/teleop")],
+        };
+        let condition = condition(&situation, &facts);
+        assert!(!condition.is_good(), "{condition:?}");
+        for part in [
+            "nodes of 10.0.0.9",
+            "/joy as http://localhost:4001/, /teleop",
+        ] {
+            assert!(condition.text.contains(part), "{condition:?}");
+        }
+        assert!(condition.action.unwrap().contains("export ROS_IP=10.0.0.9"));
     }
 
     #[test]

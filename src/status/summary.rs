@@ -9,6 +9,7 @@ use crate::{
     clock,
     health::{Feud, Health},
     master::Counts,
+    nodes::origin::Misaddressed,
 };
 
 /// Version of the format. It changes when a field is removed or changes its meaning, not when a
@@ -75,6 +76,10 @@ pub(crate) struct NodesStatus {
     /// Addresses that this computer has lost, and at which nodes are registered.
     #[serde(default)]
     pub(crate) lost_addresses: Vec<LostAddress>,
+    /// Nodes of other computers that no computer but their own can reach, because they have registered under an address
+    /// such as `localhost`.
+    #[serde(default)]
+    pub(crate) misaddressed_nodes: Vec<Misaddressed>,
 }
 
 /// An address that this computer has lost.

@@ -6,6 +6,7 @@ use std::{sync::Arc, time::Instant};
 
 use super::batch::{CallAnswer, Item};
 use crate::{
+    checkpoint::format::Origin,
     health::Eviction,
     ledger::Ledger,
     master::{Master, Request},
@@ -19,13 +20,18 @@ pub(crate) trait MoveJudge: Send + Sync {
     }
 
     /// The index of the first of `calls` that must be judged and sent alone.
-    fn first_apart(&self, _mirror: &Master, _calls: &[&Request]) -> Option<usize> {
+    fn first_apart(&self, _mirror: &Master, _calls: &[(&Request, Origin)]) -> Option<usize> {
         None
     }
 
     /// Judges a call. `None` if it moves no name and takes no port. Otherwise the eviction that must precede the call,
     /// if there is one.
-    fn judge(&self, _ledger: &Ledger, _call: &Request) -> Option<Option<Eviction>> {
+    fn judge(
+        &self,
+        _ledger: &Ledger,
+        _call: &Request,
+        _origin: Origin,
+    ) -> Option<Option<Eviction>> {
         None
     }
 
@@ -38,8 +44,9 @@ pub(crate) trait MoveJudge: Send + Sync {
 impl MoveJudge for () {}
 
 /// Unregisters the nodes whose port `call` takes, while the mirror answers in a master's place.
-pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
-    let eviction = ledger.with_mirror(|mirror| Eviction::before(mirror, call));
+pub(super) fn while_standing_in(ledger: &Ledger, call: &Request, origin: Origin) {
+    let from = origin.other_computer();
+    let eviction = ledger.with_mirror(|mirror| Eviction::before(mirror, call, from));
     if let Some(eviction) = eviction
         && ledger.stand_in(Instant::now(), &eviction.call).is_some()
     {

@@ -46,13 +46,16 @@ pub(crate) struct Merge {
     judged: Judged,
 }
 
-/// Makes an item for the write queue. Also returns the receiver of its answer, and a handle that shows which of its
+/// Makes an item for the write queue. `origin` is the computer that was cut off. Also returns the receiver of its answer, and a handle that shows which of its
 /// writes conflict with changes by other computers.
-pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Judged) {
+pub(super) fn item(
+    ask: Ask,
+    origin: Origin,
+) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Judged) {
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
     item.source = Source::Merge(ask.id.clone());
-    item.origin = Origin::Unknown;
+    item.origin = origin;
     set_call(&mut item, multicall(&ask.calls));
     item.merge = Some(Merge {
         ask,

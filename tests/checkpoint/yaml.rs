@@ -75,6 +75,7 @@ fn with_params(params: Struct) -> Checkpoint {
                     SnapshotNode {
                         api: "no".to_owned(),
                         taken_over_services: ids(&["/s", "on"]),
+                        from: Some([10, 0, 0, 7].into()),
                     },
                 ),
             ]),
@@ -99,12 +100,14 @@ fn with_params(params: Struct) -> Checkpoint {
                 api: "http://h:9/".to_owned(),
                 pid: Some(7),
                 topics: ids(&["/t", "yes"]),
+                from: Some([10, 0, 0, 7].into()),
             },
             Displaced {
                 node: "/c".to_owned(),
                 api: "http://h:8/".to_owned(),
                 pid: None,
                 topics: Vec::new(),
+                from: None,
             },
         ],
         follows: false,

@@ -61,6 +61,7 @@ mod master {
 mod recovery {
     mod addresses;
     mod dhcp;
+    mod elsewhere;
     mod health_check;
     mod host_names;
     mod injection;

@@ -11,6 +11,7 @@ mod kernel;
 mod liveness;
 mod moves;
 mod mutant;
+mod origin;
 mod rates;
 mod repeats;
 #[cfg(test)]
@@ -23,6 +24,7 @@ pub use feuds::{Feud, Feuds};
 pub use kernel::{Death, Evidence, LocalName, Owner, Process, Registrants};
 pub use liveness::{Health, Liveness};
 pub use moves::{Moving, Reap};
+pub use origin::Reach;
 pub use rates::Rates;
 pub use repeats::Repeats;
 pub use taken_port::{Eviction, first_taking};

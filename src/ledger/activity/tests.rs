@@ -105,6 +105,7 @@ fn who_is_displaced_is_known_with_what_it_did() {
         api: "http://n:1/".to_owned(),
         pid: Some(7),
         topics: vec!["/t".to_owned()],
+        from: None,
     };
     for again in [again.clone(), Request::multicall([again])] {
         let mut noticed = Noticed::new(false);
@@ -127,6 +128,7 @@ fn who_was_displaced_by_the_journal_is_told_unless_the_name_is_its_own_again() {
         api: api.to_owned(),
         pid: None,
         topics: vec!["/t".to_owned()],
+        from: None,
     };
     let taken = at("/a", "http://n:2/");
     let displaced = [

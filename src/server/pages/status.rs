@@ -78,6 +78,7 @@ impl Pages {
             master: master.clone(),
             feuds: self.nodes.local.feuds(),
             lost_addresses: self.nodes.lost_addresses(),
+            misaddressed: self.nodes.local.misaddressed(),
         };
         let rescues = facts.reports.iter().filter(|report| report.is_rescue());
         let last = (facts.recoveries > 0)
@@ -148,6 +149,7 @@ impl Pages {
             node_health: ill.collect(),
             feuds: situation.feuds,
             lost_addresses: situation.lost_addresses,
+            misaddressed_nodes: situation.misaddressed,
         }
     }
 

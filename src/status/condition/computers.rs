@@ -176,6 +176,7 @@ mod tests {
         let situation = Situation {
             feuds: Vec::new(),
             lost_addresses: Vec::new(),
+            misaddressed: Vec::new(),
             gate,
             gate_since: facts.started,
             unprotected: None,

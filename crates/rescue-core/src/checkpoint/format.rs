@@ -22,7 +22,7 @@ use std::ops::Range;
 
 use thiserror::Error;
 
-use crate::master::{Displaced, Snapshot};
+use crate::master::{Displaced, Master, Request, Snapshot};
 use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
@@ -91,6 +91,22 @@ pub enum Origin {
 impl Origin {
     /// The origin whose records name none, because most calls come from this computer.
     const COMMON: Self = Self::At(IpAddr::V4(Ipv4Addr::LOCALHOST));
+
+    /// The other computer from which the call came. `None` for this one, and if it is unknown.
+    pub fn other_computer(self) -> Option<IpAddr> {
+        match self {
+            Self::At(address) => Some(address).filter(|address| !address.is_loopback()),
+            Self::Unknown | Self::Rosrescue => None,
+        }
+    }
+
+    /// Notes in `state` from where the nodes of `call`, which has been applied, have registered. What rosrescue
+    /// registers for a node does not tell.
+    pub fn note_in(self, state: &mut Master, call: &Request) {
+        if let Self::At(_) = self {
+            state.note_origin(call, self.other_computer());
+        }
+    }
 }
 
 /// The content of a record.

@@ -125,13 +125,14 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
             RecordContent::Call {
                 call,
                 pending: waits,
-                ..
+                label,
             } => {
                 let request = Request::from(call);
                 let calls = request.calls().into_iter();
                 let taken = calls.filter_map(|call| rebuilt.mirror.displaced_by(call));
                 displaced.extend(taken.map(|it| (it.api.clone(), it)));
                 rebuilt.mirror.apply_telling(&request, &mut ());
+                label.origin.note_in(&mut rebuilt.mirror, &request);
                 if let Some(session) = &mut rebuilt.session {
                     session.cluster_seq += 1;
                 }

@@ -61,10 +61,11 @@ impl Journal {
     /// Applies `records` to the journal's state. They follow the last record that was applied.
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
-            if let JournalEntry::Call { call, .. } = &record.entry {
+            if let JournalEntry::Call { call, label, .. } = &record.entry {
                 let request = Request::from(call.clone());
                 self.displaced.note(now, &self.state, &request);
                 self.state.apply_telling(&request, &mut ());
+                label.origin.note_in(&mut self.state, &request);
             }
         }
     }

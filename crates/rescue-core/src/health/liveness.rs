@@ -8,7 +8,7 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use super::{Evidence, Reaction};
+use super::{Evidence, Reach, Reaction};
 
 /// Pause before a node is asked again. It is shorter if the socket table shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
@@ -127,6 +127,16 @@ impl Health {
             Some(Reaction::Alive) => Self::Alive,
             Some(Reaction::Silent) => Self::Unreachable,
             None => Self::Unchecked,
+        }
+    }
+
+    /// This health of a node's port, as far as the address proves something about the node. `answered` says whether the
+    /// node has ever answered there.
+    pub fn as_proved(self, reach: Reach, answered: bool) -> Self {
+        match self {
+            _ if !reach.answer_counts() => Self::Unchecked,
+            Self::Dead if !reach.refusal_proves(answered) => Self::Unreachable,
+            health => health,
         }
     }
 

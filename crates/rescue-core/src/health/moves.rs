@@ -1,7 +1,9 @@
 //! A name that moves: another program registers it, at another address. A master then tells the node at the old address
 //! to shut down. By now an innocent node may listen there (ros_comm issue 2241).
 
-use super::{Evidence, mutant::WrongRule, port_of};
+use std::net::IpAddr;
+
+use super::{Evidence, Reach, mutant::WrongRule, port_of};
 use crate::{
     master::{Master, Request, Write},
     replay::Token,
@@ -27,6 +29,8 @@ pub struct Moving {
     pub to: String,
     /// Other names at the port of `from`.
     pub others: Vec<String>,
+    /// The computer from which the node at `from` has registered; `None` for this one.
+    pub computer: Option<IpAddr>,
 }
 
 impl Moving {
@@ -49,14 +53,20 @@ impl Moving {
             if is_known || is_refused || stays || Token::is_ours(node) {
                 continue;
             }
+            // The same address given by another computer may lead to another port.
+            let same_port = |other: &str, api: &str| {
+                port_of(api) == port_of(from)
+                    && mirror.registered_from(other) == mirror.registered_from(node)
+            };
             let others = mirror.nodes().filter(|(other, api)| {
-                *other != node && port_of(api) == port_of(from) && !Token::is_ours(other)
+                *other != node && same_port(other, api) && !Token::is_ours(other)
             });
             all.push(Self {
                 node: node.to_owned(),
                 from: from.to_owned(),
                 to: to.to_owned(),
                 others: others.map(|(other, _)| other.to_owned()).collect(),
+                computer: mirror.registered_from(node),
             });
         }
         all
@@ -68,6 +78,15 @@ impl Moving {
         names.any(|(node, to)| {
             let from = mirror.api_of(node);
             from.is_some_and(|from| port_of(from) != port_of(to) && !Token::is_ours(node))
+        })
+    }
+
+    /// What the kernel shows about the node at the old address if that is a loopback address, and the node is on another
+    /// computer. `None` otherwise. `listens` says whether a process of this computer listens there.
+    pub fn evidence_elsewhere(reach: Reach, listens: bool) -> Option<Evidence> {
+        (!reach.may_be_told()).then_some(match listens {
+            true => Evidence::Replaced,
+            false => Evidence::Unknown,
         })
     }
 
@@ -127,6 +146,7 @@ mod tests {
             from: "http://h:1/".to_owned(),
             to: "http://h:2/".to_owned(),
             others: others.iter().map(|other| (*other).to_owned()).collect(),
+            computer: None,
         };
         let alone = moving(&[]);
         let first = |moving: &Moving, evidence| {

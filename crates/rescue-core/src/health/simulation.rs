@@ -3,11 +3,12 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    net::IpAddr,
     time::Instant,
 };
 
 use super::{
-    Death, Eviction, Evidence, LocalName, Moving, Owner, Process, Reap, Registrants,
+    Death, Eviction, Evidence, LocalName, Moving, Owner, Process, Reach, Reap, Registrants,
     mutant::WrongRule, port_of,
 };
 use crate::{
@@ -30,7 +31,8 @@ enum Place {
     OwnPids,
     /// In a container whose port another program forwards, which may be started again.
     Forwarded,
-    /// In a container with a network of its own, under an address that means this computer elsewhere.
+    /// On another computer, or in a container with a network of its own, under an address that means this computer here,
+    /// such as `localhost`.
     OtherNetwork,
     /// The process belongs to another user.
     Hidden,
@@ -128,6 +130,26 @@ impl World {
 
     fn api(program: &Program) -> String {
         format!("http://{}:{}/", Self::host(program), program.port)
+    }
+
+    /// The computer from which a program registers; `None` for this one.
+    fn from(program: &Program) -> Option<IpAddr> {
+        match program.place {
+            Place::OtherNetwork => Some([10, 0, 0, 9].into()),
+            Place::Elsewhere => Some([10, 0, 0, 8].into()),
+            _ => None,
+        }
+    }
+
+    /// What the address of a registered name proves.
+    fn reach(&self, name: &str) -> Reach {
+        let from = self.mirror.registered_from(name);
+        let api = self.mirror.api_of(name).unwrap_or_default();
+        let at: IpAddr = match api.contains("here") {
+            true => [127, 0, 0, 1].into(),
+            false => [10, 0, 0, 8].into(),
+        };
+        Reach::of(from, &[at], |address| address.is_loopback())
     }
 
     /// A random program that fits.
@@ -248,10 +270,11 @@ impl World {
     fn register(&mut self, index: usize) {
         let name = format!("/n{}", self.dice.below(NAMES));
         let api = Self::api(&self.programs[index]);
+        let from = Self::from(&self.programs[index]);
         let params = [name.as_str(), "/t", "x/Y", api.as_str()];
         let call = Request::new(Method::RegisterPublisher, params);
         let taking = match self.reap {
-            Reap::All => Eviction::before(&self.mirror, &call),
+            Reap::All => Eviction::before(&self.mirror, &call, from),
             _ => None,
         };
         let taken = taking.map_or(Vec::new(), |taking| taking.nodes);
@@ -270,6 +293,7 @@ impl World {
             self.mirror.apply(&eviction.call);
         }
         self.mirror.apply(&call);
+        self.mirror.note_origin(&call, from);
         self.registrations += 1;
         self.registered.insert(name.clone(), self.registrations);
         self.clashes.retain(|(clashing, _)| *clashing != name);
@@ -288,10 +312,12 @@ impl World {
         for name in taken {
             let holder = self.holder[name];
             let program = &self.programs[holder];
-            // Documented: a program with several names loses the earlier ones. Nor can an address that leads to two
-            // networks tell their programs apart.
-            let far = |place| matches!(place, Place::OtherNetwork | Place::Forwarded);
-            let excused = holder == index || far(program.place) || far(self.programs[index].place);
+            // Documented: a program with several names loses the earlier ones. Nor can an address that is forwarded to a
+            // container, or two containers behind one address, tell their programs apart.
+            let places = [program.place, self.programs[index].place];
+            let excused = holder == index
+                || places.contains(&Place::Forwarded)
+                || places == [Place::OtherNetwork; 2];
             let lives = program.runs && !program.closed;
             assert!(
                 !lives || excused,
@@ -316,15 +342,9 @@ impl World {
             }
             return;
         }
-        // Nothing shows what listens on another computer, in another network, or behind a forwarded port, before it
-        // registers.
+        // Nothing shows what listens on another computer, or behind a forwarded port, before it registers.
         let holder = was.map(|was| self.programs[was].place);
-        let is_hidden = |place| {
-            matches!(
-                place,
-                Place::Elsewhere | Place::Forwarded | Place::OtherNetwork
-            )
-        };
+        let is_hidden = |place| matches!(place, Place::Elsewhere | Place::Forwarded);
         let excused = program.names.is_empty() && holder.is_some_and(is_hidden);
         assert!(excused, "an innocent node is shut down: {moving:?}");
         self.counts.unproved += 1;
@@ -377,6 +397,9 @@ impl World {
         let Some(api) = self.mirror.api_of(name) else {
             return;
         };
+        if !self.reach(name).answer_counts() {
+            return;
+        }
         if let Some(listener) = self.listener(api) {
             let said = (self.registered[name], self.programs[listener].own_pid);
             self.said.insert(name.to_owned(), said);
@@ -388,6 +411,7 @@ impl World {
     /// The port of `api` refuses connections. Anything may happen until its nodes are unregistered.
     fn refused(&mut self, api: String) {
         let nodes = self.mirror.nodes().filter(|(_, at)| *at == api);
+        let nodes = nodes.filter(|(name, _)| self.reach(name).answer_counts());
         let asked: Vec<_> = nodes
             .map(|(name, _)| (name.to_owned(), self.registered[name]))
             .collect();
@@ -399,8 +423,8 @@ impl World {
                 continue;
             }
             let holder = &mut self.programs[self.holder[&name]];
-            // A forwarder may be started again. In another network, the node listens elsewhere.
-            let far = matches!(holder.place, Place::OtherNetwork | Place::Forwarded);
+            // A forwarder may be started again.
+            let far = holder.place == Place::Forwarded;
             let lives = holder.runs && !holder.closed;
             assert!(
                 !lives || far,
@@ -481,9 +505,9 @@ impl World {
             true => self.dice.below(9),
             false => u64::MAX,
         };
-        let names: Vec<_> = self
-            .mirror
-            .nodes()
+        let names = self.mirror.nodes();
+        let names = names.filter(|(name, _)| self.reach(name).answer_counts());
+        let names: Vec<_> = names
             .map(|(name, api)| (name.to_owned(), api.to_owned()))
             .collect();
         let registered = self.registered.clone();
@@ -569,6 +593,10 @@ impl World {
         let Some(sockets) = table.get(port_of(api)) else {
             return Evidence::Unknown;
         };
+        let elsewhere = Moving::evidence_elsewhere(self.reach(name), !sockets.is_empty());
+        if let Some(evidence) = elsewhere {
+            return evidence;
+        }
         let (running, started) = (&self.running, &self.started);
         let ended = |process: Process| {
             !running.contains(&process.pid) || started[&process.pid] != process.started
@@ -585,9 +613,10 @@ impl World {
             return;
         }
         let holder = &self.programs[self.holder[name]];
-        // A program that never registers may listen at the port of a node of another network.
+        // A program that never registers may listen at a port that is forwarded later.
         let clash = (name.to_owned(), death.process);
-        let is_elsewhere = matches!(holder.place, Place::OtherNetwork | Place::Forwarded);
+        let is_program = self.programs.iter().any(|it| it.process == death.process);
+        let is_elsewhere = holder.place == Place::Forwarded && is_program;
         let excused = is_elsewhere && !self.clashes.contains(&clash);
         assert!(
             !holder.runs || excused,

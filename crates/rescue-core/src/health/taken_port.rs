@@ -1,10 +1,11 @@
 //! Finds nodes that are gone because another node now uses their port. One process listens at a port, so when a node
-//! registers with a port, all other nodes registered there are gone.
+//! registers with a port, all other nodes registered there are gone. That does not hold for nodes that have registered
+//! from different computers, because the same address may lead to a different port on each, as `localhost` does.
 //!
 //! A master does not know that these nodes are gone. When the old node starts again at another port, the master sends a
 //! `shutdown` to the old address, where an innocent node listens now (ros_comm issue 2241).
 
-use std::collections::HashMap;
+use std::{collections::HashMap, net::IpAddr};
 
 use super::port_of;
 use crate::{
@@ -12,21 +13,25 @@ use crate::{
     replay::Token,
 };
 
+/// A port, and the computer from which it was registered; `None` for this one.
+type Port<'a> = (&'a str, Option<IpAddr>);
+
 /// The nodes registered at each port.
-struct Holders<'a>(HashMap<&'a str, Vec<&'a str>>);
+struct Holders<'a>(HashMap<Port<'a>, Vec<&'a str>>);
 
 impl<'a> Holders<'a> {
     fn new(mirror: &'a Master) -> Self {
         let mut holders = Self(HashMap::new());
         for (node, api) in mirror.nodes().filter(|(node, _)| !Token::is_ours(node)) {
-            holders.0.entry(port_of(api)).or_default().push(node);
+            let port = (port_of(api), mirror.registered_from(node));
+            holders.0.entry(port).or_default().push(node);
         }
         holders
     }
 
     /// The nodes that lose their ports to `registrants`, the names and ports that one call registers. Names that one
     /// call registers at one port belong to one process, so they do not displace each other.
-    fn displaced(&self, registrants: &[(&str, &str)]) -> Vec<&'a str> {
+    fn displaced(&self, registrants: &[(&'a str, Port<'a>)]) -> Vec<&'a str> {
         let ports = registrants.iter();
         let holders = ports.flat_map(|(_, port)| self.0.get(port).map_or(&[][..], Vec::as_slice));
         let mut displaced: Vec<_> = holders
@@ -40,20 +45,21 @@ impl<'a> Holders<'a> {
 }
 
 /// The nodes for which `call` or one of its entries registers something, with their ports.
-fn registrants(call: &Request) -> Vec<(&str, &str)> {
+fn registrants(call: &Request, from: Option<IpAddr>) -> Vec<(&str, Port<'_>)> {
     let registrants = Write::all(call).filter_map(|write| write.registrant());
     registrants
-        .map(|(node, api)| (node, port_of(api)))
+        .map(|(node, api)| (node, (port_of(api), from)))
         .collect()
 }
 
-/// The index of the first of `calls` that takes a port from a node of `mirror`, or from a node of an earlier call.
+/// The index of the first of `calls` that takes a port from a node of `mirror`, or from a node of an earlier call. Each
+/// call is given with the computer from which it came; `None` for this one.
 pub fn first_taking<'a>(
     mirror: &'a Master,
-    calls: impl Iterator<Item = &'a Request>,
+    calls: impl Iterator<Item = (&'a Request, Option<IpAddr>)>,
 ) -> Option<usize> {
     let mut holders = None;
-    let mut calls = calls.map(registrants);
+    let mut calls = calls.map(|(call, from)| registrants(call, from));
     calls.position(|registrants| {
         if registrants.is_empty() {
             return false;
@@ -76,13 +82,14 @@ pub struct Eviction {
 
 impl Eviction {
     /// The eviction that must precede `call`, because `call` takes ports from nodes of `mirror`. `None` if `call` takes
-    /// no port. A registration that the master would refuse takes no port.
-    pub fn before(mirror: &Master, call: &Request) -> Option<Self> {
-        first_taking(mirror, std::iter::once(call))?;
+    /// no port. A registration that the master would refuse takes no port. `from` is the computer from which the call
+    /// came; `None` for this one.
+    pub fn before(mirror: &Master, call: &Request, from: Option<IpAddr>) -> Option<Self> {
+        first_taking(mirror, std::iter::once((call, from)))?;
         let mut after = mirror.clone();
         after.apply_telling(call, &mut ());
-        let mut registrants = registrants(call);
-        registrants.retain(|(node, port)| after.api_of(node).map(port_of) == Some(port));
+        let mut registrants = registrants(call, from);
+        registrants.retain(|(node, (port, _))| after.api_of(node).map(port_of) == Some(port));
         let nodes = Holders::new(mirror).displaced(&registrants);
         Self::of(mirror, nodes.into_iter().map(str::to_owned))
     }
@@ -142,12 +149,12 @@ mod tests {
             subscribe,
             Request::multicall([inner]),
         ] {
-            let eviction = Eviction::before(&mirror, &call).unwrap();
+            let eviction = Eviction::before(&mirror, &call, None).unwrap();
             assert_eq!(eviction.nodes, ["/old"]);
             let mut mirror = mirror.clone();
             mirror.apply(&eviction.call);
             assert_eq!(mirror.api_of("/old"), None);
-            assert_eq!(Eviction::before(&mirror, &call), None);
+            assert_eq!(Eviction::before(&mirror, &call, None), None);
         }
     }
 
@@ -172,7 +179,7 @@ mod tests {
                 publish("/new", "/t", "http://h:1/"),
             ]),
         ] {
-            assert_eq!(Eviction::before(&mirror, &call), None, "{call:?}");
+            assert_eq!(Eviction::before(&mirror, &call, None), None, "{call:?}");
         }
     }
 
@@ -192,7 +199,7 @@ mod tests {
         ]);
         let before = master([offer("/heir", "/s", 21)]).snapshot().services;
         let call = publish("/new", "/t", "http://h:10/");
-        let eviction = Eviction::before(&mirror, &call).unwrap();
+        let eviction = Eviction::before(&mirror, &call, None).unwrap();
         let applied = mirror.apply(&eviction.call);
         assert_eq!(mirror.api_of("/old"), None);
         assert_eq!(mirror.snapshot().services, before);
@@ -204,7 +211,8 @@ mod tests {
     #[test]
     fn a_batch_ends_before_a_call_that_takes_a_port() {
         let mirror = master([publish("/old", "/t", "http://h:1/")]);
-        let first = |calls: &[Request]| first_taking(&mirror, calls.iter());
+        let first =
+            |calls: &[Request]| first_taking(&mirror, calls.iter().map(|call| (call, None)));
         let [one, two] = ["/one", "/two"].map(|node| publish(node, "/t", "http://h:2/"));
         let old = publish("/new", "/t", "http://h:1/");
         assert_eq!(first(&[one.clone(), one.clone(), old]), Some(2));

@@ -240,7 +240,7 @@ impl Inspection {
             if let Some(api) = address(Method::LookupNode, caller_id, previous.api_of(caller_id))? {
                 let node = SnapshotNode {
                     api,
-                    taken_over_services: Vec::new(),
+                    ..SnapshotNode::default()
                 };
                 found.nodes.insert(caller_id.to_owned(), node);
             }

@@ -1,5 +1,7 @@
 //! Publishers, subscribers and services, as in `rosmaster/registrations.py`.
 
+use std::net::IpAddr;
+
 use indexmap::{IndexMap, IndexSet};
 
 use super::snapshot::ServiceEntry;
@@ -16,10 +18,12 @@ pub(crate) enum SharedRegistration {
 }
 
 /// A reference to a node. rosmaster drops it when the node has no registration left.
-#[derive(Clone, Default, PartialEq)]
+#[derive(Clone, Default)]
 pub struct Node {
     /// The address of the node's slave API.
     pub api: String,
+    /// See [`Master::registered_from`](super::Master::registered_from). Ignored when two nodes are compared.
+    pub from: Option<IpAddr>,
     /// The topics that the node publishes.
     pub publications: IndexSet<String>,
     /// The topics to which the node subscribes.
@@ -28,6 +32,16 @@ pub struct Node {
     pub param_subscriptions: IndexSet<String>,
     /// Services that this node has registered, including those that another node has taken over since.
     pub services: IndexSet<String>,
+}
+
+impl PartialEq for Node {
+    fn eq(&self, other: &Self) -> bool {
+        self.api == other.api
+            && self.publications == other.publications
+            && self.subscriptions == other.subscriptions
+            && self.param_subscriptions == other.param_subscriptions
+            && self.services == other.services
+    }
 }
 
 impl Node {

@@ -1,5 +1,7 @@
 //! The whole state of a master as plain data, as it is stored in a checkpoint.
 
+use std::net::IpAddr;
+
 use indexmap::IndexMap;
 
 use crate::xmlrpc::Struct;
@@ -56,6 +58,8 @@ pub struct SnapshotNode {
     /// Services that this node registered and another node has taken over since. The master keeps them forever, so
     /// `lookupNode` still finds the node.
     pub taken_over_services: Vec<String>,
+    /// See [`Master::registered_from`](super::Master::registered_from).
+    pub from: Option<IpAddr>,
 }
 
 /// The provider of a service.

@@ -1,6 +1,6 @@
 //! The state of the model, and its conversion from and to a [`Snapshot`].
 
-use std::fmt;
+use std::{fmt, net::IpAddr};
 
 use indexmap::IndexMap;
 use serde::{Deserialize, Serialize};
@@ -11,6 +11,7 @@ use super::params::Params;
 use super::registry::{Node, Registry, SharedRegistration};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
+use super::write::Write;
 use super::{Method, Request, names};
 use crate::xmlrpc::{Python, Reply, Struct, Value};
 
@@ -198,6 +199,33 @@ impl Master {
         Some(self.registry.nodes.get(caller_id)?.api.as_str())
     }
 
+    /// The address of the other computer from which a node has made its last registration. `None` for this computer, and
+    /// if it is unknown. A master does not know it: see [`Self::note_origin`]. Ignored when two masters are compared.
+    pub fn registered_from(&self, caller_id: &str) -> Option<IpAddr> {
+        self.registry.nodes.get(caller_id)?.from
+    }
+
+    /// Notes that `call`, which has been applied, came from the computer `from`; `None` for this one.
+    pub fn note_origin(&mut self, call: &Request, from: Option<IpAddr>) {
+        for (caller_id, api) in Write::all(call).filter_map(|write| write.registrant()) {
+            let node = self.registry.nodes.get_mut(caller_id);
+            if let Some(node) = node.filter(|node| node.api == api) {
+                node.from = from;
+            }
+        }
+    }
+
+    /// Notes for each node that `known` has at the same address where that one has registered from. For a state that was
+    /// read from a master.
+    pub fn keep_origins(&mut self, known: &Self) {
+        for (caller_id, node) in &mut self.registry.nodes {
+            let known = known.registry.nodes.get(caller_id);
+            if let Some(known) = known.filter(|known| known.api == node.api) {
+                node.from = node.from.or(known.from);
+            }
+        }
+    }
+
     /// Addresses of the publishers of a topic, in order.
     pub fn publishers_of(&self, topic: &str) -> Vec<String> {
         self.registry.apis(SharedRegistration::Publishers, topic)
@@ -321,6 +349,7 @@ impl Master {
             let node = SnapshotNode {
                 api: node.api.clone(),
                 taken_over_services,
+                from: node.from,
             };
             (caller_id.clone(), node)
         });
@@ -367,6 +396,7 @@ impl Master {
             let node = Node {
                 api: node.api,
                 services: node.taken_over_services.into_iter().collect(),
+                from: node.from,
                 ..Node::default()
             };
             nodes.insert(caller_id, node);

@@ -1,6 +1,6 @@
 //! Builds the notifications that a master would send for its present state.
 
-use std::sync::Arc;
+use std::{net::IpAddr, sync::Arc};
 
 use super::registry::SharedRegistration;
 use super::{CALLER_ID, Master, Method, Request, Write, names, returnable};
@@ -24,6 +24,8 @@ pub struct Displaced {
     pub pid: Option<i32>,
     /// The topics that the node published and subscribed to.
     pub topics: Vec<String>,
+    /// See [`Master::registered_from`].
+    pub from: Option<IpAddr>,
 }
 
 impl Master {
@@ -120,6 +122,7 @@ impl Master {
             node: node.to_owned(),
             api: held.to_owned(),
             pid: None,
+            from: self.registered_from(node),
         })
     }
 
@@ -231,6 +234,7 @@ mod tests {
             api: "http://p:1/".to_owned(),
             pid: None,
             topics: vec!["/t".to_owned()],
+            from: None,
         });
         assert!(!master.is_held_elsewhere("/p", "http://p:1/"));
         assert!(master.is_held_elsewhere("/p", "http://p:2/"));

@@ -1,5 +1,7 @@
 //! Defines the YAML document of a checkpoint: which value is under which key.
 
+use std::net::IpAddr;
+
 use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
@@ -38,6 +40,9 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         if !node.taken_over_services.is_empty() {
             out.extend_from_slice(b"    taken_over_services: ");
             names(out, &node.taken_over_services);
+        }
+        if let Some(from) = node.from {
+            text_line(out, "    from: ", &from.to_string());
         }
     });
     section_of_lines(out, "topic_types", &snapshot.topic_types, |out, kind| {
@@ -203,6 +208,11 @@ fn read_label(entry: &Struct) -> Label {
     Label { at, origin }
 }
 
+/// The address of the computer from which a node has registered.
+fn read_address(node: &Struct) -> Option<IpAddr> {
+    node.get("from")?.as_str()?.parse().ok()
+}
+
 /// How a record names rosrescue as its caller.
 const ROSRESCUE: &str = "rosrescue";
 
@@ -298,6 +308,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
                     Some(ids) => texts(ids)?,
                     None => Vec::new(),
                 },
+                from: read_address(&node),
             })
         })?,
         topic_types: entries(document, "topic_types", string)?,
@@ -350,6 +361,9 @@ fn displaced_value(node: &Displaced) -> Value {
     if let Some(pid) = node.pid {
         members.insert("pid".to_owned(), pid.into());
     }
+    if let Some(from) = node.from {
+        members.insert("from".to_owned(), from.to_string().as_str().into());
+    }
     Value::Struct(members)
 }
 
@@ -358,6 +372,7 @@ fn read_displaced(value: Value) -> Option<Displaced> {
     let mut node = structure(value)?;
     Some(Displaced {
         pid: node.get("pid").and_then(Value::as_int),
+        from: read_address(&node),
         topics: texts(node.shift_remove("topics")?)?,
         node: text(&mut node, "node").ok()?,
         api: text(&mut node, "api").ok()?,
