@@ -71,9 +71,7 @@ pub(super) fn start(
 impl Context {
     fn line(&self) -> String {
         let situation = Situation {
-            feuds: self.nodes.local.feuds(),
-            lost_addresses: self.nodes.lost_addresses(),
-            misaddressed: self.nodes.local.misaddressed(),
+            nodes: self.nodes.trouble(&self.nodes.lives()),
             gate: self.gate.state(),
             gate_since: self.gate.since().into_std(),
             unprotected: self.ledger.unprotected(),

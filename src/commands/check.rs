@@ -8,6 +8,7 @@ mod judge;
 mod launch;
 mod links;
 mod planting;
+mod robot;
 mod ros;
 pub(in crate::commands) mod units;
 
@@ -16,9 +17,9 @@ use std::{convert::Infallible, fmt, time::Duration};
 use serde::Serialize;
 
 use self::facts::SetupFacts;
-use super::{CommandFailure, Exit, counted, print};
+use super::{CommandFailure, Exit, counted, print, running::Running};
 use crate::{
-    cli::{CheckArgs, OptionValue},
+    cli::{CheckArgs, OptionValue, TargetArgs},
     ros_env::MasterUri,
 };
 
@@ -39,9 +40,21 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
         never = slow => match never {},
     };
     let mut findings = judge::judge(&facts);
+    findings.extend(robot(args).await);
     findings.extend(planting::look(&facts.disk.checkpoint));
     findings.extend(sources(&args.settings));
     finish(args, findings)
+}
+
+/// What the rosrescue that runs already, if there is one, says about the robot's nodes.
+async fn robot(args: &CheckArgs) -> Vec<Finding> {
+    let uri = std::env::var("ROSRESCUE_URI").ok();
+    let Ok(mut running) = Running::find(&TargetArgs { uri }) else {
+        return Vec::new();
+    };
+    running.address.port = args.port.unwrap_or(running.address.port);
+    let status = running.status().await;
+    status.map_or_else(|_| Vec::new(), |status| robot::findings(&status))
 }
 
 fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, CommandFailure> {

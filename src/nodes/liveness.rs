@@ -20,12 +20,14 @@ use super::{
     origin,
 };
 use crate::{
+    clock,
     gate::State,
     health::{self, Evidence, Health, port_of},
     limit::rarely,
     master,
     replay::Token,
     resolver,
+    status::{condition::NodesTrouble, summary::IllNode},
     upstream::sockets,
 };
 
@@ -115,6 +117,28 @@ impl Nodes {
             (name, life)
         });
         lives.collect()
+    }
+
+    /// What is wrong with nodes. `lives` says whether each registered node is alive.
+    pub(crate) fn trouble(&self, lives: &BTreeMap<String, Life>) -> NodesTrouble {
+        let ill = |node: &str, since| IllNode {
+            node: node.to_owned(),
+            since: clock::wall_time_of(since).round(),
+        };
+        let with = |health| {
+            let nodes = lives.iter().filter(|(_, life)| life.health == health);
+            nodes.map(|(node, life)| ill(node, life.since)).collect()
+        };
+        let unregistered = self.removed.lately(Instant::now()).into_iter();
+        let unregistered = unregistered.filter(|(node, _)| !lives.contains_key(node));
+        NodesTrouble {
+            dead: with(Health::Dead),
+            unregistered: unregistered.map(|(node, at)| ill(&node, at)).collect(),
+            unreachable: with(Health::Unreachable),
+            feuds: self.local.feuds(),
+            lost_addresses: self.lost_addresses(),
+            misaddressed: self.local.misaddressed(),
+        }
     }
 
     /// Remembers since when each node's health has been the same.

@@ -319,11 +319,15 @@ impl Known {
             Reach::Elsewhere { loopback } => loopback || !is_forwarded,
             Reach::Certain | Reach::Doubtful => false,
         };
-        reaches_nobody.then(|| Misaddressed {
+        let new = Misaddressed {
             node: name.node.clone(),
             api: name.api.clone(),
             from,
-        })
+            since: clock::wall_time().round(),
+        };
+        let known = self.misaddressed.get(&name.node);
+        let known = known.filter(|known| (&known.api, known.from) == (&new.api, from));
+        reaches_nobody.then(|| known.cloned().unwrap_or(new))
     }
 }
 

@@ -19,12 +19,14 @@ use crate::{
 };
 
 /// A node that has registered from another computer under an address that leads to whoever uses it, such as `localhost`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Misaddressed {
     pub(crate) node: String,
     pub(crate) api: String,
     /// The address of the computer from which the node has registered.
     pub(crate) from: IpAddr,
+    /// When rosrescue noticed it, in seconds since 1970.
+    pub(crate) since: f64,
 }
 
 /// The addresses to which the host of `api` leads from here. `None` if it has none within `limit`.
@@ -84,7 +86,10 @@ impl Nodes {
 
 /// Logs nodes that have just been found to be misaddressed.
 pub(super) fn say_misaddressed(new: &[Misaddressed]) {
-    for Misaddressed { node, api, from } in new {
+    for Misaddressed {
+        node, api, from, ..
+    } in new
+    {
         rarely!(
             warn,
             node,

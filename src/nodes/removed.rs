@@ -3,11 +3,15 @@
 use std::{
     collections::VecDeque,
     sync::{Mutex, PoisonError},
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 /// Number of nodes that are remembered.
 const MOST: usize = 100;
+
+/// How long an unregistered node counts as trouble, unless it comes back. An operator must have time to see it, and some
+/// programs never come back.
+const LATELY: Duration = Duration::from_secs(600);
 
 /// The most recently unregistered dead nodes, oldest first.
 #[derive(Debug, Default)]
@@ -21,6 +25,13 @@ impl Removed {
             removed.pop_front();
         }
         removed.push_back((node.to_owned(), at));
+    }
+
+    /// Those of the last ten minutes. Some may have come back.
+    pub(crate) fn lately(&self, now: Instant) -> Vec<(String, Instant)> {
+        let mut list = self.list();
+        list.retain(|(_, at)| now.duration_since(*at) < LATELY);
+        list
     }
 
     /// The names of the nodes, and when they were unregistered. Some may have come back.

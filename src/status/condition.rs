@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Facts, Guarded, Mode,
-    summary::{LostAddress, some},
+    summary::{IllNode, LostAddress, some},
 };
 use crate::{clock, gate::State, health::Feud, nodes::origin::Misaddressed};
 
@@ -30,12 +30,18 @@ pub(crate) enum ConditionName {
     Unprotected,
     /// This computer is cut off from the other computers.
     Alone,
+    /// Nodes are registered at an address at which no other computer can reach them.
+    WrongAddresses,
+    /// Nodes do not answer, and nothing shows whether they are dead.
+    NodesUnreachable,
+    /// Nodes have died without unregistering.
+    NodesDead,
     /// The state is unknown: no master has been seen yet, and calls wait for one.
     Waiting,
 }
 
 impl ConditionName {
-    pub(crate) const ALL: [Self; 8] = [
+    pub(crate) const ALL: [Self; 11] = [
         Self::Protected,
         Self::Following,
         Self::StandingIn,
@@ -43,6 +49,9 @@ impl ConditionName {
         Self::CrashLoop,
         Self::Unprotected,
         Self::Alone,
+        Self::WrongAddresses,
+        Self::NodesUnreachable,
+        Self::NodesDead,
         Self::Waiting,
     ];
 
@@ -56,6 +65,9 @@ impl ConditionName {
             Self::CrashLoop => "crash_loop",
             Self::Unprotected => "unprotected",
             Self::Alone => "alone",
+            Self::WrongAddresses => "wrong_addresses",
+            Self::NodesUnreachable => "nodes_unreachable",
+            Self::NodesDead => "nodes_dead",
             Self::Waiting => "waiting",
         }
     }
@@ -69,6 +81,9 @@ impl ConditionName {
             Self::CrashLoop => "master crash loop",
             Self::Unprotected => "UNPROTECTED",
             Self::Alone => "ALONE",
+            Self::WrongAddresses => "NODES AT WRONG ADDRESSES",
+            Self::NodesUnreachable => "NODES DO NOT ANSWER",
+            Self::NodesDead => "NODES DIED",
             Self::Waiting => "waiting for the first master",
         }
     }
@@ -79,6 +94,10 @@ impl ConditionName {
 pub(crate) struct Condition {
     /// The worst condition that applies.
     pub(crate) name: ConditionName,
+    /// The worst condition that applies apart from the nodes: whether calls are answered and changes recorded. Missing
+    /// in the status of earlier versions.
+    #[serde(default)]
+    pub(crate) apart_from_nodes: Option<ConditionName>,
     /// When the condition began, in seconds since 1970 by the wall clock.
     pub(crate) since: f64,
     /// What nodes notice now, in one or more sentences.
@@ -90,13 +109,18 @@ pub(crate) struct Condition {
 impl Condition {
     /// Whether no operator is needed.
     pub(crate) fn is_good(&self) -> bool {
-        self.is_protected() && self.action.is_none()
+        self.is_protected() && self.name == self.apart_from_nodes() && self.action.is_none()
+    }
+
+    /// The worst condition apart from the nodes.
+    pub(crate) fn apart_from_nodes(&self) -> ConditionName {
+        self.apart_from_nodes.unwrap_or(self.name)
     }
 
     /// Whether changes are recorded and calls pass to a master, on this computer or on the leader.
     pub(crate) fn is_protected(&self) -> bool {
         matches!(
-            self.name,
+            self.apart_from_nodes(),
             ConditionName::Protected | ConditionName::Following
         )
     }
@@ -128,12 +152,120 @@ pub(crate) struct Situation {
     /// Why changes are not recorded. `None` if they are recorded.
     pub(crate) unprotected: Option<String>,
     pub(crate) master: String,
+    pub(crate) nodes: NodesTrouble,
+}
+
+/// What is wrong with nodes.
+#[derive(Debug, Default)]
+pub(crate) struct NodesTrouble {
+    /// Nodes that have died and are still registered.
+    pub(crate) dead: Vec<IllNode>,
+    /// Nodes that have died, that rosrescue has unregistered lately, and that have not come back.
+    pub(crate) unregistered: Vec<IllNode>,
+    /// Nodes that do not answer.
+    pub(crate) unreachable: Vec<IllNode>,
     /// Names that two programs take from each other.
     pub(crate) feuds: Vec<Feud>,
     /// Addresses that this computer has lost, and at which nodes are registered.
     pub(crate) lost_addresses: Vec<LostAddress>,
     /// Nodes that no computer but their own can reach.
     pub(crate) misaddressed: Vec<Misaddressed>,
+}
+
+impl NodesTrouble {
+    /// The worst condition of the nodes, and since when; `None` if nothing is wrong.
+    fn condition(&self) -> Option<(ConditionName, f64)> {
+        let dead = self.dead.iter().chain(&self.unregistered);
+        let since = |nodes: &mut dyn Iterator<Item = f64>| nodes.min_by(f64::total_cmp);
+        let dead = since(&mut dead.map(|node| node.since));
+        let unreachable = since(&mut self.unreachable.iter().map(|node| node.since));
+        let lost = self.lost_addresses.iter().map(|lost| lost.since);
+        let misaddressed = self.misaddressed.iter().map(|node| node.since);
+        let wrong = since(&mut lost.chain(misaddressed));
+        dead.map(|since| (ConditionName::NodesDead, since))
+            .or_else(|| unreachable.map(|since| (ConditionName::NodesUnreachable, since)))
+            .or_else(|| wrong.map(|since| (ConditionName::WrongAddresses, since)))
+    }
+
+    /// What nodes notice and what to do about each trouble, the worst first.
+    fn sentences(&self) -> Vec<(String, String)> {
+        let mut all = Vec::new();
+        if !self.dead.is_empty() {
+            all.push((
+                format!(
+                    "{} died without unregistering: {}.",
+                    count(&self.dead),
+                    listed(&self.dead)
+                ),
+                "restart these nodes, or unregister them with `rosnode cleanup`.".to_owned(),
+            ));
+        }
+        if !self.unregistered.is_empty() {
+            let nodes = &self.unregistered;
+            all.push((
+                format!(
+                    "{} died, and rosrescue unregistered them: {}.",
+                    count(nodes),
+                    listed(nodes)
+                ),
+                "restart these nodes, if the robot needs them.".to_owned(),
+            ));
+        }
+        if !self.unreachable.is_empty() {
+            let nodes = &self.unreachable;
+            let verb = if nodes.len() == 1 { "does" } else { "do" };
+            all.push((
+                format!("{} {verb} not answer: {}.", count(nodes), listed(nodes)),
+                "see whether these nodes hang, and whether their computers are on and connected."
+                    .to_owned(),
+            ));
+        }
+        for LostAddress { address, nodes, .. } in &self.lost_addresses {
+            all.push((
+                format!("This computer has lost the address {address}, so no node can connect to {}.", some(nodes)),
+                format!(
+                    "give this computer the address {address} back, or restart these nodes with its present address in ROS_IP."
+                ),
+            ));
+        }
+        for (from, nodes) in by_computer(&self.misaddressed) {
+            let addresses: Vec<_> = nodes
+                .iter()
+                .map(|it| format!("{} as {}", it.node, it.api))
+                .collect();
+            all.push((
+                format!(
+                    "No other computer can reach nodes of {from}, and they cannot be checked from here: they have registered under an address that means each computer itself ({}).",
+                    some(&addresses)
+                ),
+                format!("run `export ROS_IP={from}` on {from}, and restart these nodes there."),
+            ));
+        }
+        if !self.feuds.is_empty() {
+            let names: Vec<_> = self.feuds.iter().map(ToString::to_string).collect();
+            all.push((
+                format!(
+                    "Programs take a node name from each other, and shut each other down: {}.",
+                    some(&names)
+                ),
+                "stop one of the two programs, or give it another name (__name:=).".to_owned(),
+            ));
+        }
+        all
+    }
+}
+
+/// The number of nodes in words.
+fn count(nodes: &[IllNode]) -> String {
+    match nodes.len() {
+        1 => "1 node".to_owned(),
+        count => format!("{count} nodes"),
+    }
+}
+
+/// The names of nodes, each with the time since when it has been ill.
+fn listed(nodes: &[IllNode]) -> String {
+    some(&nodes.iter().map(ToString::to_string).collect::<Vec<_>>())
 }
 
 /// Derives the condition from the situation and the facts.
@@ -212,45 +344,22 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         text += &format!(" {count} {verb} directly to the master, unprotected: {who}.");
         action.get_or_insert_with(|| "restart it with the ROS_MASTER_URI of rosrescue.".to_owned());
     }
-    for LostAddress { address, nodes, .. } in &now.lost_addresses {
-        text += &format!(
-            " This computer has lost the address {address}, so no node can connect to {}.",
-            some(nodes)
-        );
-        action.get_or_insert_with(|| {
-            format!(
-                "give this computer the address {address} back, or restart these nodes with its present address in ROS_IP."
-            )
-        });
+    let (apart_from_nodes, mut since) = (name, clock::wall_time_of(since));
+    if let Some((worse, from)) = now.nodes.condition().filter(|(of, _)| *of > name) {
+        (name, since) = (worse, from);
+        // The nodes come before what is the matter with the master.
+        if let Some(rest) = text.strip_prefix("Nodes ") {
+            text = format!("Other nodes {rest}");
+        }
     }
-    for (from, nodes) in by_computer(&now.misaddressed) {
-        let addresses: Vec<_> = nodes
-            .iter()
-            .map(|it| format!("{} as {}", it.node, it.api))
-            .collect();
-        text += &format!(
-            " No other computer can reach nodes of {from}, and they cannot be checked from here: they have registered under an address that means each computer itself ({}).",
-            some(&addresses)
-        );
-        action.get_or_insert_with(|| {
-            format!("run `export ROS_IP={from}` on {from}, and restart these nodes there.")
-        });
-    }
-    if !now.feuds.is_empty() {
-        let names: Vec<_> = now.feuds.iter().map(ToString::to_string).collect();
-        text += &format!(
-            " Programs take a node name from each other, and shut each other down: {}.",
-            some(&names)
-        );
-        action.get_or_insert_with(|| {
-            "stop one of the two programs, or give it another name (__name:=).".to_owned()
-        });
-    }
+    let (said, to_do): (Vec<_>, Vec<_>) = now.nodes.sentences().into_iter().unzip();
+    let said: Vec<_> = said.into_iter().chain([text]).collect();
     Condition {
         name,
-        since: clock::wall_time_of(since),
-        text,
-        action,
+        apart_from_nodes: Some(apart_from_nodes),
+        since,
+        text: said.join(" "),
+        action: to_do.into_iter().next().or(action),
     }
 }
 
@@ -319,9 +428,7 @@ mod tests {
             gate,
             gate_since: facts.started,
             unprotected: unprotected.map(str::to_owned),
-            feuds: Vec::new(),
-            lost_addresses: Vec::new(),
-            misaddressed: Vec::new(),
+            nodes: NodesTrouble::default(),
             master: "http://robot:11312/".to_owned(),
         };
         condition(&situation, facts)
@@ -392,6 +499,73 @@ mod tests {
         assert!(condition.action.unwrap().contains("ROS_MASTER_URI"));
     }
 
+    fn with_nodes(
+        nodes: NodesTrouble,
+        gate: State,
+        unprotected: Option<&str>,
+        facts: &Facts,
+    ) -> Condition {
+        let situation = Situation {
+            gate,
+            gate_since: facts.started,
+            unprotected: unprotected.map(str::to_owned),
+            nodes,
+            master: "http://robot:11312/".to_owned(),
+        };
+        condition(&situation, facts)
+    }
+
+    fn ill(node: &str, since: f64) -> IllNode {
+        IllNode {
+            node: node.to_owned(),
+            since,
+        }
+    }
+
+    #[test]
+    fn dead_nodes_come_before_everything_and_hide_nothing() {
+        let facts = Facts::new(Mode::Core);
+        let trouble = |dead: &[&str], unregistered: &[&str], unreachable: &[&str]| NodesTrouble {
+            dead: dead.iter().map(|name| ill(name, 1e9)).collect(),
+            unregistered: unregistered.iter().map(|name| ill(name, 2e9)).collect(),
+            unreachable: unreachable.iter().map(|name| ill(name, 5.0)).collect(),
+            ..NodesTrouble::default()
+        };
+        let all = with_nodes(
+            trouble(&["/base", "/arm"], &["/lidar"], &["/gps"]),
+            State::StandingIn,
+            Some("the disk is full"),
+            &facts,
+        );
+        assert_eq!(all.name, ConditionName::NodesDead);
+        assert_eq!(all.apart_from_nodes(), ConditionName::Unprotected);
+        assert!(!all.is_good() && !all.is_protected());
+        assert!(all.since < 1e9 + 1.0, "{all:?}");
+        let line = all.line();
+        assert!(
+            line.starts_with("NODES DIED: 2 nodes died without unregistering: /base since 2001-"),
+            "{line}"
+        );
+        for part in [
+            "1 node died, and rosrescue unregistered them: /lidar",
+            "1 node does not answer: /gps",
+            "Other nodes keep working",
+            "the disk is full",
+            "To do: restart these nodes",
+        ] {
+            assert!(line.contains(part), "{part}: {line}");
+        }
+        let reaped = with_nodes(trouble(&[], &["/lidar"], &[]), OPEN, None, &facts);
+        assert_eq!(reaped.name, ConditionName::NodesDead);
+        assert!(reaped.is_protected() && !reaped.is_good());
+        let silent = with_nodes(trouble(&[], &[], &["/gps"]), OPEN, None, &facts);
+        assert_eq!(silent.name, ConditionName::NodesUnreachable);
+        assert!(with_nodes(trouble(&[], &[], &[]), OPEN, None, &facts).is_good());
+        // Before there is a master, that is what matters.
+        let waiting = with_nodes(trouble(&["/base"], &[], &[]), State::Unknown, None, &facts);
+        assert_eq!(waiting.name, ConditionName::Waiting);
+    }
+
     #[test]
     fn nodes_that_no_other_computer_can_reach_are_named_with_the_command_that_helps() {
         let facts = Facts::new(Mode::Core);
@@ -399,17 +573,13 @@ mod tests {
             node: node.to_owned(),
             api: "http://localhost:4001/".to_owned(),
             from: [10, 0, 0, 9].into(),
+            since: 7.0,
         };
-        let situation = Situation {
-            gate: OPEN,
-            gate_since: facts.started,
-            unprotected: None,
-            master: "http://robot:11312/".to_owned(),
-            feuds: Vec::new(),
-            lost_addresses: Vec::new(),
+        let nodes = NodesTrouble {
             misaddressed: vec![node("/joy"), node("/teleop")],
+            ..NodesTrouble::default()
         };
-        let condition = condition(&situation, &facts);
+        let condition = with_nodes(nodes, OPEN, None, &facts);
         assert!(!condition.is_good(), "{condition:?}");
         for part in [
             "nodes of 10.0.0.9",

@@ -30,7 +30,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric])
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 28] = [
+    let values: [(&str, &str, Option<f64>); 30] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -53,6 +53,8 @@ pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric])
         ("unchecked_nodes", "registered nodes without a check in the last two minutes", Some(status.nodes.unchecked_nodes.len() as f64)),
         ("feuds", "node names that two programs take from each other", Some(status.nodes.feuds.len() as f64)),
         ("lost_addresses", "addresses that this computer has lost and at which nodes are registered", Some(status.nodes.lost_addresses.len() as f64)),
+        ("unregistered_nodes", "nodes that died, that rosrescue unregistered in the last ten minutes, and that have not come back", Some(status.nodes.unregistered_nodes.len() as f64)),
+        ("misaddressed_nodes", "nodes of other computers that are registered under an address such as localhost", Some(status.nodes.misaddressed_nodes.len() as f64)),
         ("bypassing", "processes and computers that bypass rosrescue and talk to the master directly", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
         ("journal_bytes", "size of the checkpoint's journal", Some(journal.bytes as f64)),

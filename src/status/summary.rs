@@ -61,6 +61,9 @@ pub(crate) struct NodesStatus {
     /// Registered nodes whose process has ended, or whose port refuses connections.
     #[serde(default)]
     pub(crate) dead_nodes: Vec<String>,
+    /// Nodes that have died, that rosrescue has unregistered in the last ten minutes, and that have not come back.
+    #[serde(default)]
+    pub(crate) unregistered_nodes: Vec<IllNode>,
     /// Registered nodes that have not been checked, or not in the last two minutes.
     #[serde(default)]
     pub(crate) unchecked_nodes: Vec<String>,
@@ -90,6 +93,20 @@ pub(crate) struct LostAddress {
     pub(crate) since: f64,
     /// The nodes that are registered there.
     pub(crate) nodes: Vec<String>,
+}
+
+/// A node that is dead or does not answer.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct IllNode {
+    pub(crate) node: String,
+    /// Since when, in seconds since 1970.
+    pub(crate) since: f64,
+}
+
+impl fmt::Display for IllNode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} since {}", self.node, clock::wall_text(self.since))
+    }
 }
 
 /// The health of a node that is not known to be alive.

@@ -8,7 +8,7 @@ use std::{
 
 use tokio::{sync::Semaphore, task::JoinSet, time::sleep};
 
-use super::{Finding, Severity};
+use super::{Finding, Severity, robot};
 use crate::{
     cli::{CheckArgs, TargetArgs},
     commands::{CommandFailure, counted, live::Live, running::Running},
@@ -40,7 +40,12 @@ pub(super) async fn look(args: &CheckArgs) -> Result<Vec<Finding>, CommandFailur
         found = ask(&mut live).await?;
         found.missing.retain(|link| before.missing.contains(link));
     }
-    Ok(found.findings())
+    let mut findings = found.findings();
+    // A bare master has no status.
+    if let Ok(status) = running.status().await {
+        findings.extend(robot::findings(&status));
+    }
+    Ok(findings)
 }
 
 async fn ask(live: &mut Live) -> Result<Found, CommandFailure> {

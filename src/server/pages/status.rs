@@ -1,6 +1,7 @@
 //! Builds the present status.
 
 use std::{
+    collections::BTreeMap,
     sync::{Mutex, PoisonError},
     time::Instant,
 };
@@ -12,10 +13,11 @@ use crate::{
     health::Health,
     ledger::journal::StoreState,
     master::Master,
+    nodes::liveness::Life,
     status::{
         DiskStatus,
         computers::Computers,
-        condition::{Situation, condition},
+        condition::{NodesTrouble, Situation, condition},
         summary::{JournalStatus, NodeHealth, NodesStatus, SCHEMA, Status},
     },
 };
@@ -71,14 +73,13 @@ impl Pages {
         let facts = self.board.read();
         let unprotected = self.ledger.unprotected();
         let master = self.upstream.address().to_string();
+        let lives = self.nodes.lives();
         let situation = Situation {
             gate,
             gate_since,
             unprotected: unprotected.clone(),
             master: master.clone(),
-            feuds: self.nodes.local.feuds(),
-            lost_addresses: self.nodes.lost_addresses(),
-            misaddressed: self.nodes.local.misaddressed(),
+            nodes: self.nodes.trouble(&lives),
         };
         let rescues = facts.reports.iter().filter(|report| report.is_rescue());
         let last = (facts.recoveries > 0)
@@ -112,7 +113,7 @@ impl Pages {
             guarded: facts.guarded.is_guarded(),
             guarded_by: facts.guarded.to_string(),
             state: self.ledger.with_mirror(Master::counts),
-            nodes: self.nodes_status(situation),
+            nodes: Self::nodes_status(situation.nodes, &lives),
             recoveries: facts.recoveries,
             last_recovery: last.cloned(),
             rescues: facts.rescues,
@@ -125,8 +126,7 @@ impl Pages {
         }
     }
 
-    fn nodes_status(&self, situation: Situation) -> NodesStatus {
-        let lives = self.nodes.lives();
+    fn nodes_status(trouble: NodesTrouble, lives: &BTreeMap<String, Life>) -> NodesStatus {
         let of = |health| {
             let names = lives.iter().filter(|(_, life)| life.health == health);
             names.map(|(name, _)| name.clone()).collect::<Vec<_>>()
@@ -147,9 +147,10 @@ impl Pages {
             unchecked_nodes: of(Health::Unchecked),
             alive_nodes: of(Health::Alive).len(),
             node_health: ill.collect(),
-            feuds: situation.feuds,
-            lost_addresses: situation.lost_addresses,
-            misaddressed_nodes: situation.misaddressed,
+            unregistered_nodes: trouble.unregistered,
+            feuds: trouble.feuds,
+            lost_addresses: trouble.lost_addresses,
+            misaddressed_nodes: trouble.misaddressed,
         }
     }
 

@@ -174,9 +174,7 @@ mod tests {
         let mut facts = Facts::new(Mode::Core);
         facts.cluster = Some(cluster.clone());
         let situation = Situation {
-            feuds: Vec::new(),
-            lost_addresses: Vec::new(),
-            misaddressed: Vec::new(),
+            nodes: Default::default(),
             gate,
             gate_since: facts.started,
             unprotected: None,

@@ -5,8 +5,65 @@ use std::net::TcpListener;
 use std::thread;
 
 use crate::support::{
-    FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, Tool, eventually, free_port, page, params,
+    FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, State, Tool, eventually,
+    eventually_some, free_port, page, params,
 };
+
+/// A robot whose nodes are dead is not well because its master is. A node that ends in order is no trouble.
+#[test]
+fn nodes_that_died_come_before_everything_else() {
+    let robot = Robot::start(Mode::Core);
+    let [mut orderly, mut dead] = ["/orderly", "/dead"].map(|name| {
+        let name = format!("__name:={}", &name[1..]);
+        robot.node(Library::Rospy, "talker", &[&name])
+    });
+    let port = robot.port();
+    let status = || Tool::rosrescue(&robot.scratch, port, &["status"]);
+    assert!(status().stdout.starts_with("protected, since "));
+    orderly.terminate();
+    eventually("the node has unregistered", || {
+        !State::read(&robot.client()).knows("/orderly")
+    });
+    let good = status();
+    assert_eq!(good.exit(), 0, "{good:?}");
+    dead.kill();
+    let bad = eventually_some("the status names the dead node", || {
+        let bad = status();
+        bad.stdout.starts_with("NODES DIED, since ").then_some(bad)
+    });
+    assert_eq!(bad.exit(), 1, "{bad:?}");
+    let said = "1 node died without unregistering: /dead since 2";
+    assert!(bad.stdout.contains(said), "{bad:?}");
+    assert!(bad.stdout.contains("Other nodes work as usual"), "{bad:?}");
+    let live = Tool::rosrescue(&robot.scratch, port, &["check", "--live"]);
+    assert_eq!(live.exit(), 1, "{live:?}");
+    assert!(live.stdout.starts_with("PROBLEM  nodes"), "{live:?}");
+    assert!(live.stdout.contains(said), "{live:?}");
+    let metrics = page(&robot.client(), "/metrics");
+    for line in [
+        "rosrescue_condition{name=\"nodes_dead\"} 1",
+        "rosrescue_dead_nodes 1",
+        "rosrescue_action_needed 1",
+        "rosrescue_protected 1",
+    ] {
+        assert!(metrics.contains(line), "{line}: {metrics}");
+    }
+    let wait = Tool::rosrescue(&robot.scratch, port, &["wait", "--for", "protected"]);
+    assert_eq!(wait.exit(), 0, "the state is recorded: {wait:?}");
+    // A rescue unregisters the dead node, which is dead nevertheless.
+    let master = robot.master_pid();
+    crate::support::signal(master, rustix::process::Signal::KILL);
+    robot.await_recovery(master);
+    eventually("the dead node is unregistered", || {
+        !State::read(&robot.client()).knows("/dead")
+    });
+    let after = status();
+    let said = "1 node died, and rosrescue unregistered them: /dead since 2";
+    assert!(after.stdout.starts_with("NODES DIED, since "), "{after:?}");
+    assert!(after.stdout.contains(said), "{after:?}");
+    let _again = robot.node(Library::Rospy, "talker", &["__name:=dead"]);
+    eventually("all is well when the node is back", || status().exit() == 0);
+}
 
 #[test]
 fn it_says_what_nodes_notice_and_what_to_do() {

@@ -23,6 +23,9 @@ const CONDITIONS = {
   crash_loop: ["bad", "Master crash loop"],
   unprotected: ["bad", "UNPROTECTED"],
   alone: ["bad", "ALONE: cut off from the other computers"],
+  wrong_addresses: ["warn", "Nodes at wrong addresses"],
+  nodes_unreachable: ["warn", "Nodes do not answer"],
+  nodes_dead: ["warn", "Nodes died"],
   waiting: ["warn", "Waiting for the first master"],
 };
 const ROLES = { joining: "joining", following: "following", catching_up: "taking over", leading: "leads", alone: "ALONE" };
