@@ -547,8 +547,16 @@ impl Driver {
         if cause == Cause::Hung {
             self.disconnect();
         }
+        let starts = matches!(cause, Cause::Exited | Cause::ThreadEnded) && self.process.is_some();
+        self.board.update(|facts| facts.starts_master = starts);
         let cause = cause.as_str();
         match self.process {
+            Some(_) if !starts => alarm!(
+                warn,
+                AWAY,
+                cause,
+                "the master is away: nodes keep running, rosrescue answers in its place"
+            ),
             Some(_) => alarm!(
                 warn,
                 AWAY,
@@ -599,6 +607,7 @@ impl Driver {
     }
 
     async fn spawn(&mut self) -> Option<Input> {
+        self.board.update(|facts| facts.starts_master = true);
         let Examiner {
             ledger, upstream, ..
         } = &self.examiner;

@@ -20,7 +20,7 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use self::report::{DIED, HealthCheck, Report, STARTED};
+use self::report::{DIED, HealthCheck, LateAnswers, Report, STARTED};
 use crate::{cluster::machine::Role, gate::State};
 
 /// Number of recovery reports that are kept.
@@ -75,6 +75,10 @@ pub struct Facts {
     pub recoveries: u64,
     /// Number of rescues in this session.
     pub rescues: u64,
+    /// Outages in which nothing died, since this process started.
+    pub(crate) late_answers: LateAnswers,
+    /// Whether a new master is being started, because the last one has ended.
+    pub(crate) starts_master: bool,
     pub earlier: Earlier,
     pub guarded: Guarded,
     /// Processes, users and computers that bypass rosrescue and talk directly to the master of
@@ -165,6 +169,8 @@ impl Facts {
             reports: VecDeque::new(),
             recoveries: 0,
             rescues: 0,
+            late_answers: LateAnswers::default(),
+            starts_master: false,
             earlier: Earlier::default(),
             guarded: Guarded::Nobody,
             bypassing: Vec::new(),
@@ -216,6 +222,13 @@ impl Facts {
         if report.cause == STARTED && std::mem::take(&mut self.earlier.died) {
             DIED.clone_into(&mut report.cause);
         }
+        let last = self.reports.back().map(|last| last.master_pid);
+        report.same_master = report.ended.is_none() && last == Some(report.master_pid);
+        // Only the last late answer is kept, so that none takes the place of a rescue.
+        self.reports.retain(|report| !report.is_late());
+        if report.is_late() {
+            self.late_answers.add(&report);
+        }
         if report.is_rescue() {
             self.rescues += 1;
             self.earlier.last_number += 1;
@@ -257,5 +270,73 @@ impl Board {
 
     pub fn update<T>(&self, change: impl FnOnce(&mut Facts) -> T) -> T {
         change(&mut self.lock())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        lifecycle::Cause,
+        status::report::{Phases, RecoveryOutcome},
+    };
+
+    fn report(cause: &str, outcome: RecoveryOutcome, master_pid: i32) -> Report {
+        Report {
+            number: 0,
+            cause: cause.to_owned(),
+            ended: (cause == Cause::Exited.as_str()).then(|| "signal 9".to_owned()),
+            detected_at: 0.0,
+            outcome,
+            master_pid,
+            same_master: false,
+            master_speaks: String::new(),
+            phases: Phases {
+                total_ms: 250.0,
+                ..Phases::default()
+            },
+            answered: 0,
+            unanswered: 0,
+            health_check_ms: None,
+            restored: Default::default(),
+            not_restored: Vec::new(),
+            mismatches: Vec::new(),
+            removed: Vec::new(),
+            reconciled: Vec::new(),
+            unreachable: Vec::new(),
+            told_again: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn late_answers_are_counted_apart_and_evict_no_report_of_a_death() {
+        let mut facts = Facts::new(Mode::Core);
+        facts.add(report(STARTED, RecoveryOutcome::Begun, 1));
+        let dead = facts.add(report(Cause::Exited.as_str(), RecoveryOutcome::Injected, 2));
+        assert!(dead.is_rescue() && dead.line().contains("a new master got the whole state"));
+        for (cause, outcome) in [
+            (Cause::Late, RecoveryOutcome::Reconciled),
+            (Cause::Hung, RecoveryOutcome::Resumed),
+            (Cause::Late, RecoveryOutcome::Injected),
+        ] {
+            for _ in 0..2 * REPORTS {
+                let late = facts.add(report(cause.as_str(), outcome, 2));
+                assert!(!late.is_rescue() && late.number == 0, "{late:?}");
+                let said = late.to_string();
+                assert!(said.contains("the same master continues"), "{said}");
+                assert!(!said.contains("without a master"), "{said}");
+            }
+        }
+        assert_eq!(facts.rescues, 1);
+        let count = |is: fn(&Report) -> bool| facts.reports.iter().filter(|it| is(it)).count();
+        assert_eq!((count(Report::is_rescue), count(Report::is_late)), (1, 1));
+        assert_eq!(
+            facts.late_answers.to_string(),
+            "answered in the master's place 120 times, 30.0 s in all"
+        );
+        // A hung master that was replaced has died, and so has rosrescue itself.
+        let hung = facts.add(report(Cause::Hung.as_str(), RecoveryOutcome::Injected, 3));
+        let died = facts.add(report(DIED, RecoveryOutcome::Resumed, 3));
+        assert_eq!((hung.number, died.number), (2, 3));
     }
 }

@@ -24,7 +24,7 @@ use crate::{
     status::{
         computers::Computers,
         condition::Condition,
-        report::Report,
+        report::{LateAnswers, Report},
         summary::{Caller, NodesStatus, Status},
     },
 };
@@ -63,6 +63,7 @@ struct Top {
     callers: Vec<Row>,
     rescues: u64,
     last_rescues: Vec<Report>,
+    late_answers: LateAnswers,
     /// Number of lines of the terminal.
     #[serde(skip)]
     height: usize,
@@ -147,6 +148,7 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
         callers,
         rescues: status.rescues,
         last_rescues: status.last_rescues,
+        late_answers: status.late_answers,
         height,
     }
 }
@@ -207,6 +209,9 @@ impl fmt::Display for Top {
             writeln!(head, "computers: {}", cluster.line())?;
         }
         let mut foot = format!("\nrescues so far: {}\n", self.rescues);
+        if self.late_answers.times > 0 {
+            foot += &format!("late: {}\n", self.late_answers);
+        }
         for report in self.last_rescues.iter().rev().take(RESCUES) {
             writeln!(foot, "{}", report.line())?;
         }

@@ -186,6 +186,7 @@ mod tests {
             ended: Some("signal 9".to_owned()),
             detected_at: 1_795_253_213.0 + number as f64,
             outcome: RecoveryOutcome::Injected,
+            same_master: false,
             master_pid: 7,
             master_speaks: "HTTP/1.1".to_owned(),
             phases: Phases::default(),

@@ -80,6 +80,7 @@ impl Outage {
             detected_at: self.wall,
             outcome: examination.outcome,
             master_pid: examination.pid,
+            same_master: false,
             master_speaks: examination.speaks,
             phases: Phases {
                 absence_ms: ms(absence),
@@ -146,7 +147,8 @@ impl Driver {
                 ReportRecord::new(&self.board, &session, report.clone()),
             );
         }
-        self.restored = (report.outcome == RecoveryOutcome::Injected).then_some(report.number);
+        let is_restored = report.outcome == RecoveryOutcome::Injected && report.is_rescue();
+        self.restored = is_restored.then_some(report.number);
         let news = std::mem::replace(&mut self.news, News::Sent);
         let sent = news == News::SentFirst && report.outcome == RecoveryOutcome::Injected;
         if !self.lifecycle.has_served() && !sent {

@@ -403,8 +403,13 @@ fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
             (text, Some(format!("{output}.")))
         }
         (State::Open { .. }, _) => ("Nodes work as usual: the master answers.".to_owned(), None),
-        (_, Mode::Core) => (
+        (_, Mode::Core) if facts.starts_master => (
             "Nodes keep working: rosrescue answers in place of the master and starts a new one."
+                .to_owned(),
+            None,
+        ),
+        (_, Mode::Core) | (State::Late | State::Injecting, _) => (
+            "Nodes keep working: rosrescue answers in place of the master, which does not answer in time."
                 .to_owned(),
             None,
         ),

@@ -30,7 +30,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric])
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 30] = [
+    let values: [(&str, &str, Option<f64>); 32] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -40,7 +40,9 @@ pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric])
         ("master_deaths_total", "masters that have died", Some(status.deaths as f64)),
         ("worker_restarts_total", "restarts of rosrescue itself after it died, in this session", Some(status.worker_restarts as f64)),
         ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),
-        ("rescues_total", "recoveries other than an ordinary start", Some(status.rescues as f64)),
+        ("rescues_total", "recoveries after a death or a restart", Some(status.rescues as f64)),
+        ("late_answers_total", "times that the same master was late and rosrescue answered in its place", Some(status.late_answers.times as f64)),
+        ("late_answers_seconds_total", "how long rosrescue answered in the place of a late master", Some(status.late_answers.seconds)),
         ("pending_writes", "writes answered by the mirror that the master has not run yet", Some(status.pending_writes as f64)),
         ("nodes", "nodes registered", Some(status.state.nodes as f64)),
         ("publishers", "publishers, counted once for each topic", Some(status.state.publishers as f64)),

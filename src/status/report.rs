@@ -42,15 +42,36 @@ impl RecoveryOutcome {
     }
 }
 
-impl fmt::Display for RecoveryOutcome {
+/// How often the same master was late or did not answer, and rosrescue answered in its place.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct LateAnswers {
+    pub(crate) times: u64,
+    /// How long that took in all, in seconds.
+    pub(crate) seconds: f64,
+    /// When it happened last, in seconds since 1970.
+    pub(crate) last_at: Option<f64>,
+}
+
+impl LateAnswers {
+    pub(super) fn add(&mut self, report: &Report) {
+        self.times += 1;
+        self.seconds += report.phases.total_ms / 1e3;
+        self.last_at = Some(report.detected_at);
+    }
+}
+
+/// One sentence, such as `answered in the master's place 46 times, 8.1 s in all`.
+impl fmt::Display for LateAnswers {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Begun => "a new session started with a new master",
-            Self::Injected => "a new master got the whole state",
-            Self::Adopted => "a running master was taken over with its state",
-            Self::Reconciled => "the same master continues, and got the changes it missed",
-            Self::Resumed => "the same master continues, unchanged",
-        })
+        let times = match self.times {
+            1 => "once".to_owned(),
+            times => format!("{times} times"),
+        };
+        write!(
+            f,
+            "answered in the master's place {times}, {:.1} s in all",
+            self.seconds
+        )
     }
 }
 
@@ -83,6 +104,9 @@ pub struct Report {
     pub outcome: RecoveryOutcome,
     /// The process id that the master reports.
     pub master_pid: i32,
+    /// Whether it is the same process as before.
+    #[serde(default)]
+    pub same_master: bool,
     /// HTTP version and Python version of the master, as text.
     #[serde(default)]
     pub master_speaks: String,
@@ -113,13 +137,37 @@ pub struct Report {
 }
 
 impl Report {
-    /// Whether the recovery is a rescue. An ordinary start is not.
+    /// Whether the recovery is a rescue. An ordinary start is not, and no [late answer](Self::is_late) is.
     pub(crate) fn is_rescue(&self) -> bool {
-        !(self.cause == STARTED
+        let is_ordinary_start = self.cause == STARTED
             && matches!(
                 self.outcome,
                 RecoveryOutcome::Begun | RecoveryOutcome::Adopted
-            ))
+            );
+        !is_ordinary_start && !self.is_late()
+    }
+
+    /// Whether nothing has died: the master was late or did not answer, rosrescue answered in its place, and the same
+    /// process continues.
+    pub(crate) fn is_late(&self) -> bool {
+        let is_beginning = [STARTED, DIED, TAKEN_OVER, CUT_OFF].contains(&self.cause.as_str());
+        self.same_master && self.ended.is_none() && !is_beginning
+    }
+
+    /// What has happened to the master, in words.
+    fn outcome(&self) -> &'static str {
+        match self.outcome {
+            RecoveryOutcome::Begun => "a new session started with a new master",
+            RecoveryOutcome::Injected if self.same_master => {
+                "the same master continues, and got the whole state again"
+            }
+            RecoveryOutcome::Injected => "a new master got the whole state",
+            RecoveryOutcome::Adopted => "a running master was taken over with its state",
+            RecoveryOutcome::Reconciled => {
+                "the same master continues, and got the changes it missed"
+            }
+            RecoveryOutcome::Resumed => "the same master continues, unchanged",
+        }
     }
 
     /// Adds the results of the health check.
@@ -169,7 +217,7 @@ impl Report {
             total_ms = phases.total_ms,
             master_pid = self.master_pid,
             "calls pass to the master: {} ({})",
-            self.outcome,
+            self.outcome(),
             self.restored
         );
         if !self.not_restored.is_empty() {
@@ -197,7 +245,12 @@ impl Report {
             reconciled = some(&self.reconciled),
             told_again = some(&self.told_again),
             unreachable = some(&self.unreachable),
-            "every node was checked: the rescue is complete"
+            "every node was checked: {}",
+            if self.is_rescue() {
+                "the rescue is complete"
+            } else {
+                "all is done"
+            }
         );
     }
 }
@@ -206,13 +259,8 @@ impl Report {
     /// The report in one line.
     pub(crate) fn line(&self) -> String {
         let at = clock::wall_text(self.detected_at);
-        let Self {
-            number,
-            cause,
-            outcome,
-            ..
-        } = self;
-        let total = self.phases.total_ms;
+        let Self { number, cause, .. } = self;
+        let (outcome, total) = (self.outcome(), self.phases.total_ms);
         format!("{number:>3}  {at}  {total:.0} ms: {outcome} ({cause})")
     }
 }
@@ -233,10 +281,14 @@ impl fmt::Display for Report {
         if let Some(ended) = &self.ended {
             write!(f, " ({ended})")?;
         }
-        writeln!(f, "; {} after {total_ms:.0} ms", self.outcome)?;
+        writeln!(f, "; {} after {total_ms:.0} ms", self.outcome())?;
+        let without = match self.same_master {
+            true => "without an answer",
+            false => "without a master",
+        };
         writeln!(
             f,
-            "  {absence_ms:.0} ms without a master, {inspection_ms:.0} ms to read it, \
+            "  {absence_ms:.0} ms {without}, {inspection_ms:.0} ms to read it, \
              {injection_ms:.0} ms to restore it; {}",
             self.felt()
         )?;

@@ -4,7 +4,12 @@ use std::{collections::BTreeMap, fmt, net::IpAddr};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Mode, computers::Computers, condition::Condition, report::Report};
+use super::{
+    Mode,
+    computers::Computers,
+    condition::Condition,
+    report::{LateAnswers, Report},
+};
 use crate::{
     clock,
     health::{Feud, Health},
@@ -195,6 +200,9 @@ pub(crate) struct Status {
     /// Number of rescues in this session. `last_rescues` has the reports of the last 20, oldest first.
     pub(crate) rescues: u64,
     pub(crate) last_rescues: Vec<Report>,
+    /// Outages in which nothing died, since this process started.
+    #[serde(default)]
+    pub(crate) late_answers: LateAnswers,
     /// Calls per second between the last two requests for the status that were at least a second
     /// apart.
     pub(crate) calls_per_second: f64,
@@ -314,6 +322,9 @@ impl fmt::Display for Status {
                 "pending     {} changes for the next master",
                 self.pending_writes
             )?;
+        }
+        if self.late_answers.times > 0 {
+            writeln!(f, "late        {}", self.late_answers)?;
         }
         match self.last_rescues.last() {
             Some(report) => write!(f, "rescues     {}, the last:\n{report}", self.rescues),

@@ -118,6 +118,7 @@ impl Pages {
             last_recovery: last.cloned(),
             rescues: facts.rescues,
             last_rescues: rescues.cloned().collect(),
+            late_answers: facts.late_answers.clone(),
             calls_per_second: self.rate.at(Instant::now(), self.stats.calls.value()),
             slowest_callers: self.clients.slowest(SLOWEST),
             clients: self.clients.list(),

@@ -116,6 +116,16 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     robot.await_gate();
     assert_eq!(robot.master_pid(), pid, "the same master stays in use");
     assert_eq!(robot.counter("masters_restored"), injections + 1);
+    // Nothing has died, so this is no rescue.
+    let status = robot.status().expect("a status");
+    assert_eq!(status["rescues"], 0, "{status}");
+    assert_eq!(status["late_answers"]["times"], 1, "{status}");
+    assert_eq!(status["last_recovery"]["same_master"], true, "{status}");
+    let shown = crate::support::page(&client, "/");
+    assert!(
+        shown.contains("answered in the master's place once, "),
+        "{shown}"
+    );
     after.assert_same(&robot.state(), "in the master that continues");
     after.assert_same(&State::read(&client), "through rosrescue");
     // The node never gets an older value or an incomplete list of publishers.

@@ -32,6 +32,7 @@ const ROLES = { joining: "joining", following: "following", catching_up: "taking
 const OUTCOMES = {
   begun: "a new session started",
   injected: "a new master got the whole state",
+  injected_again: "the same master continues, and got the whole state again",
   adopted: "a running master was taken over",
   reconciled: "the same master continues, and got the changes it missed",
   resumed: "the same master continues",
@@ -360,7 +361,11 @@ function showRescues() {
   $("rescues-none").hidden = rows.length > 0;
   say("rescues-none", "None needed so far.");
   $("rescues-key").hidden = rows.length === 0;
-  say("rescues-count", status?.rescues ? `${status.rescues} since the start` : "");
+  const late = status?.late_answers?.times ? status.late_answers : null;
+  say("rescues-count", [
+    status?.rescues && `${status.rescues} since the start`,
+    late && `answered in the late master's place ${plural(late.times, "time")}, ${late.seconds.toFixed(1)} s in all`,
+  ].filter(Boolean).join("; "));
 }
 
 /** All bars have one scale: the longest rescue fills its track. */
@@ -393,7 +398,8 @@ function rescueRow(rescue, longest) {
     ["nodes without an answer", rescue.unreachable],
   ].filter(([, names]) => names?.length).map(([what, names]) => `${what}: ${names.join(", ")}`);
   const cause = rescue.cause + (rescue.ended ? ` (${rescue.ended})` : "");
-  const words = [`${cause}: ${OUTCOMES[rescue.outcome] ?? rescue.outcome}`, calls, phases, ...lists];
+  const outcome = rescue.outcome === "injected" && rescue.same_master ? "injected_again" : rescue.outcome;
+  const words = [`${cause}: ${OUTCOMES[outcome] ?? outcome}`, calls, phases, ...lists];
   const at = new Date(rescue.detected_at * 1000);
   return el("li", {},
     el("time", { datetime: at.toISOString() }, clock.format(at), el("small", {}, date.format(at))),
