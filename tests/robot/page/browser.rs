@@ -36,6 +36,71 @@ pub(super) fn assert_clean(browser: &Browser, robot: &Robot) {
     }
 }
 
+/// After the end of rosrescue, nodes have no master. A page that still says that they keep working is dangerous.
+#[test]
+fn the_page_says_that_its_data_is_old_after_the_end_of_rosrescue() {
+    let mut robot = Robot::start_with(Mode::Proxy, &[]);
+    let node = FakeNode::start("/node");
+    node.publish(&robot.client(), "/topic", "std_msgs/String");
+    let mut browser = Browser::start(&robot.scratch);
+    browser.screen(1280, 900, false);
+    open(&mut browser, &robot);
+    browser.shows("the robot is protected", &condition_is("Protected"));
+    browser.shows(
+        "the node is alive",
+        "document.querySelector('#sick').textContent === 'all alive'",
+    );
+    robot.rescue.terminate();
+    browser.shows(
+        "the page says that its data is old",
+        &condition_is("No answer from rosrescue"),
+    );
+    let page = browser.text();
+    for words in [
+        "Nothing on this page is live",
+        "rosrescue status",
+        "no data since",
+    ] {
+        assert!(page.contains(words), "{words}: {page}");
+    }
+    for words in [
+        "Nodes work",
+        "Nodes keep",
+        "all alive",
+        "Every change is recorded",
+    ] {
+        assert!(!page.contains(words), "{words}: {page}");
+    }
+    let opacity = "getComputedStyle(document.querySelector('#facts')).opacity";
+    assert_eq!(browser.js(opacity), "0.5");
+    robot.rescue.start_again();
+    browser.shows("the page is live again", &condition_is("Protected"));
+    browser.shows(
+        "so is the rest",
+        "document.querySelector('#sick').textContent === 'all alive'",
+    );
+}
+
+/// A dead node comes before everything else, with its name.
+#[test]
+fn the_page_names_a_node_that_has_died_where_the_condition_stands() {
+    let robot = Robot::start_with(Mode::Proxy, &[]);
+    let mut talker = robot.node(Library::Roscpp, "talker", &[]);
+    let mut browser = Browser::start(&robot.scratch);
+    browser.screen(1280, 900, false);
+    open(&mut browser, &robot);
+    browser.shows("the robot is protected", &condition_is("Protected"));
+    talker.kill();
+    browser.shows("the condition is another one", &condition_is("Nodes died"));
+    let banner = browser.js("document.querySelector('#condition').innerText");
+    let banner = banner.as_str().unwrap().to_owned();
+    assert!(banner.contains("/talker since"), "{banner}");
+    assert_eq!(
+        browser.js("document.querySelector('#condition').dataset.is"),
+        "warn"
+    );
+}
+
 #[test]
 fn the_page_shows_the_robot_and_follows_its_rescues() {
     let mut robot = Robot::start_for_outages(Mode::Core);

@@ -11,7 +11,9 @@ const TROUBLES = 8;
 /** Rows of a list; more are found by searching. */
 const ROWS = 300;
 /** Seconds without any event after which the connection counts as lost; there is one every 15. */
-const SILENCE = 40;
+const SILENCE = 20;
+/** Seconds without data after which a page without a connection shows nothing as live. */
+const STALE = 5;
 /** Shortest pause between two readings of the state, in milliseconds. */
 const PAUSE = 2000;
 
@@ -118,6 +120,9 @@ function debounced(work, wait) {
 
 let source = null;
 let heard = 0;
+/** The robot's time of the last data, and whether that is too long ago. */
+let fresh = 0;
+let stale = false;
 
 function connect() {
   source?.close();
@@ -137,12 +142,14 @@ function connect() {
   source.addEventListener("status", (event) => {
     heard = Date.now();
     status = JSON.parse(event.data);
+    isFresh();
     showStatus();
   });
   source.addEventListener("now", (event) => {
     heard = Date.now();
     const before = now;
     now = JSON.parse(event.data);
+    isFresh();
     showNow();
     const isOther = before && before.registrations !== now.registrations;
     if (isOther || (tab === "params" && before?.version !== now.version)) readState();
@@ -155,6 +162,7 @@ async function refused() {
     const answer = await fetch("/status.json");
     if (answer.ok) {
       status = await answer.json();
+      isFresh();
       setLink("waiting", "many pages are open: updates every 2 s");
       now = { ...status, gate: status.open ? "open" : status.elsewhere ? "elsewhere" : "standing_in" };
       showStatus();
@@ -171,6 +179,34 @@ function setLink(is, text) {
   $("link").dataset.is = is;
   say("link", text);
   document.body.classList.toggle("lost", is === "lost");
+}
+
+/** Notes that there is data of this moment. */
+function isFresh() {
+  fresh = robotTime();
+  if (!stale) return;
+  stale = false;
+  document.body.classList.remove("stale");
+  if (status) showStatus();
+}
+
+/** Says that the data is old, where the condition stands, if there has been none for a while. Nothing else may look live. */
+function showStale() {
+  if (!fresh || !document.body.classList.contains("lost") || robotTime() - fresh < STALE) return;
+  if (!stale) {
+    stale = true;
+    document.body.classList.add("stale");
+    const title = "No answer from rosrescue";
+    $("condition").dataset.is = "bad";
+    say("condition-name", title);
+    say("condition-text", `Nothing on this page is live: it shows the robot as it was at ${moment(fresh)}. Either rosrescue has ended, and then nodes have no master, or this browser cannot reach the robot.`);
+    say("condition-action", "run `rosrescue status` on the robot.");
+    $("condition-action").hidden = false;
+    document.title = `${title} – rosrescue`;
+    for (const [id, text] of [["master", "unknown"], ["sick", "unknown"], ["calls", "–"]]) say(id, text);
+    $("sick").dataset.is = "";
+  }
+  say("condition-since", `no data since ${moment(fresh)} (${span(robotTime() - fresh)})`);
 }
 
 async function compareClocks() {
@@ -300,7 +336,7 @@ function showComputers(cluster) {
 }
 
 function showTimes() {
-  if (!status) return;
+  if (!status || stale) return;
   const { since } = status.condition;
   say("condition-since", `since ${moment(since)} (${span(robotTime() - since)})`);
   say("uptime", span(robotTime() - status.started));
@@ -863,7 +899,8 @@ $("details-close").addEventListener("click", () => choose(null));
 new ResizeObserver(debounced(showGraph, 200)).observe(picture.parentElement);
 
 setInterval(() => {
-  countCalls();
+  if (!stale) countCalls();
+  showStale();
   showTimes();
   if (Date.now() - heard > SILENCE * 1000) {
     setLink("lost", "no answer from rosrescue, retrying");
