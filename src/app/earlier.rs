@@ -1,6 +1,10 @@
 //! Takes over the checkpoint of an earlier version, which used one default file for all ports.
 
-use std::{fs, io, path::Path};
+use std::{
+    fs::{self, File},
+    io,
+    path::Path,
+};
 
 use crate::{
     checkpoint::{session, store},
@@ -53,18 +57,20 @@ fn copy_all(old: &Path, own: &Path) -> io::Result<()> {
     let previous = (store::previous_of(old), store::previous_of(own));
     let pid_files = PID_FILES.map(|suffix| (beside(old, suffix), beside(own, suffix)));
     for (from, to) in pid_files.into_iter().chain([previous]) {
-        if from.exists() {
-            copy(&from, &to)?;
+        match regular_file::open_ours(&from) {
+            Ok(from) => copy(from, &to)?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => tracing::warn!(%error, from = %from.display(), "not copied"),
         }
     }
-    copy(old, own)
+    copy(regular_file::open(old)?, own)
 }
 
-fn copy(from: &Path, to: &Path) -> io::Result<()> {
+fn copy(mut from: File, to: &Path) -> io::Result<()> {
     // The next start removes this file if a crash leaves it behind.
     let fresh = beside(to, ".new");
     let mut file = regular_file::create(&fresh)?;
-    io::copy(&mut regular_file::open(from)?, &mut file)?;
+    io::copy(&mut from, &mut file)?;
     file.sync_all()?;
     fs::rename(&fresh, to)
 }

@@ -4,13 +4,16 @@
 
 use std::{
     fs,
-    io::{self, Write},
+    io::{self, Read, Write},
     path::{Path, PathBuf},
     thread,
 };
 
 use super::{Stat, beside, output};
 use crate::{regular_file, wait};
+
+/// Largest PID file, in bytes.
+const LONGEST: u64 = 1024;
 
 /// A file that identifies one process.
 #[derive(Clone, Debug)]
@@ -72,7 +75,8 @@ impl PidFile {
     }
 
     fn read(&self) -> Last {
-        let line = regular_file::open(&self.0).and_then(io::read_to_string);
+        let file = regular_file::open_ours(&self.0);
+        let line = file.and_then(|file| io::read_to_string(file.take(LONGEST)));
         let line = line.unwrap_or_default();
         let fields: Vec<_> = line.split(' ').collect();
         let (&[pid, started, port, boot], true) = (&*fields, line.ends_with('\n')) else {

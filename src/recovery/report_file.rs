@@ -3,7 +3,7 @@
 
 use std::{
     fs::{self, OpenOptions},
-    io::{self, Write},
+    io::{self, Read, Write},
     os::unix::fs::OpenOptionsExt,
     path::{Path, PathBuf},
     time::Instant,
@@ -124,11 +124,11 @@ pub(crate) fn read(checkpoint: &Path) -> Vec<ReportRecord> {
 }
 
 fn read_one(file: &Path) -> Option<ReportRecord> {
-    let file = regular_file::open(file).ok()?;
+    let file = regular_file::open_ours(file).ok()?;
     if file.metadata().ok()?.len() > LARGEST {
         return None;
     }
-    let text = io::read_to_string(file).ok()?;
+    let text = io::read_to_string(file.take(LARGEST)).ok()?;
     serde_json::from_str(text.lines().next_back()?).ok()
 }
 

@@ -63,7 +63,7 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
         for number in names.numbers(&Disk, kind.name())?.into_iter().rev() {
             let path = names.numbered(kind.name(), number);
             // Another process may have removed the file.
-            let Ok(metadata) = fs::metadata(&path) else {
+            let Ok(metadata) = fs::symlink_metadata(&path) else {
                 continue;
             };
             kept.push(Kept {

@@ -68,12 +68,12 @@ pub(super) fn load(
     // The id is taken before reading. So a file that replaces this one later has another id, and is kept under another
     // name.
     let id = storage.id_at(path).ok().flatten();
-    let bytes = match read(storage, path) {
+    let bytes = match read(storage, names, path) {
         Ok(None) => return Ok(None),
         Ok(Some(bytes)) => Ok(bytes),
         Err(error) => Err(error),
     };
-    let previous = read(storage, &names.previous());
+    let previous = read(storage, names, &names.previous());
     let mut bad_previous = previous.is_err().then_some(UNREADABLE);
     let previous = previous.ok().flatten();
     let previous = previous.as_deref().and_then(|bytes| {
@@ -135,13 +135,13 @@ fn load_present(
     Ok(join(names, &present, snapshot, previous, bytes))
 }
 
-fn read(storage: &impl Storage, path: &Path) -> Result<Option<Vec<u8>>, OpenError> {
+fn read(storage: &impl Storage, names: &Names, path: &Path) -> Result<Option<Vec<u8>>, OpenError> {
     let failed = |source| OpenError::Io {
         doing: "read",
         path: path.to_owned(),
         source,
     };
-    match storage.read(path, FILE_BYTES_MAX) {
+    match names.read(storage, path) {
         Ok(bytes) => Ok(Some(bytes)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(failed(error)),

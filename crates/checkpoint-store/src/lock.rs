@@ -122,7 +122,7 @@ fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
 
 /// Reads the process id from the lock file at `path`.
 fn holder_in(path: &Path) -> Refused {
-    regular_file::open(path).ok().and_then(holder)
+    regular_file::open_ours(path).ok().and_then(holder)
 }
 
 /// Reads the process id from a lock file.

@@ -25,6 +25,12 @@ use rescue_core::checkpoint::{
 
 /// Size of the records for which a new part begins, in bytes.
 const PART_BYTES_MAX: u64 = 1 << 20;
+/// Maximum size of the first line and the snapshot of a part, in bytes.
+const SNAPSHOT_BYTES_MAX: u64 = 64 << 20;
+/// Maximum size of the records in a part, in bytes. One generation can have more than [`PART_BYTES_MAX`].
+const RECORDS_BYTES_MAX: u64 = 64 << 20;
+/// How many bytes of a compressed part are looked at first. They contain the first line.
+const FIRST_BYTES: u64 = 4096;
 /// A part has at most this fraction of the log's space, so that the oldest can be removed.
 const PARTS_MIN: u64 = 8;
 
@@ -88,7 +94,7 @@ impl<S: Storage> LogKeeper<S> {
     }
 
     fn try_keep(&mut self, storage: &S, names: &Names, path: &Path) -> io::Result<()> {
-        let bytes = storage.read(path, FILE_BYTES_MAX)?;
+        let bytes = names.read(storage, path)?;
         let framed = format::scan(&bytes).map_err(io::Error::other)?;
         let Some(header) = framed.header else {
             return Ok(());
@@ -109,7 +115,7 @@ impl<S: Storage> LogKeeper<S> {
 
     /// Begins a new part with the snapshot of `framed`. `None` if there is no usable snapshot, or not enough space.
     fn begin(
-        &self,
+        &mut self,
         storage: &S,
         names: &Names,
         framed: &Framed<'_>,
@@ -119,14 +125,18 @@ impl<S: Storage> LogKeeper<S> {
         };
         let parts = names.log_parts(storage)?;
         for &(number, closed) in &parts {
-            if !closed {
-                close(storage, names, number)?;
+            if !closed && let Err(error) = close(storage, names, number) {
+                // The part stays as it is, and can be read.
+                let path = names.log_part(number);
+                let path = path.display();
+                self.trouble = Some(format!("cannot compress `{path}`: {error}"));
             }
         }
-        if head.len() as u64 > self.bytes_max / 2 {
+        if head.len() as u64 > SNAPSHOT_BYTES_MAX.min(self.bytes_max / 2) {
             return Ok(None);
         }
-        let number = parts.last().map_or(0, |(number, _)| *number) + 1;
+        let last = parts.last().map_or(0, |(number, _)| *number);
+        let number = names.next_log_part(storage, last)?;
         let file = storage.create(&names.log_part(number))?;
         append_all(storage, &file, head)?;
         Ok(Some(OpenPart {
@@ -141,7 +151,7 @@ impl<S: Storage> LogKeeper<S> {
     fn trim(&mut self, storage: &S, names: &Names) -> io::Result<()> {
         let mut total: u64 = 0;
         for (number, closed) in names.log_parts(storage)?.into_iter().rev() {
-            let path = part_path(names, number, closed);
+            let path = names.log_part_at(number, closed);
             total = total.saturating_add(storage.length_at(&path)?);
             if total > self.bytes_max {
                 storage.remove(&path)?;
@@ -160,8 +170,9 @@ impl<S: Storage> LogKeeper<S> {
         }
         self.part = None;
         let parts = names.log_parts(storage).unwrap_or_default().into_iter();
-        let mut removed = parts
-            .filter(|(number, closed)| storage.remove(&part_path(names, *number, *closed)).is_ok());
+        let mut removed = parts.filter(|(number, closed)| {
+            storage.remove(&names.log_part_at(*number, *closed)).is_ok()
+        });
         let any = removed.next().is_some();
         removed.for_each(drop);
         if any {
@@ -172,12 +183,13 @@ impl<S: Storage> LogKeeper<S> {
 }
 
 impl<S: Storage> OpenPart<S> {
-    /// Adds the records after the last one, up to the first gap.
+    /// Adds the records after the last one, up to the first gap, or until the part is full.
     fn add(mut self, storage: &S, framed: &Framed<'_>) -> io::Result<Self> {
         let mut lines = Vec::new();
         let mut last = self.last;
         for line in &framed.lines {
-            if line.seq == last + 1 {
+            let size = self.bytes + (lines.len() + line.body().len()) as u64;
+            if line.seq == last + 1 && size < RECORDS_BYTES_MAX {
                 let start = lines.len();
                 lines.extend_from_slice(line.body());
                 format::seal(&mut lines, start, self.stamp);
@@ -191,18 +203,12 @@ impl<S: Storage> OpenPart<S> {
     }
 }
 
-fn part_path(names: &Names, number: u64, closed: bool) -> PathBuf {
-    match closed {
-        true => names.closed_log_part(number),
-        false => names.log_part(number),
-    }
-}
-
 /// Compresses a part that no longer grows.
 fn close(storage: &impl Storage, names: &Names, number: u64) -> io::Result<()> {
     let (open, closed) = (names.log_part(number), names.closed_log_part(number));
-    if storage.id_at(&closed)?.is_none() {
-        let bytes = storage.read(&open, FILE_BYTES_MAX)?;
+    // What others have planted under the name of the compressed file is replaced.
+    if storage.length_at(&closed).is_err() {
+        let bytes = storage.read(&open, SNAPSHOT_BYTES_MAX + RECORDS_BYTES_MAX)?;
         let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
         encoder.write_all(&bytes)?;
         let packed = encoder.finish()?;
@@ -221,7 +227,19 @@ fn close(storage: &impl Storage, names: &Names, number: u64) -> io::Result<()> {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LogFile {
     pub path: PathBuf,
-    closed: bool,
+    content: Content,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Content {
+    Checkpoint,
+    PreviousGeneration,
+    /// A part of the log.
+    Part {
+        closed: bool,
+    },
+    /// The file is named like a part, but others have planted or renamed it.
+    Foreign,
 }
 
 impl LogFile {
@@ -229,26 +247,55 @@ impl LogFile {
     ///
     /// # Errors
     ///
-    /// If it cannot be read or decompressed.
+    /// If it cannot be read or decompressed, or is a planted file.
     pub fn read(&self) -> io::Result<Vec<u8>> {
         self.read_on(&Disk)
     }
 
     pub(super) fn read_on(&self, storage: &impl Storage) -> io::Result<Vec<u8>> {
-        let bytes = storage.read(&self.path, FILE_BYTES_MAX)?;
-        if !self.closed {
-            return Ok(bytes);
+        let part_max = SNAPSHOT_BYTES_MAX + RECORDS_BYTES_MAX;
+        match self.content {
+            Content::Checkpoint => storage.read_named(&self.path, FILE_BYTES_MAX),
+            Content::PreviousGeneration => storage.read(&self.path, FILE_BYTES_MAX),
+            Content::Part { closed: false } => storage.read(&self.path, part_max),
+            Content::Part { closed: true } => decompress(&storage.read(&self.path, part_max)?),
+            Content::Foreign => {
+                // Names the reason if it is about the file and not about its number.
+                storage.length_at(&self.path)?;
+                Err(io::Error::other("no part of the log has such a number"))
+            }
         }
-        let mut text = Vec::new();
-        MultiGzDecoder::new(bytes.as_slice())
-            .take(FILE_BYTES_MAX)
-            .read_to_end(&mut text)?;
-        Ok(text)
+    }
+}
+
+/// Decompresses a part. Stops as soon as the part is larger than its first line allows.
+fn decompress(bytes: &[u8]) -> io::Result<Vec<u8>> {
+    let mut decoder = MultiGzDecoder::new(bytes);
+    let mut text = Vec::new();
+    decoder.by_ref().take(FIRST_BYTES).read_to_end(&mut text)?;
+    if text.is_empty() {
+        // A crash came before the first line.
+        return Ok(text);
+    }
+    let head = format::head_length(&text).filter(|head| *head <= SNAPSHOT_BYTES_MAX);
+    let Some(head) = head else {
+        return Err(io::Error::other("it is not a part of the log"));
+    };
+    let limit = head + RECORDS_BYTES_MAX;
+    decoder
+        .take(limit.saturating_sub(FIRST_BYTES))
+        .read_to_end(&mut text)?;
+    match text.len() as u64 >= limit {
+        true => Err(io::Error::other(
+            "it is not a part of the log: it is too large",
+        )),
+        false => Ok(text),
     }
 }
 
 /// Lists the files that together have the history of the checkpoint at `path`, oldest first: the parts of the log, the
-/// previous generation, and the checkpoint itself. Their records may overlap. Links in `path` must be resolved.
+/// previous generation, and the checkpoint itself. Their records may overlap. Links in `path` must be resolved. Planted
+/// files that only have the name of a part come first; reading one fails and says why.
 ///
 /// # Errors
 ///
@@ -262,22 +309,30 @@ pub fn files(path: &Path) -> io::Result<Vec<LogFile>> {
 
 pub(super) fn files_on(storage: &impl Storage, names: &Names) -> io::Result<Vec<LogFile>> {
     let parts = names.log_parts(storage)?;
+    let foreign = names.false_log_parts(storage)?.into_iter();
+    let mut files: Vec<_> = foreign
+        .map(|path| LogFile {
+            path,
+            content: Content::Foreign,
+        })
+        .collect();
     // After a crash, a part may be there in both forms.
     let is_twice = |number: u64, closed: bool| !closed && parts.contains(&(number, true));
     let parts = parts
         .iter()
         .filter(|(number, closed)| !is_twice(*number, *closed));
-    let mut files: Vec<_> = parts
-        .map(|&(number, closed)| LogFile {
-            path: part_path(names, number, closed),
-            closed,
-        })
-        .collect();
-    let live = [previous(&names.path), names.path.clone()];
-    files.extend(live.map(|path| LogFile {
-        path,
-        closed: false,
+    files.extend(parts.map(|&(number, closed)| LogFile {
+        path: names.log_part_at(number, closed),
+        content: Content::Part { closed },
     }));
+    files.push(LogFile {
+        path: previous(&names.path),
+        content: Content::PreviousGeneration,
+    });
+    files.push(LogFile {
+        path: names.path.clone(),
+        content: Content::Checkpoint,
+    });
     Ok(files)
 }
 

@@ -3,10 +3,16 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::load::FILE_BYTES_MAX;
 use super::{Storage, StoreError};
 
 /// Number of files of one kind to keep. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
+
+/// Highest number in the name of a file beside the checkpoint. Counting continues from the numbers that are there, so a
+/// planted number must not be near the end of a type. No robot gets this far: that takes a part of the log per second
+/// for 30 years.
+const NUMBER_MAX: u64 = 999_999_999;
 
 /// The paths of a checkpoint and of the files beside it, such as the lock file. All are in one folder.
 #[derive(Clone, Debug)]
@@ -46,11 +52,79 @@ impl Names {
         let part = |ending: &String| {
             let number = ending.strip_prefix("log-")?;
             let closed = number.strip_suffix(".gz");
-            Some((closed.unwrap_or(number).parse().ok()?, closed.is_some()))
+            Some((number_in(closed.unwrap_or(number))?, closed.is_some()))
         };
         let mut parts: Vec<_> = self.endings(storage)?.iter().filter_map(part).collect();
+        parts.retain(|(number, closed)| is_ours(storage, &self.log_part_at(*number, *closed)));
         parts.sort_unstable();
         Ok(parts)
+    }
+
+    /// Files that are named like a part of the log but cannot be one: others have planted or renamed them.
+    pub(super) fn false_log_parts(&self, storage: &impl Storage) -> io::Result<Vec<PathBuf>> {
+        let named: Vec<_> = self.endings(storage)?;
+        let parts = named.iter().filter(|ending| {
+            let number = ending.strip_prefix("log-");
+            let number = number.map(|it| it.strip_suffix(".gz").unwrap_or(it));
+            let is_named =
+                number.is_some_and(|it| !it.is_empty() && it.bytes().all(|b| b.is_ascii_digit()));
+            let possible = number.is_some_and(|it| number_in(it).is_some());
+            is_named && !(possible && is_ours(storage, &self.with(&format!(".{ending}"))))
+        });
+        let mut paths: Vec<_> = parts
+            .map(|ending| self.with(&format!(".{ending}")))
+            .collect();
+        paths.sort_unstable();
+        Ok(paths)
+    }
+
+    /// The file of part `number` of the log, compressed or not.
+    pub(super) fn log_part_at(&self, number: u64, closed: bool) -> PathBuf {
+        match closed {
+            true => self.closed_log_part(number),
+            false => self.log_part(number),
+        }
+    }
+
+    /// The number of the next part of the log. Leaves out numbers that others have planted.
+    ///
+    /// # Errors
+    ///
+    /// If the last part has the highest possible number.
+    pub(super) fn next_log_part(&self, storage: &impl Storage, last: u64) -> io::Result<u64> {
+        self.next_number(storage, last, |number| {
+            vec![self.log_part(number), self.closed_log_part(number)]
+        })
+    }
+
+    /// The first number after `last` whose file names are free.
+    fn next_number(
+        &self,
+        storage: &impl Storage,
+        last: u64,
+        files: impl Fn(u64) -> Vec<PathBuf>,
+    ) -> io::Result<u64> {
+        for number in last.saturating_add(1)..=NUMBER_MAX {
+            let mut is_free = true;
+            for file in files(number) {
+                is_free &= storage.id_at(&file)?.is_none();
+            }
+            if is_free {
+                return Ok(number);
+            }
+        }
+        let path = self.path.display();
+        Err(io::Error::other(format!(
+            "a file beside `{path}` has the highest possible number, {NUMBER_MAX}; remove it"
+        )))
+    }
+
+    /// Reads the checkpoint itself or a file beside it.
+    pub(super) fn read(&self, storage: &impl Storage, path: &Path) -> io::Result<Vec<u8>> {
+        match path == self.path {
+            true => storage.read_named(path, FILE_BYTES_MAX),
+            false => storage.read(path, FILE_BYTES_MAX),
+        }
     }
 
     pub(super) fn superseded(&self) -> StoreError {
@@ -71,16 +145,11 @@ impl Names {
             .collect())
     }
 
-    /// The numbers of the files named `PATH.KIND-NUMBER`, lowest first.
+    /// The numbers of our files named `PATH.KIND-NUMBER`, lowest first.
     pub(super) fn numbers(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<u64>> {
-        let number = |ending: &String| {
-            ending
-                .strip_prefix(kind)?
-                .strip_prefix('-')?
-                .parse::<u64>()
-                .ok()
-        };
+        let number = |ending: &String| number_in(ending.strip_prefix(kind)?.strip_prefix('-')?);
         let mut numbers: Vec<u64> = self.endings(storage)?.iter().filter_map(number).collect();
+        numbers.retain(|number| is_ours(storage, &self.numbered(kind, *number)));
         numbers.sort_unstable();
         Ok(numbers)
     }
@@ -100,7 +169,8 @@ impl Names {
             let _ = storage.remove(&path);
             let _ = storage.remove(&previous(&path));
         }
-        let number = found.last().copied().unwrap_or(0).saturating_add(1);
+        let last = found.last().copied().unwrap_or(0);
+        let number = self.next_number(storage, last, |number| vec![self.numbered(kind, number)])?;
         Ok(self.numbered(kind, number))
     }
 
@@ -118,6 +188,16 @@ impl Names {
         }
         Ok(())
     }
+}
+
+/// The number that `digits` are as rosrescue writes it.
+fn number_in(digits: &str) -> Option<u64> {
+    let number = digits.parse::<u64>().ok()?;
+    (number <= NUMBER_MAX && number.to_string() == digits).then_some(number)
+}
+
+fn is_ours(storage: &impl Storage, path: &Path) -> bool {
+    storage.length_at(path).is_ok()
 }
 
 /// The name of the previous generation: the file that the one at `path` has replaced.

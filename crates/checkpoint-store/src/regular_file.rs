@@ -1,8 +1,12 @@
 //! Opens regular files safely in folders that other users may write to. No function waits for the other end of a pipe.
 //! A file for writing is never opened through a symbolic link, and never has a second hard link.
+//!
+//! Another user can plant a file in such a folder. A file counts as *ours* if no other user than this process's, root
+//! or the folder's owner can have made it. The owner of a folder can replace every file in it anyway, and `sudo
+//! rosrescue log` must be able to read a robot's files.
 
 use std::{
-    fs::{self, File, OpenOptions},
+    fs::{self, File, Metadata, OpenOptions},
     io,
     os::unix::fs::{MetadataExt, OpenOptionsExt},
     path::Path,
@@ -20,23 +24,41 @@ pub fn open(path: &Path) -> io::Result<File> {
     check(&file).map(|_| file)
 }
 
-/// Opens the file at `path` for reading and writing, or creates it with access for its owner only.
+/// Opens a file of ours at `path` for reading, such as a file beside the checkpoint.
+///
+/// # Errors
+///
+/// If the file cannot be opened, is a symbolic link or another irregular file, or belongs to another user.
+pub fn open_ours(path: &Path) -> io::Result<File> {
+    let flags = OFlags::NONBLOCK | OFlags::NOFOLLOW;
+    let file = with(OpenOptions::new().read(true), flags)
+        .open(path)
+        .map_err(name_link)?;
+    check_ours(path, &file.metadata()?).map(|()| file)
+}
+
+/// The length of the file of ours at `path`, in bytes.
+///
+/// # Errors
+///
+/// The errors of [`open_ours`].
+pub fn length_of_ours(path: &Path) -> io::Result<u64> {
+    let metadata = fs::symlink_metadata(path)?;
+    check_ours(path, &metadata).map(|()| metadata.len())
+}
+
+/// Opens the file of ours at `path` for reading and writing, or creates it with access for its owner only.
 /// Keeps existing content.
 ///
 /// # Errors
 ///
-/// If the file cannot be opened, is a symbolic link, is not a regular file, or has several hard
-/// links.
+/// The errors of [`open_ours`], or if the file has several hard links.
 pub fn open_or_create(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.mode(0o600).read(true).write(true).create(true);
     let flags = OFlags::NONBLOCK | OFlags::NOFOLLOW;
-    let file = match with(&mut options, flags).open(path) {
-        Err(error) if error.raw_os_error() == Some(rustix::io::Errno::LOOP.raw_os_error()) => {
-            return Err(io::Error::other("it is a symbolic link"));
-        }
-        opened => opened?,
-    };
+    let file = with(&mut options, flags).open(path).map_err(name_link)?;
+    check_ours(path, &file.metadata()?)?;
     match check(&file)? {
         0 | 1 => Ok(file),
         _ => Err(io::Error::other("the file has another hard link")),
@@ -75,6 +97,38 @@ fn check(file: &File) -> io::Result<u64> {
     }
 }
 
+/// Checks the file at `path` with this `metadata`.
+fn check_ours(path: &Path, metadata: &Metadata) -> io::Result<()> {
+    if metadata.is_symlink() {
+        return Err(io::Error::other(LINK));
+    }
+    if !metadata.is_file() {
+        return Err(irregular());
+    }
+    let folder = match path.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    let own = rustix::process::geteuid().as_raw();
+    let owner = metadata.uid();
+    if owner == own || owner == 0 || owner == fs::metadata(folder)?.uid() {
+        return Ok(());
+    }
+    Err(io::Error::other(format!(
+        "it belongs to another user (number {owner})"
+    )))
+}
+
+/// Names the reason if a symbolic link could not be opened.
+fn name_link(error: io::Error) -> io::Error {
+    match error.raw_os_error() == Some(rustix::io::Errno::LOOP.raw_os_error()) {
+        true => io::Error::other(LINK),
+        false => error,
+    }
+}
+
+const LINK: &str = "it is a symbolic link";
+
 fn irregular() -> io::Error {
     io::Error::other("it is not a regular file")
 }
@@ -103,11 +157,40 @@ mod tests {
             assert!(open_or_create(&path(name)).is_err(), "{name}");
         }
         assert!(open(&fifo).is_err());
+        for name in ["link", "fifo"] {
+            assert!(open_ours(&path(name)).is_err(), "{name}");
+            assert!(length_of_ours(&path(name)).is_err(), "{name}");
+        }
+        let error = open_ours(&path("link")).unwrap_err();
+        assert_eq!(error.to_string(), LINK);
+        assert_eq!(length_of_ours(&path("target")).unwrap(), 4);
         assert!(open(&path("link")).is_ok());
         // One of the two names is removed. The content remains under the other.
         create(&path("second")).unwrap().write_all(b"new").unwrap();
         assert_eq!(fs::read_to_string(path("target")).unwrap(), "kept");
         assert_eq!(fs::read_to_string(path("second")).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_file_of_another_user_is_not_ours_unless_the_folder_is_his() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        fs::write(&path, "planted").unwrap();
+        let other = Some(12_345);
+        if std::os::unix::fs::chown(&path, other, None).is_err() {
+            // Only root can give a file away.
+            return;
+        }
+        let error = open_ours(&path).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "it belongs to another user (number 12345)"
+        );
+        assert!(open_or_create(&path).is_err());
+        assert!(length_of_ours(&path).is_err());
+        assert!(open(&path).is_ok());
+        std::os::unix::fs::chown(folder.path(), other, None).unwrap();
+        assert!(open_ours(&path).is_ok());
     }
 
     #[test]

@@ -69,8 +69,13 @@ pub trait Storage: Clone + Send + Sync + 'static {
     -> io::Result<Result<(), Option<u32>>>;
     /// The id of the lock file.
     fn lock_id(&self, lock: &Self::Lock) -> io::Result<FileId>;
-    /// Reads the whole content of the file at `path`. A file of more than `limit` bytes is an error.
+    /// Reads the whole content of the file at `path`. A file of more than `limit` bytes is an error, as is one that is
+    /// not a regular file of [ours](crate::regular_file).
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
+    /// Does the same for a regular file that the operator has named, whoever owns it.
+    fn read_named(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
+        self.read(path, limit)
+    }
     /// Creates an empty file, readable and writable for its owner only. Replaces an existing one.
     fn create(&self, path: &Path) -> io::Result<Self::File>;
     /// Writes at the end of the file, and returns how many bytes were written.
@@ -85,7 +90,8 @@ pub trait Storage: Clone + Send + Sync + 'static {
     /// Renames `from` to `path`, and the file that was at `path` to `aside`, an unused name.
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()>;
     fn status(&self, file: &Self::File) -> io::Result<FileStatus>;
-    /// The length of the file at `path`, in bytes.
+    /// The length of the file at `path`, in bytes. A file that is not a regular file of [ours](crate::regular_file) is
+    /// an error.
     fn length_at(&self, path: &Path) -> io::Result<u64>;
     /// The id of the file at `path`, if there is one.
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>>;
@@ -109,6 +115,20 @@ impl Disk {
         let mut options = OpenOptions::new();
         options.mode(0o600);
         options
+    }
+}
+
+fn read_all(file: &File, limit: u64) -> io::Result<Vec<u8>> {
+    let too_large = || io::Error::other("it is larger than such a file can be");
+    if file.metadata()?.len() > limit {
+        return Err(too_large());
+    }
+    let mut bytes = Vec::new();
+    file.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    match bytes.len() as u64 > limit {
+        // It has grown meanwhile.
+        true => Err(too_large()),
+        false => Ok(bytes),
     }
 }
 
@@ -156,13 +176,11 @@ impl Storage for Disk {
     }
 
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
-        let file = regular_file::open(path)?;
-        if file.metadata()?.len() > limit {
-            return Err(io::Error::other("it is larger than any checkpoint"));
-        }
-        let mut bytes = Vec::new();
-        file.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
-        Ok(bytes)
+        read_all(&regular_file::open_ours(path)?, limit)
+    }
+
+    fn read_named(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
+        read_all(&regular_file::open(path)?, limit)
     }
 
     fn create(&self, path: &Path) -> io::Result<File> {
@@ -241,7 +259,7 @@ impl Storage for Disk {
     }
 
     fn length_at(&self, path: &Path) -> io::Result<u64> {
-        Ok(fs::symlink_metadata(path)?.len())
+        regular_file::length_of_ours(path)
     }
 
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {

@@ -13,7 +13,7 @@ use crate::{
     ledger::journal::{DISK_PATIENCE, SILENT},
     limit::rarely,
     master::{Master, Request},
-    wait,
+    regular_file, wait,
 };
 
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
@@ -40,10 +40,13 @@ impl Kept {
     pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
         let path = path_of(checkpoint);
         let opened = wait::within(DISK_PATIENCE, move || {
+            if let Err(error) = check(&path) {
+                return Some(Err(error.to_string()));
+            }
             if !path.exists() {
                 return None;
             }
-            let mut opened = Store::open(&path);
+            let mut opened = Store::open(&path).map_err(|error| error.to_string());
             if let (Ok((store, Some(_))), false) = (&mut opened, goes_on) {
                 keep_of_session(store);
                 return None;
@@ -86,7 +89,13 @@ impl Kept {
         let path = path_of(checkpoint);
         let store = match self.store.take() {
             Some(store) => Some(Ok(store)),
-            None => wait::within(DISK_PATIENCE, move || Store::open_over(&path)).await,
+            None => {
+                let open = move || {
+                    check(&path)?;
+                    Store::open_over(&path).map_err(|error| error.to_string())
+                };
+                wait::within(DISK_PATIENCE, open).await
+            }
         };
         match store {
             Some(Ok(store)) => self.write(store, base, calls).await,
@@ -149,6 +158,17 @@ impl Kept {
         let path = path_of(checkpoint);
         // A hanging disk may remove the file later: it must only be gone before the next start.
         wait::within(DISK_PATIENCE, move || remove_files(path)).await;
+    }
+}
+
+/// Refuses a file that others have planted at `path`.
+fn check(path: &Path) -> Result<(), String> {
+    match regular_file::length_of_ours(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            let path = path.display();
+            Err(format!("cannot use `{path}`: {error}"))
+        }
+        _ => Ok(()),
     }
 }
 

@@ -259,6 +259,13 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
     Ok(header)
 }
 
+/// Length of the first line and the snapshot of a file, in bytes, according to its first line. `None` if that is not
+/// valid. The file's first 256 bytes are enough.
+pub fn head_length(bytes: &[u8]) -> Option<u64> {
+    let header = read_header(bytes).ok()??;
+    header.snapshot.checked_add(header.length as u64)
+}
+
 /// Whether a file without a valid first line and without a valid record is a damaged checkpoint and not another
 /// program's file. It counts as a checkpoint if it is empty, begins with zeros (as after a crash of the computer), or
 /// still has most of the start of the first line or of the document.
