@@ -3,7 +3,7 @@
 //! The options of the file become words of the command line, so clap checks them like any other. Options that the
 //! command line or the environment gives are left out.
 
-use std::{collections::BTreeSet, ffi::OsString, fs, path::PathBuf};
+use std::{collections::BTreeSet, ffi::OsString, path::PathBuf};
 
 use clap::{
     Arg, ArgMatches, Command, Id,
@@ -12,6 +12,8 @@ use clap::{
 };
 use serde::Serialize;
 use toml::{Table, Value};
+
+use crate::regular_file::read_small;
 
 /// The option that names the file.
 const OPTION: &str = "config";
@@ -57,7 +59,7 @@ pub(crate) fn insert(command: &Command, words: &mut Vec<OsString>) -> Result<Fro
         return Ok(FromFile::default());
     };
     let fail = |why: String| format!("{}: {}", path.display(), why.trim());
-    let text = fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
+    let text = read_small(path).map_err(|error| fail(error.to_string()))?;
     let table: Table = text
         .parse()
         .map_err(|error: toml::de::Error| fail(error.to_string()))?;

@@ -17,7 +17,7 @@ use crate::{
         session,
         store::{
             self, OpenError, history,
-            log::{NoPast, PastState, past_state},
+            log::{KnownTimes, NoPast, PastState, past_state},
         },
     },
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
@@ -202,7 +202,7 @@ pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, Command
         at => at.millis(clock::wall_millis()),
     };
     let shown = path.display();
-    match past_state(&path, time) {
+    match past_state(&path, time, &mut KnownTimes::default()) {
         Ok(past) => opened_at(past, args),
         Err(NoPast::Folder(error)) => Err(CommandFailure::Usage(format!(
             "cannot read the log beside `{shown}`: {error}"
@@ -222,6 +222,13 @@ pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, Command
 
 fn opened_at(past: PastState, args: &ReadArgs) -> Result<Opened, CommandFailure> {
     let PastState { path, moment, .. } = past;
+    if past.is_set_back {
+        eprintln!(
+            "rosrescue: the clock was set back: changes after record {} have this time or an earlier one, and are not \
+             shown. `rosrescue log` lists them in their order",
+            moment.seq
+        );
+    }
     let rebuilt = moment.rebuilt;
     let mut damage = past.unread;
     if !moment.exact {

@@ -1,7 +1,7 @@
 //! The configuration of a robot with several computers.
 
 use std::{
-    fmt, fs, io,
+    fmt, io,
     net::{IpAddr, Ipv6Addr},
     path::{Path, PathBuf},
     time::Duration,
@@ -13,6 +13,7 @@ use thiserror::Error;
 pub use crate::cli::{ClusterSync, WhenCutOff};
 use crate::{
     cli::{ClusterArgs, cluster::name},
+    regular_file::read_small,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 
@@ -234,7 +235,7 @@ fn advertised(given: &str, port: u16) -> Result<MasterUri, ClusterError> {
 }
 
 fn password(file: &Path) -> Result<String, ClusterError> {
-    let read = fs::read_to_string(file).and_then(|text| match text.lines().next() {
+    let read = read_small(file).and_then(|text| match text.lines().next() {
         None | Some("") => Err(io::Error::other("its first line is empty")),
         Some(line) => Ok(line.to_owned()),
     });
@@ -246,6 +247,8 @@ fn password(file: &Path) -> Result<String, ClusterError> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use clap::Parser;
 
     use super::*;

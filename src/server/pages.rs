@@ -38,6 +38,7 @@ use super::{
     replies::{HttpReply, page as reply, text},
 };
 use crate::{
+    checkpoint::store::log::KnownTimes,
     gate,
     hide::Hide,
     ledger::Ledger,
@@ -105,7 +106,7 @@ pub(crate) struct PageState {
     /// Permit to build the complete state, which happens one request at a time.
     reading: Semaphore,
     /// Permit to read earlier states, which happens for one request at a time, even if its client has gone.
-    reading_past: Arc<Semaphore>,
+    reading_past: Arc<tokio::sync::Mutex<KnownTimes>>,
 }
 
 impl Default for PageState {
@@ -113,7 +114,7 @@ impl Default for PageState {
         Self {
             feed: Feed::default(),
             reading: Semaphore::new(1),
-            reading_past: Arc::new(Semaphore::new(1)),
+            reading_past: Arc::default(),
         }
     }
 }

@@ -7,7 +7,7 @@
 //! Nothing depends on the log. It is written by the job that writes a new generation, in the background, and a failure
 //! only leaves records out of the log. It is not synced, except for a compressed part before it replaces the other one.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -20,7 +20,7 @@ use super::names::previous;
 use super::{Disk, Names, Storage};
 use rescue_core::checkpoint::{
     format::{self, Framed, Stamp},
-    log::{self, Moment},
+    log::{self, Moment, Span},
 };
 
 /// Size of the records for which a new part begins, in bytes.
@@ -295,7 +295,7 @@ fn decompress(bytes: &[u8]) -> io::Result<Vec<u8>> {
 
 /// Lists the files that together have the history of the checkpoint at `path`, oldest first: the parts of the log, the
 /// previous generation, and the checkpoint itself. Their records may overlap. Links in `path` must be resolved. Planted
-/// files that only have the name of a part come first; reading one fails and says why.
+/// files that only have the name of a part are among them; reading one fails and says why.
 ///
 /// # Errors
 ///
@@ -310,10 +310,10 @@ pub fn files(path: &Path) -> io::Result<Vec<LogFile>> {
 pub(super) fn files_on(storage: &impl Storage, names: &Names) -> io::Result<Vec<LogFile>> {
     let parts = names.log_parts(storage)?;
     let foreign = names.false_log_parts(storage)?.into_iter();
-    let mut files: Vec<_> = foreign
-        .map(|path| LogFile {
-            path,
-            content: Content::Foreign,
+    let mut numbered: Vec<_> = foreign
+        .map(|(number, path)| {
+            let content = Content::Foreign;
+            (number, LogFile { path, content })
         })
         .collect();
     // After a crash, a part may be there in both forms.
@@ -321,10 +321,13 @@ pub(super) fn files_on(storage: &impl Storage, names: &Names) -> io::Result<Vec<
     let parts = parts
         .iter()
         .filter(|(number, closed)| !is_twice(*number, *closed));
-    files.extend(parts.map(|&(number, closed)| LogFile {
-        path: names.log_part_at(number, closed),
-        content: Content::Part { closed },
+    numbered.extend(parts.map(|&(number, closed)| {
+        let path = names.log_part_at(number, closed);
+        let content = Content::Part { closed };
+        (number, LogFile { path, content })
     }));
+    numbered.sort_by_key(|(number, _)| *number);
+    let mut files: Vec<_> = numbered.into_iter().map(|(_, file)| file).collect();
     files.push(LogFile {
         path: previous(&names.path),
         content: Content::PreviousGeneration,
@@ -345,7 +348,13 @@ pub struct PastState {
     pub moment: Moment,
     /// Why later files could not be used, one sentence each.
     pub unread: Vec<String>,
+    /// Whether records after this state have the time of the state or an earlier one: the clock was set back.
+    pub is_set_back: bool,
 }
+
+/// The times in compressed parts that were read before. Such a part never changes.
+#[derive(Debug, Default)]
+pub struct KnownTimes(HashMap<PathBuf, Span>);
 
 /// Why there is no state of a time.
 #[derive(Debug, thiserror::Error)]
@@ -357,38 +366,85 @@ pub enum NoPast {
     Later(Vec<String>),
 }
 
-/// Rebuilds the state that the history of the checkpoint at `path` had at `time`, in milliseconds since 1970. Links in
-/// `path` must be resolved.
+/// Rebuilds the state that the history of the checkpoint at `path` had at `time`, in milliseconds since 1970: before the
+/// first record with a later time. Links in `path` must be resolved.
 ///
 /// # Errors
 ///
 /// If there is no usable state of that time.
-pub fn past_state(path: &Path, time: u64) -> Result<PastState, NoPast> {
+pub fn past_state(path: &Path, time: u64, known: &mut KnownTimes) -> Result<PastState, NoPast> {
+    let files = files(path)?;
+    known
+        .0
+        .retain(|path, _| files.iter().any(|file| file.path == *path));
+    let mut found: Option<PastState> = None;
+    // Why files after the one in `found` could not be used.
     let mut unread = Vec::new();
-    for file in files(path)?.into_iter().rev() {
-        let shown = file.path.display();
-        let text = match file.read() {
-            Ok(text) => text,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-            Err(error) => {
-                unread.push(format!("cannot read `{shown}`: {error}"));
-                continue;
+    let mut is_over = false;
+    for file in files {
+        match read_past(&file, time, is_over, known) {
+            Ok((span, state)) => {
+                if let Some(state) = state {
+                    unread.clear();
+                    found = Some(state);
+                } else if let Some(found) = &mut found
+                    && span.earliest <= time
+                {
+                    let seq = found.moment.seq;
+                    let is_set_back = || {
+                        let text = file.read().unwrap_or_default();
+                        log::is_set_back_after(&text, seq, time)
+                    };
+                    found.is_set_back |= span.snapshot_seq >= seq || is_set_back();
+                }
+                is_over |= span.latest > time;
             }
-        };
-        match log::moment(&text, time) {
-            Ok(Some(moment)) => {
-                return Ok(PastState {
-                    bytes: text.len() as u64,
-                    path: file.path,
-                    moment,
-                    unread,
-                });
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) if !is_over => {
+                let shown = file.path.display();
+                unread.push(format!("cannot use `{shown}`: {error}"));
             }
-            Ok(None) => {}
-            Err(why) => unread.push(format!("cannot use `{shown}`: {why}")),
+            Err(_) => {}
         }
     }
-    Err(NoPast::Later(unread))
+    match found {
+        Some(found) => Ok(PastState { unread, ..found }),
+        None => Err(NoPast::Later(unread)),
+    }
+}
+
+/// Reads the times in `file`, and its state at `time` if the history before it is not later (`is_over`).
+fn read_past(
+    file: &LogFile,
+    time: u64,
+    is_over: bool,
+    known: &mut KnownTimes,
+) -> io::Result<(Span, Option<PastState>)> {
+    let is_fixed = file.content == Content::Part { closed: true };
+    let mut text = None;
+    let span = match known.0.get(&file.path).filter(|_| is_fixed) {
+        Some(span) => *span,
+        None => log::span(text.insert(file.read()?)).map_err(io::Error::other)?,
+    };
+    if is_fixed {
+        known.0.insert(file.path.clone(), span);
+    }
+    if is_over {
+        return Ok((span, None));
+    }
+    let text = match text {
+        Some(text) => text,
+        None => file.read()?,
+    };
+    let moment = log::moment(&text, time).map_err(io::Error::other)?;
+    let state = moment.map(|moment| PastState {
+        bytes: text.len() as u64,
+        path: file.path.clone(),
+        is_set_back: moment.is_set_back,
+        moment,
+        unread: Vec::new(),
+    });
+    Ok((span, state))
 }
 
 /// The time at which the history of the checkpoint at `path` begins, in milliseconds since 1970. `None` if it is unknown.

@@ -60,22 +60,22 @@ impl Names {
         Ok(parts)
     }
 
-    /// Files that are named like a part of the log but cannot be one: others have planted or renamed them.
-    pub(super) fn false_log_parts(&self, storage: &impl Storage) -> io::Result<Vec<PathBuf>> {
-        let named: Vec<_> = self.endings(storage)?;
-        let parts = named.iter().filter(|ending| {
-            let number = ending.strip_prefix("log-");
-            let number = number.map(|it| it.strip_suffix(".gz").unwrap_or(it));
-            let is_named =
-                number.is_some_and(|it| !it.is_empty() && it.bytes().all(|b| b.is_ascii_digit()));
-            let possible = number.is_some_and(|it| number_in(it).is_some());
-            is_named && !(possible && is_ours(storage, &self.with(&format!(".{ending}"))))
-        });
-        let mut paths: Vec<_> = parts
-            .map(|ending| self.with(&format!(".{ending}")))
-            .collect();
-        paths.sort_unstable();
-        Ok(paths)
+    /// Files that are named like a part of the log but cannot be one: others have planted or renamed them. With the
+    /// number of each, or 0 if it cannot be.
+    pub(super) fn false_log_parts(
+        &self,
+        storage: &impl Storage,
+    ) -> io::Result<Vec<(u64, PathBuf)>> {
+        let foreign = |ending: &String| {
+            let name = ending.strip_prefix("log-")?;
+            let digits = name.strip_suffix(".gz").unwrap_or(name);
+            let is_number = !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit());
+            let path = self.with(&format!(".{ending}"));
+            let number = number_in(digits);
+            let is_part = number.is_some() && is_ours(storage, &path);
+            (is_number && !is_part).then(|| (number.unwrap_or(0), path))
+        };
+        Ok(self.endings(storage)?.iter().filter_map(foreign).collect())
     }
 
     /// The file of part `number` of the log, compressed or not.

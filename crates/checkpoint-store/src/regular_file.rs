@@ -7,7 +7,7 @@
 
 use std::{
     fs::{self, File, Metadata, OpenOptions},
-    io,
+    io::{self, Read},
     os::unix::fs::{MetadataExt, OpenOptionsExt},
     path::Path,
 };
@@ -22,6 +22,24 @@ use rustix::fs::OFlags;
 pub fn open(path: &Path) -> io::Result<File> {
     let file = with(OpenOptions::new().read(true), OFlags::NONBLOCK).open(path)?;
     check(&file).map(|_| file)
+}
+
+/// Largest file of options, a password or the like, in bytes.
+const SMALL: u64 = 1 << 20;
+
+/// Reads a small text from a file that the operator has named, which may also be a pipe.
+///
+/// # Errors
+///
+/// If the file cannot be read, is not UTF-8, or has more than 1 MiB.
+pub fn read_small(path: &Path) -> io::Result<String> {
+    let mut text = String::new();
+    let mut file = File::open(path)?.take(SMALL + 1);
+    file.read_to_string(&mut text)?;
+    match text.len() as u64 > SMALL {
+        true => Err(io::Error::other("it has more than 1 MiB")),
+        false => Ok(text),
+    }
 }
 
 /// Opens a file of ours at `path` for reading, such as a file beside the checkpoint.

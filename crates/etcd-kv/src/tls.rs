@@ -21,8 +21,8 @@ pub(super) use without::{Secured, TlsSettings};
 #[cfg(feature = "tls")]
 mod with {
     use std::{
-        fs::Metadata,
-        io,
+        fs::{File, Metadata},
+        io::{self, Read as _},
         os::unix::fs::MetadataExt,
         path::PathBuf,
         sync::{Arc, Mutex, PoisonError},
@@ -40,6 +40,9 @@ mod with {
 
     use super::Tls;
     use crate::EtcdError;
+
+    /// How much of a certificate file is read, in bytes.
+    const FILE_BYTES_MAX: u64 = 1 << 20;
 
     /// TLS settings that all connections share.
     #[derive(Clone, Debug)]
@@ -103,10 +106,16 @@ mod with {
                     path.display()
                 ))
             };
+            // `/dev/zero` never ends.
+            let open = |path: &PathBuf| {
+                let file = File::open(path).map_err(|error| refused(path, error.to_string()))?;
+                Ok(file.take(FILE_BYTES_MAX))
+            };
             let certificates = |path: &PathBuf| {
-                let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
-                let read: Vec<CertificateDer<'static>> =
-                    read.map_err(|error| refused(path, error.to_string()))?;
+                let read = CertificateDer::pem_reader_iter(open(path)?);
+                let read: Vec<CertificateDer<'static>> = read
+                    .collect::<Result<_, _>>()
+                    .map_err(|error| refused(path, error.to_string()))?;
                 match read.is_empty() {
                     true => Err(refused(path, "there is no certificate in it".to_owned())),
                     false => Ok(read),
@@ -122,7 +131,7 @@ mod with {
             let config = match (&self.cert, &self.key) {
                 (None, None) => builder.with_no_client_auth(),
                 (Some(cert), Some(key)) => {
-                    let private = PrivateKeyDer::from_pem_file(key)
+                    let private = PrivateKeyDer::from_pem_reader(open(key)?)
                         .map_err(|error| refused(key, error.to_string()))?;
                     builder
                         .with_client_auth_cert(certificates(cert)?, private)

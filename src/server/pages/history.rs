@@ -57,7 +57,7 @@ pub(super) async fn history(server: &Arc<Server>, asked: Asked) -> HttpReply {
         Ok(since) => since.millis(clock::wall_millis()),
         Err(why) => return text(StatusCode::BAD_REQUEST, why + "\n"),
     };
-    let Ok(turn) = server.pages.state.reading_past.clone().try_acquire_owned() else {
+    let Ok(turn) = server.pages.state.reading_past.clone().try_lock_owned() else {
         return busy();
     };
     let server = server.clone();

@@ -10,7 +10,7 @@ use super::{Asked, Pages, WholeState, in_background, robot::Robot, text};
 use crate::{
     checkpoint::{
         compare::{Described, compare},
-        store::log::{PastState, oldest, past_state},
+        store::log::{KnownTimes, PastState, oldest, past_state},
     },
     cli::When,
     clock,
@@ -31,6 +31,8 @@ pub(super) struct Past {
     oldest: Option<f64>,
     /// Whether no change before that time is missing.
     exact: bool,
+    /// Whether the clock was set back later: changes after this state have its time or an earlier one.
+    set_back: bool,
     /// How the earlier of two states differs from the later one.
     changes: Vec<Described>,
     /// Number of changes that are left out.
@@ -44,16 +46,13 @@ pub(super) async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
         (Err(why), _) | (_, Err(why)) => return text(StatusCode::BAD_REQUEST, why + "\n"),
     };
     let turn = server.pages.state.reading_past.clone();
-    let Ok(turn) = turn.try_acquire_owned() else {
+    let Ok(mut known) = turn.try_lock_owned() else {
         return busy();
     };
     let server = server.clone();
-    let work = move || {
-        let _turn = turn;
-        match answer(&server.pages, &asked, at, with) {
-            Ok(reply) => reply,
-            Err(why) => text(StatusCode::NOT_FOUND, why + "\n"),
-        }
+    let work = move || match answer(&server.pages, &asked, at, with, &mut known) {
+        Ok(reply) => reply,
+        Err(why) => text(StatusCode::NOT_FOUND, why + "\n"),
     };
     in_background(work).await
 }
@@ -64,7 +63,13 @@ pub(super) fn busy() -> HttpReply {
     text(StatusCode::SERVICE_UNAVAILABLE, why)
 }
 
-fn answer(pages: &Pages, asked: &Asked, at: When, with: Option<When>) -> Result<HttpReply, String> {
+fn answer(
+    pages: &Pages,
+    asked: &Asked,
+    at: When,
+    with: Option<When>,
+    known: &mut KnownTimes,
+) -> Result<HttpReply, String> {
     let path = Path::new(&pages.checkpoint);
     let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     let now = clock::wall_millis();
@@ -74,8 +79,8 @@ fn answer(pages: &Pages, asked: &Asked, at: When, with: Option<When>) -> Result<
         when => when.millis(now),
     };
     let begun = oldest(&path);
-    let read = |when| {
-        past_state(&path, time(when)).map_err(|error| match begun {
+    let mut read = |when| {
+        past_state(&path, time(when), known).map_err(|error| match begun {
             Some(begun) => format!(
                 "{error}; the log begins at {}",
                 clock::wall_text_millis(begun)
@@ -98,6 +103,7 @@ fn answer(pages: &Pages, asked: &Asked, at: When, with: Option<When>) -> Result<
         at: found.moment.at as f64 / 1e3,
         oldest: begun.map(|at| at as f64 / 1e3),
         exact: is_exact(&found),
+        set_back: found.is_set_back,
         more_changes: changes.len().saturating_sub(CHANGES),
         changes: changes
             .into_iter()

@@ -120,3 +120,30 @@ fn a_file_with_a_mistake_is_refused_in_a_sentence() {
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("/nonexistent: No such file"));
 }
+
+#[test]
+fn a_file_without_end_is_refused() {
+    let scratch = Scratch::new();
+    for (options, file) in [
+        (&[][..], "--config"),
+        (
+            &["--cluster", "127.0.0.1:1", "--cluster-user", "u"],
+            "--cluster-password-file",
+        ),
+    ] {
+        let mut endless = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+        scratch.prepare(&mut endless);
+        let output = endless
+            .arg("core")
+            .args(options)
+            .args([file, "/dev/zero"])
+            .output()
+            .unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{file}: {stderr}");
+        assert!(
+            stderr.contains("it has more than 1 MiB"),
+            "{file}: {stderr}"
+        );
+    }
+}

@@ -26,7 +26,7 @@ use crate::master::{Displaced, Master, Request, Snapshot};
 use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
-pub use frame::{Framed, head_length, push_body, push_record, read_records, scan, seal};
+pub use frame::{Framed, Line, head_length, push_body, push_record, read_records, scan, seal};
 pub use rosparam::{for_rosparam, shown};
 
 /// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512 levels) below a

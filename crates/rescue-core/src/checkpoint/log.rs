@@ -30,26 +30,63 @@ pub struct Moment {
     pub rebuilt: Rebuilt,
     /// Whether no record is missing.
     pub exact: bool,
+    /// Whether a later record in the file has the time of the state or an earlier one: the clock was set back.
+    pub is_set_back: bool,
 }
 
-/// Finds the state that the checkpoint file `text` has at `time`, in milliseconds since 1970: after the last record
-/// with this time or an earlier one. `None` if all of the file is later. To find the state of a whole history, ask its
-/// files from new to old. Where the clock was set back, this finds the later of two moments with the same time.
+/// The times in a checkpoint file, in milliseconds since 1970.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// The earliest time of a record. `u64::MAX` if there is no record.
+    pub earliest: u64,
+    /// The latest time of a record or of the snapshot.
+    pub latest: u64,
+    /// Number of the last record in the snapshot. All records of the file have higher ones.
+    pub snapshot_seq: u64,
+}
+
+/// Finds the times in the checkpoint file `text`.
+///
+/// # Errors
+///
+/// If the file cannot be used. The text says why.
+pub fn span(text: &[u8]) -> Result<Span, String> {
+    let framed = format::scan(text).map_err(|error| error.to_string())?;
+    let times = framed.lines.iter().map(format::Line::time);
+    Ok(Span {
+        earliest: times.clone().min().unwrap_or(u64::MAX),
+        latest: times.max().unwrap_or(0).max(framed.taken_at()),
+        snapshot_seq: framed.header.map_or(0, |header| header.seq),
+    })
+}
+
+/// Whether a record after number `seq` in the checkpoint file `text` has the `time` or an earlier one. Files of a
+/// history can overlap.
+pub fn is_set_back_after(text: &[u8], seq: u64, time: u64) -> bool {
+    let lines = format::scan(text).map(|framed| framed.lines);
+    let mut lines = lines.into_iter().flatten();
+    lines.any(|line| line.seq > seq && line.time() <= time)
+}
+
+/// Finds the state that the checkpoint file `text` has at `time`, in milliseconds since 1970: before the first record
+/// with a later time. `None` if the snapshot is later. The order is that of the records: after the clock was set back,
+/// records can follow that have an earlier time than those before them, and are no part of that state.
 ///
 /// # Errors
 ///
 /// If the file cannot be used. The text says why.
 pub fn moment(text: &[u8], time: u64) -> Result<Option<Moment>, String> {
     let mut framed = format::scan(text).map_err(|error| error.to_string())?;
-    let last = framed.lines.iter().rposition(|line| line.time() <= time);
-    let at = match last.and_then(|last| framed.lines.get(last)) {
-        Some(line) => line.time(),
-        None => framed.taken_at(),
-    };
-    if at > time {
+    if framed.taken_at() > time {
         return Ok(None);
     }
-    framed.lines.truncate(last.map_or(0, |last| last + 1));
+    let later = framed.lines.iter().position(|line| line.time() > time);
+    let end = later.unwrap_or(framed.lines.len());
+    let last = end.checked_sub(1).and_then(|last| framed.lines.get(last));
+    let at = last.map_or_else(|| framed.taken_at(), format::Line::time);
+    let mut after = framed.lines.iter().skip(end);
+    let is_set_back = after.any(|line| line.time() <= time);
+    framed.lines.truncate(end);
     let checkpoint = framed.checkpoint().map_err(|error| error.to_string())?;
     let snapshot_seq = checkpoint.seq;
     let records = framed.records(snapshot_seq, &mut Vec::new());
@@ -64,6 +101,7 @@ pub fn moment(text: &[u8], time: u64) -> Result<Option<Moment>, String> {
         snapshot_seq,
         journal: journal.collect(),
         exact: records.len() as u64 == seq - snapshot_seq,
+        is_set_back,
         rebuilt: rebuild(Some(checkpoint), records),
     }))
 }
