@@ -2,7 +2,6 @@
 
 use std::{io, sync::Arc, time::Duration};
 
-use hyper::header::{HeaderValue, InvalidHeaderValue};
 use thiserror::Error;
 use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
@@ -32,10 +31,10 @@ mod notify;
 mod startup;
 
 use self::{
-    assemble::{Identity, assemble, last_master, server},
+    assemble::{assemble, last_master, server},
     cluster::ClusterDriver,
     context::Context,
-    startup::{begin, kernel_id},
+    startup::begin,
 };
 
 /// How long connections may take to end when rosrescue stops.
@@ -75,9 +74,6 @@ pub enum RunError {
     /// The etcd options cannot be used.
     #[error(transparent)]
     Cluster(#[from] EtcdError),
-    /// The id in `/proc/sys/kernel/random/uuid` is not a valid header value. A real kernel's ids always are.
-    #[error("the kernel's random id is not usable: {0}")]
-    Instance(#[from] InvalidHeaderValue),
 }
 
 /// Serves `sockets` until `stop`. `say` prints a line for the operator.
@@ -108,19 +104,16 @@ pub async fn run(
     let restored = beginning.restored;
     let rosmaster = supervised.as_ref().map(|supervised| &supervised.rosmaster);
     let last = last_master(&config, &beginning, rosmaster).await;
-    // This id marks our requests to the master. If such a request comes back, the master's address is our own.
-    let instance = kernel_id("/proc/sys/kernel/random/uuid");
-    let mark = HeaderValue::from_str(&instance)?;
-    let (context, drain) = assemble(&config, beginning, last.clone(), mark.clone()).await;
+    let (context, drain) = assemble(&config, beginning, last.clone()).await;
     let context = Arc::new(context);
     let notified = notify::start(guard, context.clone(), stop.clone());
     let halt = CancellationToken::new();
-    let (others, runs) = Runs::choose(&config, &context, supervised, mark, restored, &halt).await?;
+    let (others, runs) = Runs::choose(&config, &context, supervised, restored, &halt).await?;
     let looped = Arc::default();
     let server = server(
         &config,
         &context,
-        Identity { names, instance },
+        names,
         others,
         (Arc::clone(&looped), halt.clone()),
     );
@@ -230,7 +223,6 @@ impl Runs {
         config: &Config,
         context: &Arc<Context>,
         supervised: Option<Supervised>,
-        mark: HeaderValue,
         restored: bool,
         halt: &CancellationToken,
     ) -> Result<(Option<Others>, Self), RunError> {
@@ -246,7 +238,6 @@ impl Runs {
             context: context.clone(),
             rosmaster: supervised.rosmaster.clone(),
             rosout: supervised.rosout,
-            instance: mark,
             restore: config.restore,
             hold: config.hold,
             restored,

@@ -20,7 +20,7 @@ use crate::{
     log::Stderr,
     resolver,
     ros_env::MasterUri,
-    server::listener,
+    server::{hosts::own_names, listener},
     task::boxed,
 };
 use clap::{CommandFactory, error::ErrorKind};
@@ -188,7 +188,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
     }
     let mut names = vec![hostname, config.advertised.host.clone()];
     names.extend(std::env::var("ROS_HOSTNAME").ok());
-    app::run(config, sockets, names, stop, say).await?;
+    app::run(config, sockets, own_names(names), stop, say).await?;
     Ok(())
 }
 

@@ -8,6 +8,7 @@ pub(crate) mod calls;
 pub(crate) mod clients;
 pub(crate) mod compare;
 pub(crate) mod deadlines;
+pub(crate) mod hosts;
 pub(crate) mod idle;
 pub mod listener;
 pub(crate) mod others;
@@ -37,8 +38,6 @@ pub struct Server {
     pub(crate) access: AccessRules,
     /// When each refused address was last logged.
     pub(crate) refused: Mutex<LastLogged>,
-    /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
-    pub instance: String,
     /// Signals that a request from this rosrescue has arrived here: the master's address leads back to it.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,

@@ -3,6 +3,7 @@
 mod connection;
 pub(crate) mod inspect;
 pub(crate) mod next;
+pub(crate) mod open_requests;
 pub(crate) mod peer;
 pub(crate) mod pool;
 pub(crate) mod sentinel;
@@ -42,7 +43,8 @@ const MAX_REPLY: usize = 512 << 20;
 /// Time limit for connecting. A host that drops packets never answers.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
-/// Header in each request to the master. A rosrescue that receives its own value is its own master.
+/// Header in each request to the master, with the number of an [open request](open_requests). A rosrescue that receives
+/// a number of its own is its own master.
 pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 
 /// Why a connection could not be made.
@@ -95,6 +97,12 @@ impl Head {
     /// Whether every rosmaster accepts calls at this path.
     pub(crate) fn is_for_rpc(&self) -> bool {
         matches!(self.path.as_str(), "/" | "/RPC2")
+    }
+
+    /// Whether some rosmaster accepts calls at this path: some versions of Python read several slashes as one. The
+    /// mirror must not answer at any other path, because rosmaster would refuse the call.
+    pub(crate) fn may_be_for_rpc(&self) -> bool {
+        matches!(self.path.trim_start_matches('/'), "" | "RPC2")
     }
 }
 
@@ -150,7 +158,6 @@ fn python(server: Option<&str>) -> Python {
 #[derive(Debug)]
 pub struct Upstream {
     address: watch::Sender<MasterUri>,
-    instance: HeaderValue,
     probe_timeout: Duration,
     probe_count: u32,
     /// The master's addresses from the last successful lookup.
@@ -186,15 +193,9 @@ impl Drop for OpenCall<'_> {
 impl Upstream {
     /// Prepares connections to `address`. `instance` identifies this process. A connection also ends after the kernel's
     /// probes were unanswered, with the count and timeout of rosrescue's own probes.
-    pub fn new(
-        address: MasterUri,
-        instance: HeaderValue,
-        probe_timeout: Duration,
-        probe_count: u32,
-    ) -> Self {
+    pub fn new(address: MasterUri, probe_timeout: Duration, probe_count: u32) -> Self {
         Self {
             address: watch::Sender::new(address),
-            instance,
             probe_timeout,
             probe_count,
             found: watch::Sender::new(None),
@@ -281,8 +282,8 @@ impl Upstream {
 
     async fn connect_with(&self, writer: Option<Writer>) -> Result<Connection, ConnectError> {
         let (address, stream) = self.stream().await?;
-        let (instance, silence) = (self.instance.clone(), Some(self.silence()));
-        Connection::open(stream, &address, instance, MAX_REPLY, silence, writer)
+        let silence = Some(self.silence());
+        Connection::open(stream, &address, true, MAX_REPLY, silence, writer)
             .await
             .map_err(|source| ConnectError::Unreachable {
                 master: address.to_string(),
@@ -418,8 +419,7 @@ pub(crate) async fn test_master() -> (
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let uri = format!("http://{}", listener.local_addr().unwrap());
     let uri = MasterUri::parse(&uri).unwrap();
-    let name = HeaderValue::from_static("test");
-    let upstream = Upstream::new(uri, name, Duration::from_secs(1), 3);
+    let upstream = Upstream::new(uri, Duration::from_secs(1), 3);
     let sentinel = upstream.connect_sentinel().await.unwrap();
     let (accepted, _) = listener.accept().await.unwrap();
     (listener, accepted, upstream.into(), sentinel.into())
@@ -441,8 +441,7 @@ mod tests {
         // The kernel ignores further connections.
         let _waiting = std::net::TcpStream::connect(old).unwrap();
         let uri = MasterUri::parse("http://nobody.invalid:11312").unwrap();
-        let name = HeaderValue::from_static("test");
-        let upstream = Upstream::new(uri.clone(), name, Duration::from_millis(200), 3);
+        let upstream = Upstream::new(uri.clone(), Duration::from_millis(200), 3);
         upstream.found.send_replace(Some((uri, vec![old])));
         // The clock stands still except for waiting.
         let began = tokio::time::Instant::now();

@@ -5,7 +5,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use hyper::header::HeaderValue;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
@@ -66,12 +65,11 @@ pub(super) async fn last_master(
 }
 
 /// Creates what the tasks of this process share, and the task that carries writes to the master.
-/// `last` is where the last master was, `mark` the value of the header of our requests to a master.
+/// `last` is where the last master was.
 pub(super) async fn assemble(
     config: &Config,
     beginning: Beginning,
     last: Option<MasterUri>,
-    mark: HeaderValue,
 ) -> (Context, Drain) {
     let address = match (&config.master, last) {
         (MasterConfig::External(address), _) => address.clone(),
@@ -102,7 +100,6 @@ pub(super) async fn assemble(
     let (gate_tx, gate) = gate::gate();
     let upstream = Arc::new(Upstream::new(
         address,
-        mark,
         config.probe_timeout,
         config.probing.count,
     ));
@@ -185,20 +182,12 @@ fn ledger(config: &Config, beginning: Beginning, uri: &str, stats: &'static Stat
     ledger
 }
 
-/// How others know this process.
-pub(super) struct Identity {
-    /// Host names under which clients reach this process.
-    pub(super) names: Vec<String>,
-    /// The value of the header that marks this process's requests to a master.
-    pub(super) instance: String,
-}
-
-/// Creates the server for the clients' requests. The server notifies the first of `ends` when one of our own requests
+/// Creates the server for the clients' requests, who reach it under the host `names`. The server notifies the first of `ends` when one of our own requests
 /// to the master comes back. The second of `ends` ends the streams of the status page.
 pub(super) fn server(
     config: &Config,
     context: &Context,
-    identity: Identity,
+    names: Vec<String>,
     others: Option<Others>,
     ends: (Arc<Notify>, CancellationToken),
 ) -> Server {
@@ -215,10 +204,9 @@ pub(super) fn server(
         tracing::info!("{access}");
     }
     Server {
-        names: identity.names,
+        names,
         access,
         refused: Default::default(),
-        instance: identity.instance,
         looped,
         clients: clients.clone(),
         idle: Idle::among(config.max_connections),

@@ -2,7 +2,6 @@
 
 use std::{fmt::Display, time::Duration};
 
-use hyper::header::HeaderValue;
 use tokio::{net::TcpStream, time::timeout};
 
 use super::{CommandFailure, running::Running};
@@ -38,8 +37,7 @@ impl Live {
         let connect = async {
             let addresses = resolver::addresses(&address.host, address.port).await?;
             let stream = TcpStream::connect(&*addresses).await?;
-            let name = HeaderValue::from_static("a-command");
-            Connection::over(stream, address, name, MAX_REPLY).await
+            Connection::over(stream, address, MAX_REPLY).await
         };
         let connection = match timeout(CONNECT_LIMIT, connect).await {
             Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,

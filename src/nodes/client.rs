@@ -5,7 +5,6 @@ use std::{
     time::Duration,
 };
 
-use hyper::header::HeaderValue;
 use socket2::SockRef;
 use tokio::{net::TcpStream, time::timeout};
 
@@ -103,8 +102,7 @@ async fn connect(address: &MasterUri, limit: Duration) -> Result<Connection, Rea
             Ok(stream) => {
                 // This fails only if the connection has ended.
                 let _ = SockRef::from(&stream).set_tcp_user_timeout(Some(limit));
-                let name = HeaderValue::from_static("to-a-node");
-                let connection = Connection::over(stream, address, name, MAX_REPLY);
+                let connection = Connection::over(stream, address, MAX_REPLY);
                 return connection.await.map_err(|_| Reaction::Silent);
             }
             Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,

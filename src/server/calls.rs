@@ -307,7 +307,7 @@ impl Calls {
         body: Bytes,
         call: Option<&Request>,
     ) -> Result<HttpReply, Unanswered> {
-        let known = call.filter(|call| call.is_answerable());
+        let known = call.filter(|call| call.is_answerable() && head.may_be_for_rpc());
         let mut gate = self.gate.clone();
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
         let delivery = self.begin_read(call).await;

@@ -16,12 +16,13 @@ use tokio::{
 };
 
 mod forwarded;
+mod members;
 
-pub(crate) use self::forwarded::Forwarded;
+pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
     listener,
-    replies::{HttpReply, UntilWritten, forwarded, text, xml},
+    replies::{HttpReply, UntilWritten, forwarded, no_such_page, text, xml},
 };
 use crate::{
     checkpoint::format::Origin,
@@ -63,6 +64,8 @@ pub(crate) struct Others {
     pub(crate) handovers: mpsc::Sender<Handover>,
     /// Hosts whose nodes use this rosrescue as their master.
     pub(crate) served: Served,
+    /// The computers that are believed if they name the caller of a call that they forward.
+    pub(crate) members: MemberAddresses,
     /// Answers that followers have not passed on to their callers yet.
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
@@ -196,8 +199,14 @@ impl Others {
         if asked_term.is_some() {
             head.path = Head::default().path;
         }
-        // Any program that may call can claim to be a follower. Only the log shows this address.
-        let said = head.caller.take().filter(|_| asked_term.is_some());
+        if asked_term.is_none() && !head.may_be_for_rpc() {
+            // A forwarded call loses its path.
+            return Ok(no_such_page());
+        }
+        // Any program that may call can claim to be a follower, but not one at a member's address. Only the log shows
+        // this address.
+        let is_believed = asked_term.is_some() && self.members.has(peer.ip());
+        let said = head.caller.take().filter(|_| is_believed);
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         if body.len() > RECORD_BYTES_MAX && kind.mutates() {
             return Ok(too_large(body.len()));

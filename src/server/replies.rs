@@ -154,10 +154,9 @@ pub(super) fn no_shutdown(why: &str) -> HttpReply {
 /// body's encoding. `None` if it decodes the body, or if that is not certain. `python` is its version of Python.
 pub(super) fn refused_by_rosmaster(head: &Head, body: &[u8], python: Python) -> Option<HttpReply> {
     // Some versions read several slashes as one.
-    let has_page =
-        head.path.starts_with("//") || head.path == "/pydoc.css" && python >= Python::new(3, 11, 0);
-    if !head.is_for_rpc() && !has_page {
-        return Some(page(StatusCode::NOT_FOUND, "text/plain", "No such page"));
+    let has_page = head.path == "/pydoc.css" && python >= Python::new(3, 11, 0);
+    if !head.may_be_for_rpc() && !has_page {
+        return Some(no_such_page());
     }
     let encoding = head.encoding.as_ref()?.to_str().ok()?.to_ascii_lowercase();
     let (status, reason) = match encoding.as_str() {
@@ -178,6 +177,11 @@ pub(super) fn refused_by_rosmaster(head: &Head, body: &[u8], python: Python) -> 
     http.extensions_mut()
         .insert(ReasonPhrase::try_from(reason).ok()?);
     Some(http)
+}
+
+/// rosmaster's reply to a call at a path that it does not have.
+pub(super) fn no_such_page() -> HttpReply {
+    page(StatusCode::NOT_FOUND, "text/plain", "No such page")
 }
 
 /// A reply that is not XML-RPC.

@@ -27,7 +27,7 @@ use super::{
 use crate::{
     limit::rarely,
     master::{self, Kind, Master},
-    upstream::{Head, INSTANCE_HEADER, peer::CALLER_HEADER},
+    upstream::{Head, INSTANCE_HEADER, open_requests, peer::CALLER_HEADER},
     xmlrpc::{Python, Reply},
 };
 
@@ -97,7 +97,7 @@ async fn post(
     if request
         .headers()
         .get(INSTANCE_HEADER)
-        .is_some_and(|of| of == server.instance.as_str())
+        .is_some_and(open_requests::is_own)
     {
         server.looped.notify_one();
         return Ok(text(

@@ -23,7 +23,7 @@ use tokio::{net::TcpStream, time::timeout};
 
 use super::{
     CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer,
-    peer::CALLER_HEADER, python,
+    open_requests::OpenRequest, peer::CALLER_HEADER, python,
 };
 use crate::{
     ros_env::MasterUri,
@@ -49,7 +49,8 @@ pub struct Connection {
     driver: Drive,
     peer: SocketAddr,
     host: HeaderValue,
-    instance: HeaderValue,
+    /// Whether requests carry a number by which this process recognises its own ones.
+    marked: bool,
     max_reply: usize,
     silence: Option<Silence>,
     /// Whether the server left the connection open after the last answer.
@@ -92,16 +93,15 @@ impl Connection {
     pub async fn over(
         stream: TcpStream,
         address: &MasterUri,
-        instance: HeaderValue,
         max_reply: usize,
     ) -> io::Result<Self> {
-        Self::open(stream, address, instance, max_reply, None, None).await
+        Self::open(stream, address, false, max_reply, None, None).await
     }
 
     pub(super) async fn open(
         stream: TcpStream,
         address: &MasterUri,
-        instance: HeaderValue,
+        marked: bool,
         max_reply: usize,
         silence: Option<Silence>,
         writer: Option<Writer>,
@@ -114,7 +114,7 @@ impl Connection {
             driver: Drive(Some((driver, writer))),
             peer,
             host,
-            instance,
+            marked,
             max_reply,
             silence,
             keeps_alive: None,
@@ -186,8 +186,11 @@ impl Connection {
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
             // An empty body needs this header too. Without it rosmaster answers with status 500 and no body.
-            .header(CONTENT_LENGTH, body.len())
-            .header(INSTANCE_HEADER, &self.instance);
+            .header(CONTENT_LENGTH, body.len());
+        let open = self.marked.then(OpenRequest::begin);
+        if let Some(open) = &open {
+            request = request.header(INSTANCE_HEADER, open.value());
+        }
         if let Some(encoding) = &head.encoding {
             request = request.header(CONTENT_ENCODING, encoding);
         }

@@ -9,7 +9,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use hyper::{StatusCode, header::HeaderValue};
+use hyper::StatusCode;
 use thiserror::Error;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
@@ -155,16 +155,13 @@ impl Peer {
 /// Connects to the rosrescue of the present leader.
 #[derive(Debug)]
 pub(crate) struct Peers {
-    instance: HeaderValue,
     probe_timeout: Duration,
     present: Mutex<Option<Arc<Peer>>>,
 }
 
 impl Peers {
-    /// Creates the connections. `instance` identifies this process; see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
-    pub(crate) fn new(instance: HeaderValue, probe_timeout: Duration) -> Self {
+    pub(crate) fn new(probe_timeout: Duration) -> Self {
         Self {
-            instance,
             probe_timeout,
             present: Mutex::default(),
         }
@@ -178,12 +175,7 @@ impl Peers {
         }
         let peer = Arc::new(Peer {
             uri: uri.clone(),
-            upstream: Upstream::new(
-                uri.clone(),
-                self.instance.clone(),
-                self.probe_timeout.min(PROBE),
-                SILENT_PROBES,
-            ),
+            upstream: Upstream::new(uri.clone(), self.probe_timeout.min(PROBE), SILENT_PROBES),
             idle: Mutex::default(),
             late: AtomicBool::new(false),
         });

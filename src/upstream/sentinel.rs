@@ -126,8 +126,7 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let uri = crate::ros_env::MasterUri::parse(&format!("http://{address}")).unwrap();
-        let name = hyper::header::HeaderValue::from_static("test");
-        let upstream = Upstream::new(uri, name, Duration::from_secs(1), 3);
+        let upstream = Upstream::new(uri, Duration::from_secs(1), 3);
         let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
         let ended = crate::task::spawn({
             let sentinel = sentinel.clone();

@@ -103,8 +103,15 @@ impl Item {
 
     /// Whether the mirror can answer the call.
     pub(super) fn is_answerable(&self) -> bool {
-        let call = self.call.as_deref();
-        call.is_some_and(Request::is_answerable)
+        self.answerable().is_some()
+    }
+
+    /// The call, if the mirror can answer it. It cannot if rosmaster would refuse the path of the request.
+    pub(super) fn answerable(&self) -> Option<&Request> {
+        let raw = self.raw.as_ref();
+        let call = self.call.as_deref().filter(|call| call.is_answerable())?;
+        raw.is_none_or(|(head, _)| head.may_be_for_rpc())
+            .then_some(call)
     }
 
     pub(super) fn concern(&self) -> &Concern {
@@ -148,10 +155,7 @@ impl Item {
             let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
             !shows && call.kind().mutates()
         };
-        let plain = self
-            .raw
-            .as_ref()
-            .is_none_or(|(head, _)| matches!(head.path.as_str(), "/" | "/RPC2"));
+        let plain = self.raw.as_ref().is_none_or(|(head, _)| head.is_for_rpc());
         plain && self.call.as_ref().is_some_and(shareable)
     }
 

@@ -616,7 +616,7 @@ impl Drain {
             let Some(item) = merge::judged(&ledger, item) else {
                 continue;
             };
-            let call = item.call.as_deref().filter(|call| call.is_answerable());
+            let call = item.answerable();
             if let Some(call) = call.filter(|_| self.link.judge.reaps_all() && item.raw.is_some()) {
                 evict::while_standing_in(&ledger, call, item.origin);
             }
@@ -681,7 +681,7 @@ struct Answers {
 impl Answers {
     /// Answers `item`, or returns it if only a master can answer it.
     fn add(&mut self, ledger: &Arc<Ledger>, mut item: Item) -> Option<Item> {
-        let call = item.call.as_deref().filter(|call| call.is_answerable());
+        let call = item.answerable();
         let answer = |call| {
             let (concern, source, origin) = (item.concern(), &item.source, item.origin);
             ledger.stand_in_for(Instant::now(), call, concern, source, origin)

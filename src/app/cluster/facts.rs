@@ -11,6 +11,7 @@ use crate::{
         machine::{Role, Settings, View},
         member::Heard,
     },
+    server::others::MemberAddresses,
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };
 
@@ -18,6 +19,7 @@ use crate::{
 pub(super) struct Known {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
+    addresses: MemberAddresses,
     leader: Option<LeaderFacts>,
     /// The revision of the leader's key `alive`, and when it was first seen.
     sign: Option<(u64, Instant)>,
@@ -29,10 +31,11 @@ pub(super) struct Known {
 }
 
 impl Known {
-    pub(super) fn new(settings: &Settings) -> Self {
+    pub(super) fn new(settings: &Settings, addresses: MemberAddresses) -> Self {
         Self {
             settings: settings.clone(),
             members: BTreeMap::new(),
+            addresses,
             leader: None,
             sign: None,
             role: (Role::Joining, Instant::now()),
@@ -73,6 +76,8 @@ impl Known {
 
     /// Updates the facts from what a computer has written about itself.
     pub(super) fn heard(&mut self, heard: &Heard) {
+        let uri = heard.said.as_ref().map(|said| &*said.uri);
+        self.addresses.heard(&heard.name, uri);
         let Some(said) = &heard.said else { return };
         let mut roles = Role::ALL.into_iter();
         let role = roles.find(|role| role.as_str() == said.role);

@@ -2,7 +2,6 @@
 
 use std::{collections::VecDeque, net::IpAddr, sync::Arc, time::Duration};
 
-use hyper::header::HeaderValue;
 use tokio::{
     sync::{mpsc, watch},
     task::{JoinSet, block_in_place},
@@ -24,7 +23,7 @@ use crate::{
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     hide::Hide,
     process::Rosmaster,
-    server::others::{Forwarded, Others, Shown},
+    server::others::{Forwarded, MemberAddresses, Others, Shown},
     upstream::peer::Peers,
 };
 
@@ -34,8 +33,6 @@ pub(in crate::app) struct ClusterSetup {
     pub(in crate::app) context: Arc<Context>,
     pub(in crate::app) rosmaster: Rosmaster,
     pub(in crate::app) rosout: bool,
-    /// Identifies this process.
-    pub(in crate::app) instance: HeaderValue,
     pub(in crate::app) restore: RestorePolicy,
     /// How long a call waits while nothing can answer it (`--hold`).
     pub(in crate::app) hold: Duration,
@@ -92,7 +89,8 @@ pub(in crate::app) async fn join(
     let place = watch::Sender::new(Place::default());
     let shown = Arc::new(Shown::new());
     let forwarded = Arc::<Forwarded>::default();
-    let peers = Arc::new(Peers::new(setup.instance.clone(), context.probe_timeout));
+    let peers = Arc::new(Peers::new(context.probe_timeout));
+    let members = MemberAddresses::default();
     let others = Others {
         standing: standing_rx,
         peers: peers.clone(),
@@ -100,6 +98,7 @@ pub(in crate::app) async fn join(
         passing: Arc::default(),
         forwarded: forwarded.clone(),
         served: setup.context.served.clone(),
+        members: members.clone(),
         followed: place.subscribe(),
         shown: shown.clone(),
         // A call may have to wait for the next leader. That takes the time to live, and longer if etcd must elect its
@@ -117,7 +116,7 @@ pub(in crate::app) async fn join(
     let keys = Keys::new(&config.robot);
     let id = settings.id.clone();
     let driver = ClusterDriver {
-        known: Known::new(&settings),
+        known: Known::new(&settings, members),
         member: Member::new(settings, keys.clone(), own, left, id),
         replica: Replica {
             client,

@@ -7,7 +7,6 @@ use std::{
     time::Duration,
 };
 
-use hyper::header::HeaderValue;
 use serde::Deserialize;
 use tokio::net::TcpStream;
 
@@ -99,8 +98,7 @@ pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
     let ask = async {
         let addresses = resolver::addresses(&address.host, address.port).await;
         let stream = TcpStream::connect(&*addresses.ok()?).await.ok()?;
-        let name = HeaderValue::from_static("a-command");
-        let connection = Connection::over(stream, address, name, MAX_REPLY).await;
+        let connection = Connection::over(stream, address, MAX_REPLY).await;
         let mut connection = connection.ok()?;
         connection.call(&master::get_pid()).await.ok()?;
         Some(software::speaks(

@@ -1,7 +1,7 @@
 //! Calls to a computer that leads, follows, or knows no leader.
 
 use http_body_util::BodyExt;
-use hyper::{StatusCode, header::HeaderValue};
+use hyper::StatusCode;
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpListener,
@@ -67,10 +67,9 @@ impl Computer {
         let ledger = Arc::new(ledger);
         ledger.set_identity(42, OWN.to_owned());
         ledger.leave();
-        let instance = || HeaderValue::from_static("test");
         let second = Duration::from_secs(1);
         let nobody = MasterUri::parse("http://127.0.0.1:1/").unwrap();
-        let upstream = Arc::new(Upstream::new(nobody, instance(), second, 3));
+        let upstream = Arc::new(Upstream::new(nobody, second, 3));
         let (write_queue, _) = write_queue(
             ledger.clone(),
             upstream.clone(),
@@ -97,11 +96,12 @@ impl Computer {
             hold: second,
             others: Some(Others {
                 standing: standing_rx,
-                peers: Arc::new(Peers::new(instance(), second)),
+                peers: Arc::new(Peers::new(second)),
                 handovers: handovers_tx,
                 passing: Arc::default(),
                 forwarded: Arc::default(),
                 served: Default::default(),
+                members: Default::default(),
                 followed,
                 shown: Arc::new(Shown::new()),
                 hold: second,

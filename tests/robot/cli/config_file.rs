@@ -127,7 +127,7 @@ fn a_file_without_end_is_refused() {
     for (options, file) in [
         (&[][..], "--config"),
         (
-            &["--cluster", "127.0.0.1:1", "--cluster-user", "u"],
+            &["--cluster", "http://127.0.0.1:1", "--cluster-user", "u"],
             "--cluster-password-file",
         ),
     ] {

@@ -7,7 +7,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    FakeNode, Finish, Library, Mode, NODES, Robot, State, alive, eventually, holds, params,
+    FakeNode, Finish, Library, Mode, NODES, Robot, State, alive, encode_call, eventually, holds,
+    params, request,
 };
 use rosrescue::xmlrpc::Value;
 use rustix::process::{Pid, Signal, kill_process};
@@ -35,6 +36,37 @@ fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
     of_key
         .map(|call| (call.params[2].as_int().unwrap(), call.from_rosrescue))
         .collect()
+}
+
+/// rosmaster answers such a call with 404, and runs nothing.
+#[test]
+fn a_call_to_a_path_that_rosmaster_does_not_have_never_takes_effect() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let robot = Robot::start_with(mode, &["--stand-in-after", "100"]);
+        let client = robot.client();
+        client.set_param("/before", 1);
+        let pid = robot.master_pid();
+        crate::support::stop(pid);
+        let call = encode_call("setParam", params!["/c", "/wrong", 1]);
+        let wires: Vec<_> = ["/foo", "//foo", "/RPC2/", "/RPC2?x"]
+            .into_iter()
+            .map(|path| {
+                let mut wire = client.connect().unwrap();
+                let bytes = request(&format!("POST {path} HTTP/1.1"), &[], &call);
+                wire.send(&bytes).unwrap();
+                wire
+            })
+            .collect();
+        // The mirror answers in the place of the hung master.
+        client.set_param("/after", 2);
+        assert_eq!(client.param("/after"), Some(2.into()));
+        assert_eq!(client.param("/wrong"), None);
+        crate::support::signal(pid, Signal::CONT);
+        robot.await_gate();
+        assert_eq!(client.param("/after"), Some(2.into()));
+        assert_eq!(client.param("/wrong"), None);
+        drop(wires);
+    }
 }
 
 /// The gate shuts, the mirror answers and rosrescue notifies nodes. When the same master continues, it gets all writes
