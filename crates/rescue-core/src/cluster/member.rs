@@ -4,6 +4,13 @@
 //! [`Machine`], a part of it, decides who leads. `app/cluster` passes in what happened and when, and carries out the
 //! returned actions in order. It decides nothing, so the simulation in `cluster/tests` tests what production
 //! decides.
+//!
+//! * `roles`: this computer's role changes, and it starts a master or gives it up; `release`: a handover or a stop.
+//! * `routing`: where calls go, and how current the mirror is; `probes`: whether the leader's rosrescue answers.
+//! * `following`: the journal as others write it; `journal_writes`: this computer's changes on their way there.
+//! * `alone`: this computer is cut off, and keeps its nodes' writes; `merging`: it sends them to the leader.
+//! * `data_loss`: etcd has lost data; `name_check`: another computer has this one's name.
+//! * `notifying`: who has stopped notifying nodes; `chores`: member entry, snapshots, compaction.
 
 use std::{
     collections::VecDeque,
@@ -17,28 +24,35 @@ use crate::{
         displaced::DisplacedLately,
         journal::{Keys, Progress},
         machine::{self, Machine, Role, Settings, View, WhenAlone},
-        namesake::{self, Sign},
         outgoing::Outgoing,
         standing::{Place, Standing},
     },
     master::{Master, Request},
 };
 
+mod alone;
+mod chores;
 mod data_loss;
 mod following;
-mod leading;
+mod journal_writes;
+mod merging;
+mod name_check;
 mod notifying;
+mod probes;
+mod release;
+mod roles;
+mod routing;
 #[cfg(test)]
 mod tests;
 mod types;
 
 use self::{
-    data_loss::DataLoss,
-    following::{Merging, Reading},
-    notifying::Notifying,
+    chores::Chores, data_loss::DataLoss, following::Reading, merging::Merging,
+    name_check::Namesake, probes::Probing, release::Release,
 };
 pub use self::{
-    leading::PROBES,
+    chores::SAYS_EVERY,
+    probes::PROBES,
     types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
 };
 
@@ -80,14 +94,6 @@ struct Told {
     has_master: bool,
 }
 
-/// The probes of the leader's rosrescue.
-#[derive(Debug, Default)]
-struct Probing {
-    number: u64,
-    under_way: bool,
-    at: Option<Instant>,
-}
-
 /// The previous leader, and how its leadership ended.
 #[derive(Debug, Default)]
 struct Before {
@@ -95,17 +101,6 @@ struct Before {
     released: bool,
     /// The term that the checkpoint was given last.
     term: u64,
-}
-
-/// Evidence of another computer with this one's name.
-#[derive(Debug, Default)]
-struct Namesake {
-    /// Set if the member entry of this name belongs to another computer.
-    sign: Option<Sign>,
-    /// Looks for a living computer with this one's name. Set once etcd has been read.
-    watch: Option<namesake::NamesakeWatch>,
-    /// Whether this process has led.
-    led: bool,
 }
 
 /// The state machine of one computer; see the [module](self).
@@ -383,224 +378,5 @@ impl Member {
         self.update_probes(now);
         self.update_merge(now);
         self.update_chores(now);
-    }
-}
-
-/// How long a handover may take.
-const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
-/// How long giving up leadership may take when rosrescue stops.
-const STOP_LIMIT: Duration = Duration::from_secs(4);
-
-/// Why leadership is given up.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum Why {
-    #[default]
-    No,
-    /// A handover was requested, and its caller waits.
-    Asked,
-    /// rosrescue stops, and waits for rosout.
-    EndingRosout,
-    Stops,
-}
-
-/// How leadership is given up: for a handover, or because rosrescue stops.
-#[derive(Debug, Default)]
-struct Release {
-    why: Why,
-    /// The time limit of the handover or the stop.
-    by: Option<Instant>,
-}
-
-impl Release {
-    /// Whether writes wait for the next leader.
-    fn is_begun(&self) -> bool {
-        matches!(self.why, Why::Asked | Why::Stops)
-    }
-}
-
-impl Member {
-    fn stop(&mut self, now: Instant) {
-        if self.told.has_master {
-            self.release.why = Why::EndingRosout;
-            self.release.by = Some(now + STOP_LIMIT);
-            self.act(Action::EndRosout);
-        } else {
-            self.end();
-        }
-    }
-
-    fn rosout_ended(&mut self) {
-        match self.machine.role() {
-            Role::Leading => self.begin_release(Why::Stops, String::new()),
-            _ => self.end(),
-        }
-    }
-
-    fn hand_over(&mut self, now: Instant, to: String, refused: Option<String>) {
-        let refused = match self.machine.role() {
-            Role::Leading if self.release.why != Why::No => {
-                Some("a handover or a stop is already under way".to_owned())
-            }
-            Role::Leading => refused,
-            _ => Some("this computer does not lead".to_owned()),
-        };
-        if let Some(why) = refused {
-            return self.act(Action::HandedOver(Err(why)));
-        }
-        self.begin_release(Why::Asked, to);
-        self.release.by = Some(now + HANDOVER_LIMIT);
-    }
-
-    /// Gives up leadership. From now on writes wait for the next leader.
-    fn begin_release(&mut self, why: Why, to: String) {
-        self.release.why = why;
-        let term = self.machine.term().unwrap_or_default();
-        self.stand_leading(term);
-        self.tell_machine(machine::Input::HandOver(to));
-    }
-
-    /// Ends a handover: another computer may lead now.
-    fn released(&mut self) {
-        if self.release.why == Why::Asked {
-            self.release = Release::default();
-            self.act(Action::HandedOver(Ok(())));
-        }
-    }
-
-    fn woken(&mut self, now: Instant) {
-        if self.release.by.is_some_and(|by| by <= now) {
-            self.release.by = None;
-            match self.release.why {
-                // The request may still reach etcd, so writes keep waiting.
-                Why::Asked => {
-                    let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
-                    self.act(Action::HandedOver(Err(why)));
-                }
-                Why::EndingRosout | Why::Stops => self.end(),
-                Why::No => {}
-            }
-        }
-        if self.queue.start_by.is_some_and(|by| by <= now) {
-            self.start(now);
-        }
-        self.tell_machine(machine::Input::Wake);
-    }
-
-    /// Finishes a stop as soon as this computer no longer leads.
-    fn end_if_stopped(&mut self) {
-        if self.release.why == Why::Stops && self.machine.role() != Role::Leading {
-            self.end();
-        }
-    }
-
-    fn end(&mut self) {
-        self.act(Action::End);
-    }
-}
-
-/// How often a computer updates its entry among the members.
-pub const SAYS_EVERY: Duration = Duration::from_secs(5);
-/// How often the leader compacts etcd, and the age from which revisions are dropped.
-const FORGET: Duration = Duration::from_secs(300);
-/// Pause after a snapshot that could not be written.
-const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
-
-/// Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
-#[derive(Debug, Default)]
-struct Chores {
-    /// When to write this computer's entry among the members.
-    say_at: Option<Instant>,
-    /// Whether a snapshot is being written.
-    snapshot: bool,
-    /// The last record that a snapshot of this computer holds or will hold. Its entry and those before are deleted.
-    replaced: u64,
-    /// After a failed snapshot, when the next one may begin.
-    snapshot_at: Option<Instant>,
-    /// The revision up to which to compact etcd, and when.
-    forget: Option<(Instant, u64)>,
-    /// The record with which the journal has all writes that a lone leader kept in a file.
-    kept_until: Option<u64>,
-    /// What the entries among the members say about notifications.
-    notifying: Notifying,
-}
-
-impl Chores {
-    fn due(&self) -> Option<Instant> {
-        let forget = self.forget.map(|(at, _)| at);
-        [self.say_at, forget].into_iter().flatten().min()
-    }
-
-    /// Has this computer's entry among the members updated at `now`.
-    fn say_at(&mut self, now: Instant) {
-        self.say_at = Some(now);
-    }
-
-    /// Keeps the file of kept writes as it is until the journal has record `seq`. If the leader lost its power before,
-    /// the writes would be lost without a report.
-    fn keep_until(&mut self, seq: u64) {
-        self.kept_until = Some(seq);
-    }
-
-    /// Whether the file of kept writes must stay as it is.
-    fn keeps_file(&self) -> bool {
-        self.kept_until.is_some()
-    }
-}
-
-impl Member {
-    /// Writes this computer's entry among the members and, if it leads, a snapshot, and compacts etcd, each when it is
-    /// due.
-    fn update_chores(&mut self, now: Instant) {
-        // Before the watch for a namesake is over, the entry could overwrite that of another computer.
-        let watch = self.namesake.watch.as_ref();
-        let may_say = watch.is_some_and(|of| of.is_over(now));
-        if self.chores.say_at.is_none_or(|at| at <= now) {
-            self.chores.say_at = Some(now + SAYS_EVERY);
-            if may_say {
-                self.act(Action::Say);
-            }
-        }
-        if let Some(seq) = self.chores.kept_until {
-            let leads = self.machine.role() == Role::Leading;
-            if !leads || self.journal.progress.seq >= seq {
-                self.chores.kept_until = None;
-                self.keep_all();
-            }
-        }
-        let term = self.machine.term();
-        let Some(term) = term.filter(|_| self.machine.role() == Role::Leading) else {
-            self.chores.forget = None;
-            return;
-        };
-        let is_early = self.chores.snapshot_at.is_some_and(|at| now < at);
-        let progress = self.journal.progress;
-        if !self.chores.snapshot && !is_early && progress.wants_snapshot() {
-            self.chores.snapshot = true;
-            self.chores.replaced = progress.seq;
-            self.act(Action::WriteSnapshot {
-                term,
-                progress,
-                state: self.journal.state.clone(),
-                displaced: self.journal.displaced.at(now),
-            });
-        }
-        let revision = self.view().revision;
-        match self.chores.forget {
-            Some((at, before)) if at <= now => {
-                self.chores.forget = Some((now + FORGET, revision));
-                self.act(Action::Forget(before));
-            }
-            None => self.chores.forget = Some((now + FORGET, revision)),
-            Some(_) => {}
-        }
-    }
-
-    fn snapshot_written(&mut self, now: Instant, written: Option<(Progress, usize)>) {
-        self.chores.snapshot = false;
-        match written {
-            Some((then, bytes)) => self.journal.progress.snapshot_written(then, bytes),
-            // A full etcd refuses at once, so the next attempt must wait.
-            None => self.chores.snapshot_at = Some(now + SNAPSHOT_PAUSE),
-        }
     }
 }

@@ -1,0 +1,90 @@
+//! A computer that is cut off answers its own nodes, and keeps their writes for a leader.
+
+use super::{Action, Member, News, journal_writes::is_ours};
+use crate::{
+    cluster::{machine::WhenAlone, sharing::Change, standing::Standing},
+    master::{Master, Request},
+};
+
+impl Member {
+    pub(super) fn be_alone(&mut self) {
+        let serves = self.settings().alone == WhenAlone::Serve;
+        self.tell(News::Alone { serves });
+        if !serves {
+            self.give_up();
+            return self.stand(Standing::Nobody { known: true });
+        }
+        let led = self.records();
+        self.end_master();
+        let base = match led || self.follows() {
+            true => &self.journal.state,
+            false => &self.own.state,
+        };
+        // The nodes continue from what they wrote in earlier periods of being cut off.
+        let base = self.cut_off.on(base);
+        self.begin_cut_off(base.clone());
+        self.act(Action::ServeOwnOnly(true));
+        if led {
+            // Recorded calls are answered from now on, except forwarded ones, which their computers send elsewhere.
+            let answered = self.outgoing.acknowledged;
+            let changes = self.outgoing.changes();
+            let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
+            let kept = self.cut_off.add(kept, true);
+            self.keep(kept);
+        } else {
+            // The standing changes first, so that no more calls are forwarded.
+            self.stand(Standing::Nobody { known: true });
+            self.act(Action::AskForwarded);
+            let seq = self.machine.committed();
+            self.outgoing.start(seq);
+            let (held, state) = (base.clone(), Some(base));
+            self.act(Action::Lead { seq, held, state });
+        }
+        self.act(Action::StandIn);
+        self.stand(Standing::Alone);
+        self.all_ready();
+    }
+
+    /// From now on, keeps answered writes for the leader. `base` is the present state.
+    fn begin_cut_off(&mut self, base: Master) {
+        let first = self.cut_off.is_empty();
+        // Before etcd has been read, the others' state is unknown. It will be compared with the first period's base.
+        if first || self.reading.loaded {
+            self.cut_off.begin(base);
+        }
+        if first {
+            self.keep_all();
+        }
+    }
+
+    /// Keeps the writes after record `committed` up to `acknowledged`: they were answered but are not in the journal.
+    pub(super) fn give_back(&mut self, committed: u64, acknowledged: u64) {
+        let changes = self.outgoing.take_all();
+        if self.keeps() {
+            return;
+        }
+        let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
+        let answered: Vec<_> = changes.iter().filter(answered).collect();
+        if !answered.is_empty() {
+            let base = self.journal.state.clone();
+            self.begin_cut_off(base);
+            let kept = self.cut_off.add(answered, true);
+            self.keep(kept);
+        }
+    }
+
+    /// Stores exactly the writes that a leader must still get.
+    pub(super) fn keep_all(&mut self) {
+        let kept = self.kept().map(|(base, calls)| (base.clone(), calls));
+        self.act(match kept {
+            Some((base, calls)) => Action::KeepAll { base, calls },
+            None => Action::KeepNothing,
+        });
+    }
+
+    pub(super) fn keep(&mut self, calls: Vec<Request>) {
+        if !calls.is_empty() {
+            self.act(Action::Keep(calls));
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! Changes of this computer's role: it starts a master, or gives it up.
+
+use std::time::Instant;
+
+use super::{Action, Cause, Member, News};
+use crate::{
+    cluster::{
+        machine::{JournalSession, Role},
+        mutant::Mutant,
+        standing::Standing,
+    },
+    master::Master,
+};
+
+impl Member {
+    pub(super) fn become_role(&mut self, now: Instant, role: Role) {
+        let before = std::mem::replace(&mut self.told.role, role);
+        if before == Role::Alone && role != Role::Alone {
+            self.tell(News::NotAlone);
+        }
+        match role {
+            Role::Leading => self.lead(now),
+            Role::Alone => self.be_alone(),
+            Role::Joining | Role::Following | Role::CatchingUp => {
+                if self.records() {
+                    self.tell(News::Deposed);
+                }
+                self.released();
+                // What is left was not answered, and its callers call again.
+                self.outgoing.forget();
+                self.give_up();
+            }
+        }
+        self.chores.say_at(now);
+    }
+
+    fn lead(&mut self, now: Instant) {
+        let term = self.machine.term().unwrap_or_default();
+        match self.records() {
+            false => self.begin_to_lead(now),
+            true => {
+                self.tell(News::LeadsAgain);
+                self.act(Action::ServeOwnOnly(false));
+                self.begin_master(Cause::WasCutOff);
+                self.cut_off.resumed();
+                let last = self.outgoing.last();
+                let at_once = Mutant::DeletesKeptWrites.lives();
+                self.chores.keep_until(if at_once { 0 } else { last });
+            }
+        }
+        self.keep_term(term);
+        self.stand_leading(term);
+    }
+
+    /// Has the checkpoint name the present term.
+    pub(super) fn keep_term(&mut self, term: u64) {
+        if std::mem::replace(&mut self.before.term, term) != term {
+            self.act(Action::Term(term));
+        }
+    }
+
+    fn begin_to_lead(&mut self, now: Instant) {
+        let over = matches!(self.machine.session(), JournalSession::Over(_));
+        let before = self.before.leader.take();
+        let own = &self.settings().name;
+        let cause = match before.as_ref().is_some_and(|(name, _)| name != own) {
+            true => Cause::TakenOver,
+            false => Cause::Started,
+        };
+        let released = self.before.released;
+        self.tell(News::Leads { before, released });
+        let owns = std::mem::take(&mut self.journal.own_wins);
+        let seq = self.machine.committed();
+        if seq > 0 {
+            // Keys may have been deleted that this computer did not have to read.
+            self.reading.check_all(now);
+        }
+        self.outgoing.start(seq);
+        let held = self.journal.state.clone();
+        let state = match over {
+            true => Some(Master::default()),
+            // Writes answered while cut off are merged later. They are not part of the state that the others get.
+            false => (!self.cut_off.is_empty() && !owns).then(|| held.clone()),
+        };
+        self.act(Action::Lead { seq, held, state });
+        let displaced = self.journal.displaced.at(now);
+        self.act(Action::TellDisplaced(displaced));
+        self.begin_master(cause);
+    }
+
+    fn begin_master(&mut self, cause: Cause) {
+        self.told.has_master = true;
+        self.act(Action::BeginMaster(cause));
+    }
+
+    pub(super) fn end_master(&mut self) {
+        if Mutant::MasterWhileAlone.lives() && self.told.role == Role::Alone {
+            return;
+        }
+        if std::mem::take(&mut self.told.has_master) {
+            self.act(Action::EndMaster);
+        }
+    }
+
+    /// Runs a master as long as the machine allows it.
+    pub(super) fn update_master(&mut self) {
+        let may = self.machine.may_have_master();
+        if self.told.has_master && !may {
+            self.tell(News::Lapsed);
+            self.end_master();
+            self.act(Action::StandIn);
+        } else if !self.told.has_master && may && self.records() {
+            self.begin_master(Cause::WasCutOff);
+        }
+    }
+
+    /// Stops recording calls and ends this computer's master, because another computer may lead.
+    pub(super) fn give_up(&mut self) {
+        if self.records() {
+            self.chores.notifying.stop();
+        }
+        // A computer that is cut off and serves has its own history.
+        let binds = !self.keeps();
+        self.act(Action::Leave { binds });
+        let known = self.knows();
+        self.stand(Standing::Nobody { known });
+        self.end_master();
+        self.act(Action::ServeOwnOnly(false));
+        self.act(Action::TurnAway);
+        self.adopt();
+    }
+}

@@ -1,0 +1,97 @@
+//! Publishes where this computer's calls go, and how current its mirror is.
+
+use super::{Action, Member};
+use crate::cluster::{
+    machine::Role,
+    standing::{Pass, Place, Standing},
+};
+
+impl Member {
+    /// Publishes who has the master and where calls go, if that has changed.
+    pub(super) fn stand(&mut self, standing: Standing) {
+        if self.told.standing != standing {
+            self.told.standing = standing.clone();
+            self.act(Action::Stand(standing));
+        }
+    }
+
+    /// Publishes that this computer leads. Calls wait while earlier writes, answered while cut off, are being merged.
+    pub(super) fn stand_leading(&mut self, term: u64) {
+        let pass = match (self.cut_off.is_empty(), self.release.is_begun()) {
+            (false, _) => Pass::Nothing,
+            (true, true) => Pass::Reads,
+            (true, false) => Pass::Calls,
+        };
+        self.stand(Standing::Leads { term, pass });
+    }
+
+    /// The address and term of the leader, if it is another computer that has not given up leadership.
+    pub(super) fn leader(&self) -> Option<(&str, u64)> {
+        let own = self.settings();
+        let view = self.view();
+        let leader = view.leader.as_ref()?;
+        let released = view.alive.as_ref().is_some_and(|of| of.released.is_some());
+        let is_own = leader.id == own.id || leader.name == own.name && leader.uri == own.uri;
+        (!released && !is_own).then_some((&*leader.uri, leader.term))
+    }
+
+    /// Notes who leads. If this computer follows, publishes where its calls go.
+    pub(super) fn update_standing(&mut self) {
+        self.look_at_place();
+        let own = &self.settings().id;
+        let view = self.view();
+        let other = view.leader.as_ref().filter(|leader| leader.id != *own);
+        if let Some(leader) = other {
+            let released = view.alive.as_ref().is_some_and(|of| of.released.is_some());
+            let seen = self.machine.observed();
+            self.before.leader = seen.map(|at| (leader.name.clone(), at));
+            self.before.released = released;
+        }
+        if self.machine.role() != Role::Following || self.told.role != Role::Following {
+            return;
+        }
+        // After a restart, a term that etcd has not reached would mean that etcd has lost its data.
+        if let Some((_, term)) = self.leader() {
+            self.keep_term(term);
+        }
+        let standing = match self.leader() {
+            // Writes answered while cut off must be merged before new calls.
+            Some((uri, term)) if self.cut_off.is_empty() => {
+                let uri = uri.to_owned();
+                Standing::Follows { uri, term }
+            }
+            _ => Standing::Nobody {
+                known: self.knows(),
+            },
+        };
+        self.stand(standing);
+    }
+
+    /// Updates the place up to which the mirror is current.
+    fn look_at_place(&mut self) {
+        let seq = self.journal.progress.seq;
+        // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
+        // lacks.
+        let lost = self.data_loss.since().is_some();
+        let differs = self.own.seq > seq || lost || !self.cut_off.is_empty();
+        if self.journal.own_wins && differs && !self.records() {
+            return;
+        }
+        let view = self.view();
+        // The leader's term counts only once the mirror has the whole journal before that leader's first record.
+        let whole = self.reading.loaded && seq >= view.seq();
+        let leader = view.leader.as_ref().filter(|_| whole);
+        let term = leader.map_or(self.place.term, |leader| leader.term);
+        let epoch = self.data_loss.times;
+        // A former leader's mirror still has the changes that the journal may lack.
+        let own = view
+            .leader
+            .as_ref()
+            .is_some_and(|of| of.id == self.settings().id);
+        let seq = match self.follows() && own {
+            true => seq.max(self.outgoing.last()),
+            false => seq,
+        };
+        self.place = Place { epoch, term, seq };
+    }
+}
