@@ -3,7 +3,7 @@
 
 import { abandon, draw, dress, layOut, measure, namespaces, nodesOf, select, shapeOf } from "/graph.js";
 import { countIll, tiles } from "/overview.js";
-import { begin as beginTimeLine, changed, past, query, readHistory, readPast, showMarks } from "/time.js";
+import { begin as beginTimeLine, changed, fetchLog, past, query, readHistory, readPast, showMarks } from "/time.js";
 
 const $ = (id) => document.getElementById(id);
 /** Nodes in trouble that are named at once. */
@@ -830,7 +830,8 @@ async function showParams(text) {
 
 async function ask(part) {
   try {
-    const answer = await fetch(`/state.json?${new URLSearchParams({ ...query(), ...part })}`);
+    const url = `/state.json?${new URLSearchParams({ ...query(), ...part })}`;
+    const answer = await (past ? fetchLog(url) : fetch(url));
     if (answer.status === 503) {
       await new Promise((resolve) => setTimeout(resolve, 300));
       return await ask(part);

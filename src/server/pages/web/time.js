@@ -90,7 +90,7 @@ export async function readHistory() {
   const since = isMore ? begin : readUntil - 2;
   const until = tools.robotTime();
   try {
-    const answer = await fetch(`/history.json?since=${new Date(1000 * since).toISOString()}`);
+    const answer = await fetchLog(`/history.json?since=${new Date(1000 * since).toISOString()}`);
     if (answer.ok) {
       const read = await answer.json();
       const before = isMore ? [] : known.nodes.filter((event) => event.at < read.since);
@@ -159,6 +159,15 @@ function mark({ from, to, events }) {
   return made;
 }
 
+let turn = Promise.resolve();
+
+/** Requests what comes from the log, one thing at a time: rosrescue refuses a second reader. */
+export function fetchLog(url) {
+  const answer = turn.then(() => fetch(url));
+  turn = answer.catch(() => {});
+  return answer;
+}
+
 /** Whether both moments are now. */
 const isLive = () => chosen.at === null && chosen.with === null;
 
@@ -204,7 +213,7 @@ export async function readPast() {
   [reading, again] = [true, false];
   const asked = text(chosen.at);
   try {
-    const answer = await fetch(`/state.json?${new URLSearchParams({ at: asked, with: text(chosen.with) })}`);
+    const answer = await fetchLog(`/state.json?${new URLSearchParams({ at: asked, with: text(chosen.with) })}`);
     if (answer.ok) show({ ...(await answer.json()), asked });
     else if (answer.status === 503) again = true;
     else {
