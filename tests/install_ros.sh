@@ -53,6 +53,8 @@ ros_missing() {
     done
     need python3-rospy /usr/bin/python3 -c 'import rospy, roscpp.srv'
     need python3-std-msgs /usr/bin/python3 -c 'import std_msgs.msg'
+    need python3-nav-msgs /usr/bin/python3 -c 'import nav_msgs.msg'
+    need python3-sensor-msgs /usr/bin/python3 -c 'import sensor_msgs.msg'
     need python3-std-srvs /usr/bin/python3 -c 'import std_srvs.srv'
     need python3-diagnostic-updater /usr/bin/python3 -c 'import diagnostic_updater'
     need python3-yaml /usr/bin/python3 -c 'import yaml'

@@ -166,7 +166,8 @@ pub struct DrillArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=3600))]
     pub limit: u32,
-    /// Topic to watch as a subscriber; may be repeated [default: up to three topics with messages]
+    /// Topic to watch as a subscriber; may be repeated [default: up to five topics that robots drive
+    /// by, or those with most messages]
     #[arg(
         long,
         env = "ROSRESCUE_DRILL_TOPIC",

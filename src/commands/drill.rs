@@ -24,9 +24,9 @@ use tokio_util::sync::CancellationToken;
 use self::{
     calls::{Api, CallResults, Callers},
     node::DrillNode,
-    robot::RobotState,
+    robot::{ByOthers, DrillDifference, RobotState},
     target::Target,
-    topics::Topic,
+    topics::{Topic, Usefulness},
     verdict::{DrillVerdict, names},
 };
 use super::{CommandFailure, Exit, counted, print, running::Running};
@@ -42,7 +42,11 @@ const PREFIX: &str = history::DRILLS;
 /// How long the drill watches the robot before the first kill, to choose topics and learn normal pauses.
 const BEFORE: Duration = Duration::from_secs(2);
 /// Number of topics that are watched if none is named.
-const TOPICS: usize = 3;
+const TOPICS: usize = 5;
+/// Longest time for a node that has ended to start again, for example by roslaunch's `respawn`.
+const START_AGAIN: Duration = Duration::from_secs(8);
+/// Pause between two looks at nodes that do not answer.
+const LOOK_AGAIN: Duration = Duration::from_millis(500);
 /// Longest time for cleaning up.
 const TIDY_LIMIT: Duration = Duration::from_secs(15);
 
@@ -198,9 +202,17 @@ impl Drill<'_> {
         let calls = self.calls().await;
         let updates = self.node.heard.updates();
         let (now, watched) = (Instant::now(), self.topics.iter());
-        let topics = watched.map(|topic| topic.report(now, &updates)).collect();
-        let after = RobotState::read(&api).await;
-        let (nodes, facts) = before.counts();
+        let mut topics: Vec<_> = watched.map(|topic| topic.report(now, &updates)).collect();
+        let difference = match self.read_after(&before).await {
+            Ok((after, others)) => before.compare(&meanwhile, &after, &others),
+            Err(why) => DrillDifference {
+                lost: vec![format!("cannot read the state at the end: {why}")],
+                ..DrillDifference::default()
+            },
+        };
+        for topic in &mut topics {
+            topic.judge(&difference.ended);
+        }
         let mut verdict = DrillVerdict {
             passed: false,
             uri: self.target.running.address.to_string(),
@@ -209,21 +221,32 @@ impl Drill<'_> {
             kills,
             calls,
             topics,
-            nodes,
-            registrations_and_parameters: facts,
+            nodes: difference.same,
+            registrations_and_parameters: before.facts(),
             failures: Vec::new(),
             notes: Vec::new(),
-        };
-        let difference = match after {
-            Ok(after) => before.compare(&meanwhile, &after, &self.node.heard.changed()),
-            Err(why) => robot::DrillDifference {
-                lost: vec![format!("cannot read the state at the end: {why}")],
-                new: Vec::new(),
-            },
         };
         let shutdown = self.node.heard.shutdown();
         verdict.judge(difference, shutdown, self.args.limit);
         Ok(verdict)
+    }
+
+    /// Reads the state at the end, and what others did. A node that is started again gets some time for that.
+    async fn read_after(&self, before: &RobotState) -> Result<(RobotState, ByOthers), String> {
+        let start = Instant::now();
+        let after = loop {
+            let after = RobotState::read(&self.target.api).await?;
+            if before.all_answer(&after) || start.elapsed() > START_AGAIN {
+                break after;
+            }
+            sleep(LOOK_AGAIN).await;
+        };
+        let others = ByOthers {
+            changed: self.node.heard.changed(),
+            died: self.target.died().await?,
+            alive: before.alive_without(&after).await,
+        };
+        Ok((after, others))
     }
 
     /// Subscribes to the topics to watch.
@@ -232,7 +255,7 @@ impl Drill<'_> {
         if !self.args.topic.is_empty() {
             for topic in &self.args.topic {
                 let name = format!("/{}", topic.trim_start_matches('/'));
-                let topic = Topic::subscribe(&api, &self.node, &name).await;
+                let topic = Topic::subscribe(&api, &self.node, &name, Usefulness::Other).await;
                 let topic = topic.map_err(CommandFailure::Failed)?;
                 let published = topic.has_publishers();
                 self.topics.push(topic);
@@ -244,11 +267,9 @@ impl Drill<'_> {
             return Ok(());
         }
         let mut found = Vec::new();
-        for name in topics::candidates(&api)
-            .await
-            .map_err(CommandFailure::Failed)?
-        {
-            match Topic::subscribe(&api, &self.node, &name).await {
+        let candidates = topics::candidates(&api).await;
+        for (name, usefulness) in candidates.map_err(CommandFailure::Failed)? {
+            match Topic::subscribe(&api, &self.node, &name, usefulness).await {
                 Ok(topic) => found.push(topic),
                 Err(why) => {
                     eprintln!("not watched: {why}");

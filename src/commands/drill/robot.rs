@@ -25,17 +25,40 @@ const PARAMETER: &str = "the parameter ";
 pub(super) struct RobotState {
     /// Registrations, types and parameters, each under a name for people.
     facts: BTreeMap<String, Value>,
-    /// Each node's process id. `None` if the node did not answer.
-    nodes: BTreeMap<String, Option<i32>>,
+    nodes: BTreeMap<String, RobotNode>,
+}
+
+/// A registered node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct RobotNode {
+    /// Address that the node registered.
+    api: String,
+    /// The node's process id. `None` if the node did not answer.
+    pid: Option<i32>,
+}
+
+/// What others did during the drill.
+#[derive(Clone, Debug, Default)]
+pub(super) struct ByOthers {
+    /// Parameters and namespaces that other programs were seen to change.
+    pub(super) changed: BTreeSet<String>,
+    /// Nodes that rosrescue unregistered because they had died.
+    pub(super) died: BTreeSet<String>,
+    /// Nodes that are no longer registered, but still answer at their address.
+    pub(super) alive: BTreeSet<String>,
 }
 
 /// How the robot's state differs between two moments.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct DrillDifference {
+    /// Number of nodes that are the same processes as before.
+    pub(super) same: usize,
     /// Facts that are gone or changed.
     pub(super) lost: Vec<String>,
-    /// Facts that are new, or changed by other programs.
+    /// Facts that are new, or changed by other programs, and nodes that ended by themselves.
     pub(super) new: Vec<String>,
+    /// Addresses of the nodes that ended by themselves: they unregistered, or came back as another process.
+    pub(super) ended: BTreeSet<String>,
 }
 
 impl RobotState {
@@ -50,53 +73,95 @@ impl RobotState {
         for name in names {
             let found = api.call("lookupNode", &[name.as_str().into()]).await?;
             questions.spawn(async move {
-                let node = found.as_str().unwrap_or_default();
-                let answer = client::ask_for(node, &master::get_pid(), NODE_LIMIT).await;
-                let pid = match answer {
-                    (Reaction::Alive, Some(pid)) => pid.as_int(),
-                    _ => None,
-                };
-                (name, pid)
+                let api = found.as_str().unwrap_or_default().to_owned();
+                let pid = pid_at(&api).await;
+                (name, RobotNode { api, pid })
             });
         }
         let nodes = questions.join_all().await.into_iter().collect();
         Ok(Self { facts, nodes })
     }
 
-    pub(super) fn counts(&self) -> (usize, usize) {
-        let answering = self.nodes.values().flatten().count();
-        (answering, self.facts.len())
+    /// Number of registrations, types and parameters.
+    pub(super) fn facts(&self) -> usize {
+        self.facts.len()
+    }
+
+    /// Whether each node of this state that answered also answers in the state `later`.
+    pub(super) fn all_answer(&self, later: &Self) -> bool {
+        let mut nodes = self.nodes.iter().filter(|(_, node)| node.pid.is_some());
+        nodes.all(|(name, _)| later.nodes.get(name).is_some_and(|now| now.pid.is_some()))
+    }
+
+    /// The nodes of this state that are not registered in the state `later`, but still answer.
+    pub(super) async fn alive_without(&self, later: &Self) -> BTreeSet<String> {
+        let gone = self.nodes.iter();
+        let gone = gone.filter(|(name, _)| !later.nodes.contains_key(*name));
+        let mut questions = JoinSet::new();
+        for (name, RobotNode { api, pid }) in gone {
+            let (name, api, pid) = (name.clone(), api.clone(), *pid);
+            questions.spawn(async move {
+                let lives = pid.is_some() && pid_at(&api).await == pid;
+                lives.then_some(name)
+            });
+        }
+        questions.join_all().await.into_iter().flatten().collect()
     }
 
     /// How the state `later` differs from this state. Facts that already differed in `meanwhile`, just before the first
-    /// kill, do not count as lost. `changed` are the parameters and namespaces that other programs were seen to change.
+    /// kill, do not count as lost. Neither does what belongs to nodes that ended by themselves.
     pub(super) fn compare(
         &self,
         meanwhile: &Self,
         later: &Self,
-        changed: &BTreeSet<String>,
+        others: &ByOthers,
     ) -> DrillDifference {
         let mut difference = DrillDifference::default();
-        for (node, pid) in &self.nodes {
+        let mut ended = BTreeSet::new();
+        let started = meanwhile.nodes.iter();
+        let started = started.filter(|(name, _)| !self.nodes.contains_key(*name));
+        for (node, RobotNode { api, pid }) in self.nodes.iter().chain(started) {
             let Some(pid) = pid else { continue };
-            match later.nodes.get(node) {
-                Some(Some(now)) if now == pid => {}
-                Some(Some(now)) => difference.lost.push(format!(
-                    "the node {node} was started again: it was process {pid} and is {now}"
-                )),
-                Some(None) => difference
-                    .lost
-                    .push(format!("the node {node}, process {pid}, does not answer")),
-                None => difference.lost.push(format!(
-                    "the node {node}, process {pid}, is not registered any more"
-                )),
-            }
+            let process = format!("the node {node}, process {pid},");
+            let how = match later.nodes.get(node).map(|now| now.pid) {
+                Some(Some(now)) if now == *pid => {
+                    difference.same += 1;
+                    continue;
+                }
+                Some(Some(now)) => format!("was started again as process {now}"),
+                Some(None) => {
+                    difference.lost.push(format!("{process} does not answer"));
+                    continue;
+                }
+                None if others.alive.contains(node) => {
+                    let what = "is no longer registered, but its process runs";
+                    difference.lost.push(format!("{process} {what}"));
+                    continue;
+                }
+                None if others.died.contains(node) => {
+                    let what = "has died without unregistering";
+                    difference.lost.push(format!("{process} {what}"));
+                    continue;
+                }
+                None => "has unregistered and ended".to_owned(),
+            };
+            difference.new.push(format!("{process} {how}"));
+            ended.insert(node);
+            difference.ended.insert(api.clone());
+            let started_again = meanwhile.nodes.get(node);
+            difference
+                .ended
+                .extend(started_again.map(|node| node.api.clone()));
         }
+        let has_ended = |what: &str| {
+            let owner = what.split_once(" as ").map(|(node, _)| node);
+            owner.is_some_and(|node| ended.iter().any(|ended| *ended == node))
+        };
         let mut by_others = Vec::new();
         for (what, value) in &self.facts {
             let steady = meanwhile.facts.get(what) == Some(value);
             let now = later.facts.get(what);
-            if !steady || now == Some(value) {
+            if !steady || now == Some(value) || has_ended(what) {
                 continue;
             }
             let how = if now.is_some() {
@@ -104,16 +169,26 @@ impl RobotState {
             } else {
                 "is gone"
             };
-            match is_below(what, changed) {
+            match is_below(what, &others.changed) {
                 true => by_others.push(format!("{what} {how}: another program did that")),
                 false => difference.lost.push(format!("{what} {how}")),
             }
         }
         let new = later.facts.keys();
-        let new = new.filter(|what| !self.facts.contains_key(*what));
-        difference.new = new.map(|what| format!("{what} is new")).collect();
+        let new = new.filter(|what| !self.facts.contains_key(*what) && !has_ended(what));
+        difference
+            .new
+            .extend(new.map(|what| format!("{what} is new")));
         difference.new.extend(by_others);
         difference
+    }
+}
+
+/// The process id of the node at `api`, if it answers.
+async fn pid_at(api: &str) -> Option<i32> {
+    match client::ask_for(api, &master::get_pid(), NODE_LIMIT).await {
+        (Reaction::Alive, Some(pid)) => pid.as_int(),
+        _ => None,
     }
 }
 
@@ -195,25 +270,34 @@ mod tests {
             ("rosrescue_drill_7".to_owned(), 3.into()),
         ]));
         let (facts, names) = facts(&state, &types, &params);
-        let nodes = names.into_iter().map(|name| (name, pid)).collect();
+        let node = |name: String| {
+            let api = format!("http://robot{name}/{}", pid.unwrap_or_default());
+            (name, RobotNode { api, pid })
+        };
+        let nodes = names.into_iter().map(node).collect();
         RobotState { facts, nodes }
     }
 
     #[test]
     fn what_is_gone_or_changed_is_told_and_what_a_drill_owns_is_not() {
-        let nothing = BTreeSet::new();
+        let nothing = ByOthers::default();
         let before = robot("/talker", 4, Some(1));
-        assert_eq!(before.counts(), (2, 4));
-        assert_eq!(
-            before.compare(&before, &before, &nothing),
-            DrillDifference::default()
-        );
+        assert_eq!(before.facts(), 4);
+        let same = DrillDifference {
+            same: 2,
+            ..DrillDifference::default()
+        };
+        assert_eq!(before.compare(&before, &before, &nothing), same);
         let after = robot("/other", 5, Some(1));
-        let difference = before.compare(&before, &after, &nothing);
+        let lives = ByOthers {
+            alive: ["/talker".to_owned()].into(),
+            ..ByOthers::default()
+        };
+        let difference = before.compare(&before, &after, &lives);
         assert_eq!(
             difference.lost,
             [
-                "the node /talker, process 1, is not registered any more",
+                "the node /talker, process 1, is no longer registered, but its process runs",
                 "/talker as publisher of /chatter is gone",
                 "the parameter /robot/wheels has changed",
             ]
@@ -221,8 +305,11 @@ mod tests {
         assert_eq!(difference.new, ["/other as publisher of /chatter is new"]);
         // Another program changes the parameter.
         for (changed, is_its) in [("/robot", true), ("/robot/wheels", true), ("/rob", false)] {
-            let changed = [changed.to_owned()].into();
-            let difference = before.compare(&before, &after, &changed);
+            let others = ByOthers {
+                changed: [changed.to_owned()].into(),
+                ..ByOthers::default()
+            };
+            let difference = before.compare(&before, &after, &others);
             let is_lost = difference.lost.iter().any(|what| what.contains("wheels"));
             let is_noted = difference.new.iter().any(|what| what.contains("wheels"));
             assert_eq!((is_lost, is_noted), (!is_its, is_its), "{changed:?}");
@@ -234,18 +321,45 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_was_started_again_is_told() {
+    fn a_node_that_ends_by_itself_or_comes_back_is_no_damage() {
+        let nothing = ByOthers::default();
         let before = robot("/talker", 4, Some(1));
-        let nothing = BTreeSet::new();
-        let lost = |pid| {
-            before
-                .compare(&before, &robot("/talker", 4, pid), &nothing)
-                .lost
+        // Both nodes were started again.
+        let again = robot("/talker", 4, Some(2));
+        let difference = before.compare(&before, &again, &nothing);
+        assert_eq!(difference.lost, Vec::<String>::new());
+        let told = "the node /talker, process 1, was started again as process 2";
+        assert!(difference.new.contains(&told.to_owned()), "{difference:?}");
+        let apis = ["http://robot/listener/1", "http://robot/talker/1"];
+        assert_eq!(difference.ended, apis.map(str::to_owned).into());
+        // The talker has unregistered. Its registrations went with it.
+        let mut after = before.clone();
+        after.nodes.remove("/talker");
+        after.facts.remove("/talker as publisher of /chatter");
+        let difference = before.compare(&before, &after, &nothing);
+        assert_eq!(difference.lost, Vec::<String>::new());
+        let told = "the node /talker, process 1, has unregistered and ended";
+        assert_eq!(difference.new, [told]);
+        // rosrescue has unregistered it, because it was dead.
+        let died = ByOthers {
+            died: ["/talker".to_owned()].into(),
+            ..ByOthers::default()
         };
-        assert!(lost(Some(2))[0].contains("it was process 1 and is 2"));
-        assert!(lost(None)[0].contains("does not answer"));
-        // A node that never answered proves nothing.
+        let difference = before.compare(&before, &after, &died);
+        let told = "the node /talker, process 1, has died without unregistering";
+        assert_eq!(difference.lost[0], told);
+        assert_eq!((difference.lost.len(), difference.ended.len()), (2, 0));
+    }
+
+    #[test]
+    fn a_registered_node_that_no_longer_answers_is_lost() {
+        let nothing = ByOthers::default();
+        let before = robot("/talker", 4, Some(1));
         let silent = robot("/talker", 4, None);
+        let lost = before.compare(&before, &silent, &nothing).lost;
+        assert!(lost[0].contains("does not answer"));
+        assert!(before.all_answer(&before) && !before.all_answer(&silent));
+        // A node that never answered proves nothing.
         assert!(silent.compare(&silent, &before, &nothing).lost.is_empty());
     }
 }

@@ -1,8 +1,9 @@
 //! Finds the processes that a drill kills, and verifies them.
 
-use std::path::Path;
+use std::{collections::BTreeSet, path::Path};
 
 use rustix::process::Signal;
+use serde::Deserialize;
 
 use super::calls::Api;
 use crate::{
@@ -69,6 +70,28 @@ impl Target {
              so: run the drill as the user of rosrescue, and not in another container",
             status.master
         )))
+    }
+
+    /// The nodes that rosrescue has unregistered because they had died, and that have not come back.
+    pub(super) async fn died(&self) -> Result<BTreeSet<String>, String> {
+        /// The part of `/state.json` that the drill needs.
+        #[derive(Deserialize)]
+        struct State {
+            nodes: Vec<Row>,
+        }
+        #[derive(Deserialize)]
+        struct Row {
+            name: String,
+            removed_at: Option<u64>,
+        }
+        let page = self.running.get("/state.json").await;
+        let (_, json) = page.map_err(|error| error.to_string())?;
+        let state: State = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+        let died = state
+            .nodes
+            .into_iter()
+            .filter(|row| row.removed_at.is_some());
+        Ok(died.map(|row| row.name).collect())
     }
 
     pub(super) async fn master_pid(&self) -> Result<u32, String> {

@@ -1,6 +1,8 @@
 //! Watches topics as a subscriber.
 
 use std::{
+    cmp::Reverse,
+    collections::BTreeSet,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
@@ -20,7 +22,7 @@ const SHORTEST_GAP: Duration = Duration::from_secs(1);
 /// A pause counts as a failure if it is more than this many times as long as the longest normal one.
 const LONGER: u32 = 10;
 /// Maximum number of topics that are tried when none is named.
-const CANDIDATES: usize = 12;
+const CANDIDATES: usize = 24;
 
 /// What arrived over one connection.
 #[derive(Debug, Default)]
@@ -106,6 +108,7 @@ impl Drop for Watched {
 #[derive(Debug)]
 pub(super) struct Topic {
     pub(super) name: String,
+    usefulness: Usefulness,
     links: Vec<Watched>,
 }
 
@@ -121,6 +124,18 @@ pub(super) struct TopicReport {
     /// The longest pause before the first kill. `None` if too few messages came.
     pub(super) normal_gap_ms: Option<f64>,
     pub(super) failures: Vec<String>,
+    /// Each failure, with the address of the publisher that it concerns.
+    #[serde(skip)]
+    found: Vec<(String, String)>,
+}
+
+impl TopicReport {
+    /// Counts the failures, except those of publishers in `ended`, which ended by themselves.
+    pub(super) fn judge(&mut self, ended: &BTreeSet<String>) {
+        let found = self.found.iter();
+        let failures = found.filter(|(publisher, _)| !ended.contains(publisher));
+        self.failures = failures.map(|(_, failure)| failure.clone()).collect();
+    }
 }
 
 impl Topic {
@@ -129,6 +144,7 @@ impl Topic {
         api: &Api,
         node: &DrillNode,
         topic: &str,
+        usefulness: Usefulness,
     ) -> Result<Self, String> {
         let register = [topic.into(), "*".into(), node.api.as_str().into()];
         let publishers = api.call("registerSubscriber", &register).await?;
@@ -153,6 +169,7 @@ impl Topic {
         }
         Ok(Self {
             name: topic.to_owned(),
+            usefulness,
             links,
         })
     }
@@ -189,6 +206,7 @@ impl Topic {
             longest_gap_ms: 0.0,
             normal_gap_ms: None,
             failures: Vec::new(),
+            found: Vec::new(),
         };
         let ms = |time: Duration| time.as_secs_f64() * 1e3;
         for link in &self.links {
@@ -200,16 +218,20 @@ impl Topic {
             if seen.is_numbered {
                 report.lost = Some(report.lost.unwrap_or_default() + seen.lost);
             }
-            report.failures.extend(seen.failures(&link.publisher));
+            let publisher = &link.publisher;
+            let mut failures = seen.failures(publisher);
             let left_out = updates
                 .iter()
-                .any(|(topic, list)| *topic == self.name && !list.contains(&link.publisher));
+                .any(|(topic, list)| *topic == self.name && !list.contains(publisher));
             if left_out {
-                let publisher = &link.publisher;
-                report.failures.push(format!(
+                failures.push(format!(
                     "subscribers were told that {publisher} no longer publishes"
                 ));
             }
+            let failures = failures.into_iter();
+            report
+                .found
+                .extend(failures.map(|failure| (publisher.clone(), failure)));
         }
         report
     }
@@ -250,23 +272,70 @@ async fn read(mut link: Link, seen: Arc<Mutex<Seen>>) {
     }
 }
 
-/// Published topics that are cheap to watch.
-pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
+/// Published topics that are cheap to watch, the most useful ones first.
+pub(super) async fn candidates(api: &Api) -> Result<Vec<(String, Usefulness)>, String> {
     let published = api.call("getPublishedTopics", &["".into()]).await?;
-    let mut topics: Vec<_> = published
-        .as_array()
-        .unwrap_or_default()
-        .iter()
-        .filter_map(|pair| match pair.as_array() {
-            Some([Value::String(topic), Value::String(of)]) => Some((topic.clone(), of.clone())),
-            _ => None,
-        })
-        .filter(|(topic, of)| !topic.starts_with("/rosout") && !is_heavy(of))
-        .map(|(topic, _)| topic)
+    let pairs = published.as_array().unwrap_or_default().iter();
+    let pairs = pairs.filter_map(|pair| match pair.as_array() {
+        Some([Value::String(topic), Value::String(of)]) => Some((topic.clone(), of.clone())),
+        _ => None,
+    });
+    Ok(choose(pairs.collect()))
+}
+
+/// Chooses topics to try from all published ones, given with their message types.
+fn choose(published: Vec<(String, String)>) -> Vec<(String, Usefulness)> {
+    let cheap = published
+        .into_iter()
+        .filter(|(topic, of)| !topic.starts_with("/rosout") && !is_heavy(of));
+    let mut topics: Vec<_> = cheap
+        .map(|(topic, of)| (topic, Usefulness::of(&of)))
         .collect();
-    topics.sort();
+    topics.sort_by(|(a, a_is), (b, b_is)| (a_is, a).cmp(&(b_is, b)));
     topics.truncate(CANDIDATES);
-    Ok(topics)
+    topics
+}
+
+/// How much a robot depends on a topic of a message type, the most useful first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Usefulness {
+    /// Robots stop without these messages.
+    Drives,
+    Other,
+    /// States of programs, which change little.
+    Housekeeping,
+}
+
+impl Usefulness {
+    /// Judges a message type, such as `nav_msgs/Odometry`.
+    pub(super) fn of(message_type: &str) -> Self {
+        const DRIVES: [&str; 8] = [
+            "nav_msgs/Odometry",
+            "sensor_msgs/LaserScan",
+            "sensor_msgs/Imu",
+            "sensor_msgs/JointState",
+            "sensor_msgs/Range",
+            "tf/tfMessage",
+            "tf2_msgs/TFMessage",
+            "geometry_msgs/Twist",
+        ];
+        const HOUSEKEEPING: [&str; 7] = [
+            "bond/",
+            "diagnostic_msgs/",
+            "dynamic_reconfigure/",
+            "rosgraph_msgs/",
+            "sensor_msgs/CameraInfo",
+            "actionlib_msgs/",
+            "visualization_msgs/",
+        ];
+        if DRIVES.iter().any(|of| message_type.starts_with(of)) {
+            Self::Drives
+        } else if HOUSEKEEPING.iter().any(|of| message_type.starts_with(of)) {
+            Self::Housekeeping
+        } else {
+            Self::Other
+        }
+    }
 }
 
 /// Whether messages of this type are usually so large that another subscriber would load the robot.
@@ -282,11 +351,11 @@ fn is_heavy(message_type: &str) -> bool {
     .any(|word| message_type.contains(word))
 }
 
-/// Sorts the best topics first: those with sequence numbers, then those with many messages.
+/// Sorts the topics to watch first: the most useful ones, and among those the ones with most messages. Removes topics
+/// without messages.
 pub(super) fn sort(topics: &mut Vec<Topic>) {
     topics.retain(|topic| topic.messages() > 0);
-    let is_numbered = |topic: &Topic| topic.links.iter().any(|link| lock(&link.seen).is_numbered);
-    topics.sort_by_key(|topic| std::cmp::Reverse((is_numbered(topic), topic.messages())));
+    topics.sort_by_key(|topic| (topic.usefulness, Reverse(topic.messages())));
 }
 
 #[cfg(test)]
@@ -335,5 +404,37 @@ mod tests {
         rare.pause(at(60_000));
         assert_eq!(rare.failures("/p"), Vec::<String>::new());
         assert!(!rare.is_numbered);
+    }
+
+    #[test]
+    fn the_topics_that_robots_drive_by_are_tried_first() {
+        let mut published: Vec<_> = (0..40)
+            .map(|number| {
+                (
+                    format!("/arm/part_{number:02}"),
+                    "std_msgs/Float64".to_owned(),
+                )
+            })
+            .collect();
+        for (topic, of) in [
+            ("/bond", "bond/Status"),
+            ("/camera/camera_info", "sensor_msgs/CameraInfo"),
+            ("/camera/image_raw", "sensor_msgs/Image"),
+            ("/odom", "nav_msgs/Odometry"),
+            ("/rosout", "rosgraph_msgs/Log"),
+            ("/scan", "sensor_msgs/LaserScan"),
+            ("/tf", "tf2_msgs/TFMessage"),
+        ] {
+            published.push((topic.to_owned(), of.to_owned()));
+        }
+        let chosen = choose(published);
+        let names: Vec<_> = chosen.iter().map(|(topic, _)| &**topic).collect();
+        assert_eq!(&names[..4], ["/odom", "/scan", "/tf", "/arm/part_00"]);
+        assert_eq!(names.len(), CANDIDATES);
+        let few = choose(vec![
+            ("/a".to_owned(), "bond/Status".to_owned()),
+            ("/b".to_owned(), "std_msgs/String".to_owned()),
+        ]);
+        assert_eq!(few[0].0, "/b");
     }
 }

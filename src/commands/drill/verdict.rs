@@ -35,7 +35,7 @@ pub(super) struct DrillVerdict {
     pub(super) kills: Vec<Kill>,
     pub(super) calls: CallResults,
     pub(super) topics: Vec<topics::TopicReport>,
-    /// Number of nodes that answered before the drill.
+    /// Number of nodes that are the same processes as before the drill.
     pub(super) nodes: usize,
     pub(super) registrations_and_parameters: usize,
     /// Why the drill failed.
@@ -310,7 +310,7 @@ mod tests {
             .collect();
         let lost = DrillDifference {
             lost,
-            new: Vec::new(),
+            ..DrillDifference::default()
         };
         fails(&|_| (lost.clone(), None), "and 8 more like these");
     }
