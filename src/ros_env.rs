@@ -72,6 +72,16 @@ impl MasterUri {
         })
     }
 
+    /// Whether `uri`, which can be parsed, contains a port. roscpp refuses one without, and rospy calls port 80.
+    pub fn has_port(uri: &str) -> bool {
+        let authority = uri.trim().trim_start_matches("http://");
+        let authority = authority.split('/').next().unwrap_or_default();
+        authority
+            .rsplit(']')
+            .next()
+            .is_some_and(|end| end.contains(':'))
+    }
+
     /// Whether this address, which a node uses as its master, is the master at `own`. `addresses` are the host's
     /// addresses as resolved here. `is_own` recognises this computer's own addresses. A loopback address counts only if
     /// `node_is_here`, because it means the node's own computer.
@@ -243,6 +253,14 @@ mod tests {
             );
         }
         assert_eq!(uri("::1", 5).to_string(), "http://[::1]:5/");
+        for (text, has) in [
+            ("http://robot:11311/", true),
+            ("http://[::1]:5/RPC2", true),
+            ("http://robot", false),
+            ("http://[fe80::1]/", false),
+        ] {
+            assert_eq!(MasterUri::has_port(text), has, "{text}");
+        }
     }
 
     #[test]

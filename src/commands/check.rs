@@ -8,8 +8,10 @@ mod judge;
 mod launch;
 mod links;
 mod planting;
+mod reach;
 mod robot;
 mod ros;
+mod shell;
 pub(in crate::commands) mod units;
 
 use std::{convert::Infallible, fmt, time::Duration};

@@ -1,7 +1,7 @@
 //! Gathers facts about this computer.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     fs, io,
     net::IpAddr,
     path::{Path, PathBuf},
@@ -18,7 +18,9 @@ use tokio::{task::JoinSet, time::timeout};
 use super::{
     computers::{Cluster, Unusable},
     launch::{self, Launches},
+    reach::{self, Reached},
     ros::{self, Program},
+    shell::{self, ShellSetting},
     units::{self, Unit},
 };
 use crate::{
@@ -37,6 +39,8 @@ use crate::{
 
 /// Longest time for one name lookup. A dead name server takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
+/// Maximum number of nodes that are named for each host.
+const NAMED: usize = 3;
 /// Maximum number of addresses in launch files that are looked up.
 const LOOKUPS_MOST: usize = 4;
 /// Names of services that set the clock.
@@ -88,8 +92,18 @@ pub(super) struct SetupFacts {
     pub(super) memory: Option<u64>,
     /// Listening processes that were started with another `ROS_MASTER_URI`.
     pub(super) strays: Vec<(Process, String)>,
-    /// Why the address in `ROS_IP` may change.
+    /// Why the address that nodes of this computer register may change.
     pub(super) lease: Option<Lease>,
+    /// This computer's address, as other computers see it. `None` without a network.
+    pub(super) local: Option<IpAddr>,
+    /// ROS's variables in the files that every new shell reads.
+    pub(super) shell: Vec<ShellSetting>,
+    /// Ports of the robot's other computers, each tried once.
+    pub(super) reached: Vec<Reached>,
+    /// The ports that nodes get from the kernel.
+    pub(super) ports_of_nodes: String,
+    /// The firewall that runs on this computer.
+    pub(super) firewall: Option<&'static str>,
     /// The master behind rosrescue, and the clients that bypass rosrescue.
     pub(super) behind: Option<UpstreamMaster>,
     /// Masters that run beside rosrescue.
@@ -270,15 +284,16 @@ impl SetupFacts {
             (_, Some(ros::Responder::Master(_)), Some(far)) => nodes_of = Some(far.to_string()),
             _ => {}
         }
-        let mut node_hosts = Vec::new();
-        if let Some(uri) = nodes_of {
-            let mut lookups = JoinSet::new();
-            for (host, nodes) in ros::hosts_of_nodes(&uri).await {
-                lookups.spawn(async move { (Host::find(&host).await, nodes) });
-            }
-            node_hosts = lookups.join_all().await;
-            node_hosts.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
+        let (mut node_hosts, mut ports) = (Vec::new(), Vec::new());
+        if let (Some(ros::Responder::Silent), Some(far)) = (&elsewhere, &far) {
+            ports.push(("the master".to_owned(), far.clone()));
         }
+        if let Some(uri) = nodes_of {
+            let nodes = ros::nodes(&uri).await;
+            node_hosts = hosts_of(&nodes).await;
+            ports.extend(nodes);
+        }
+        let reached = reach::all(ports).await;
         let mut others = Vec::new();
         for (process, uri) in environment
             .master_uri
@@ -309,17 +324,26 @@ impl SetupFacts {
             Some(uri) => Some(UpstreamMaster::look(uri, known).await),
             None => None,
         };
-        let lease = match &environment.ip {
-            Some(ip) => Lease::find(ip).await,
-            None => None,
-        };
+        let own = Host::find(&own).await;
+        let hosts = master_host
+            .iter()
+            .chain(node_hosts.iter().map(|(host, _)| host));
+        let far = hosts.filter(|host| !host.is_here);
+        let far = far.flat_map(|host| host.addresses.iter().flatten());
+        let local = far.filter_map(|address| reach::source_to(*address)).next();
+        let home = env("HOME").unwrap_or_default();
         Self {
+            lease: Lease::of(&own).await,
+            local: local.or_else(listener::local_address),
+            shell: shell::settings(Path::new(&home), &env("SHELL").unwrap_or_default()),
+            reached,
+            ports_of_nodes: reach::ports_of_nodes(),
+            firewall: reach::firewall(),
             strays: others,
             behind,
             launches,
-            lease,
             version: env!("CARGO_PKG_VERSION"),
-            own: Host::find(&own).await,
+            own,
             master_host,
             elsewhere,
             elsewhere_host,
@@ -347,6 +371,24 @@ impl SetupFacts {
             cluster: cluster.map(Arc::new),
         }
     }
+}
+
+/// Hosts of `nodes`, each with some of its nodes.
+async fn hosts_of(nodes: &[(String, MasterUri)]) -> Vec<(Host, Vec<String>)> {
+    let mut hosts = BTreeMap::<_, Vec<String>>::new();
+    for (name, address) in nodes {
+        let nodes = hosts.entry(address.host.clone()).or_default();
+        if nodes.len() < NAMED {
+            nodes.push(name.clone());
+        }
+    }
+    let mut lookups = JoinSet::new();
+    for (host, nodes) in hosts {
+        lookups.spawn(async move { (Host::find(&host).await, nodes) });
+    }
+    let mut hosts = lookups.join_all().await;
+    hosts.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
+    hosts
 }
 
 impl Port {
@@ -540,6 +582,7 @@ async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bo
 /// How this computer got its address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Lease {
+    pub(super) address: String,
     pub(super) interface: String,
     /// Whether DHCP gave the address, and for a limited time.
     pub(super) is_leased: bool,
@@ -547,6 +590,22 @@ pub(super) struct Lease {
 }
 
 impl Lease {
+    /// The lease of an address of `host`, if one of them is leased or wireless.
+    async fn of(host: &Host) -> Option<Self> {
+        for address in host
+            .addresses
+            .iter()
+            .flatten()
+            .filter(|at| !at.is_loopback())
+        {
+            let found = Self::find(&address.to_string()).await;
+            if found.is_some() {
+                return found;
+            }
+        }
+        None
+    }
+
     /// Asks `ip`, a program of iproute2. `None` if it is not installed.
     async fn find(address: &str) -> Option<Self> {
         let mut ip = tokio::process::Command::new("ip");
@@ -559,6 +618,7 @@ impl Lease {
             .join("phy80211")
             .exists();
         (is_leased || is_wireless).then_some(Self {
+            address: address.to_owned(),
             interface,
             is_leased,
             is_wireless,

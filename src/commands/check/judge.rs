@@ -22,9 +22,11 @@ pub(super) fn judge(facts: &SetupFacts) -> Vec<Finding> {
         found.address(facts);
         found.own_name(facts);
         found.lease(facts);
+        found.shell(facts);
         found.strays(facts);
         found.launches(&facts.launches);
         found.nodes(facts);
+        found.reached(facts);
         found.files(facts.files);
         found.clock(&facts.clock);
         found.cluster(facts);
@@ -36,10 +38,12 @@ pub(super) fn judge(facts: &SetupFacts) -> Vec<Finding> {
     found.address(facts);
     found.own_name(facts);
     found.lease(facts);
+    found.shell(facts);
     found.strays(facts);
     found.bypass(facts);
     found.launches(&facts.launches);
     found.nodes(facts);
+    found.reached(facts);
     found.disk(&facts.disk, facts.port.as_ref().ok());
     found.files(facts.files);
     found.clock(&facts.clock);

@@ -199,8 +199,9 @@ impl Found {
         } in self.missing
         {
             let what = format!("{subscriber} is not connected to {topic} of {publisher}");
-            let todo =
-                format!("restart {subscriber}; if that does not help, compare the message types");
+            let todo = format!(
+                "restart {subscriber}; if that does not help, `rosnode info {publisher} {subscriber}` shows the types"
+            );
             all.push(finding(Severity::Problem, what, todo));
         }
         for Link {
@@ -221,7 +222,8 @@ impl Found {
                 counted(silent.len(), "node"),
                 some(&silent)
             );
-            let todo = "see `rosrescue status`: dead nodes stay registered until they restart";
+            let todo =
+                "`rosrescue status` shows which are dead; `rosnode cleanup` unregisters those";
             all.push(finding(Severity::Warning, what, todo.to_owned()));
         }
         let seen = format!(

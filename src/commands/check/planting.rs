@@ -15,7 +15,8 @@ pub(super) fn look(path: &Path) -> Option<Finding> {
             "other users may change the robot's state in {}: {why}",
             folder.display()
         ),
-        todo: "choose a folder that only the user of rosrescue can write to, with --checkpoint"
+        todo: "`rosrescue core --checkpoint ~/.ros/rosrescue/latest-chkpt.yaml`, or another folder that only its user \
+               can write to"
             .to_owned(),
     })
 }

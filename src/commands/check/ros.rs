@@ -1,7 +1,6 @@
 //! Finds out what answers at a port, and how ROS runs on this computer.
 
 use std::{
-    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
     time::Duration,
@@ -27,8 +26,6 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 const IMPORT_LIMIT: Duration = Duration::from_secs(20);
 /// Largest answer to getPid, in bytes.
 const MAX_REPLY: usize = 64 << 10;
-/// Maximum number of nodes that are named for each host.
-const SOME: usize = 3;
 
 /// What answers at an address.
 #[derive(Clone, Debug)]
@@ -109,14 +106,14 @@ pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
     tokio::time::timeout(ANSWER_LIMIT, ask).await.ok()?
 }
 
-/// Hosts of the nodes registered at `uri`, each with some of its nodes.
-pub(super) async fn hosts_of_nodes(uri: &str) -> BTreeMap<String, Vec<String>> {
+/// The nodes registered at `uri`, each with its address.
+pub(super) async fn nodes(uri: &str) -> Vec<(String, MasterUri)> {
     let ask = async |method: &str, params: Vec<Value>| {
         let params = std::iter::once("/rosrescue_check".into()).chain(params);
         let call = Call::new(method, params.collect());
         client::ask_for(uri, &call, ANSWER_LIMIT).await.1
     };
-    let mut hosts = BTreeMap::<_, Vec<String>>::new();
+    let mut nodes = Vec::new();
     let state = ask("getSystemState", Vec::new()).await;
     let mut names = Vec::new();
     for list in state.iter().filter_map(Value::as_array).flatten() {
@@ -132,14 +129,9 @@ pub(super) async fn hosts_of_nodes(uri: &str) -> BTreeMap<String, Vec<String>> {
         let Some(Value::String(api)) = ask("lookupNode", vec![name.as_str().into()]).await else {
             continue;
         };
-        if let Ok(address) = MasterUri::parse(&api) {
-            let nodes = hosts.entry(address.host).or_default();
-            if nodes.len() < SOME {
-                nodes.push(name);
-            }
-        }
+        nodes.extend(MasterUri::parse(&api).ok().map(|address| (name, address)));
     }
-    hosts
+    nodes
 }
 
 /// An installed rosmaster.

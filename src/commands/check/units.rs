@@ -21,6 +21,8 @@ pub(in crate::commands) struct Unit {
     pub(in crate::commands) name: String,
     pub(in crate::commands) kind: UnitKind,
     pub(in crate::commands) is_enabled: bool,
+    /// Whether the unit belongs to a user's systemd.
+    pub(in crate::commands) is_users: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,6 +56,9 @@ pub(in crate::commands) fn in_folders(folders: &[PathBuf], of_computer: bool) ->
             if let Some(kind) = kind_of(&read(&entry.path())) {
                 units.push(Unit {
                     is_enabled: is_enabled(&folders, &name),
+                    is_users: !FOLDERS
+                        .iter()
+                        .any(|of_computer| folder == Path::new(of_computer)),
                     name,
                     kind,
                 });
@@ -175,6 +180,7 @@ mod tests {
             name: name.to_owned(),
             kind,
             is_enabled,
+            is_users: true,
         };
         assert_eq!(
             in_folders(&[folder.path().to_owned()], false),

@@ -5,7 +5,9 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::support::{Library, Mode, Process, Robot, Rosmaster, Scratch, Setup, behind, free_port};
+use crate::support::{
+    Library, Mode, Netns, Process, Robot, Rosmaster, Scratch, Setup, behind, free_port,
+};
 
 /// A check of port `port` in an environment without problems.
 fn check(scratch: &Scratch, port: u16) -> Command {
@@ -252,6 +254,12 @@ fn wrong_environment_variables_are_found() {
         ),
         (
             "ROS_MASTER_URI",
+            "http://127.0.0.1",
+            "ROS_MASTER_URI",
+            "has no port: roscpp nodes do not start",
+        ),
+        (
+            "ROS_MASTER_URI",
             "localhost:11311",
             "ROS_MASTER_URI",
             "is not the URI of a master",
@@ -369,6 +377,107 @@ fn problems_in_the_hosts_file_and_units_are_found() {
         "{:#}",
         found.report
     );
+}
+
+/// `hostname -I` prints all addresses, and people export them as they are.
+#[test]
+fn the_advice_for_several_addresses_is_a_command() {
+    let scratch = Scratch::new();
+    let found = Found::by(check(&scratch, free_port()).env("ROS_IP", "127.0.0.1 192.0.2.7 "));
+    found.assert_problem("ROS_IP", "is more than one address");
+    let todo = found.of("problem")[0]["todo"].as_str().unwrap();
+    let command = todo.split('`').nth(1).unwrap();
+    let line = format!("{command}; echo $ROS_IP");
+    let output = Command::new("bash").args(["-ec", &line]).output().unwrap();
+    assert_eq!(
+        String::from_utf8_lossy(&output.stdout),
+        "127.0.0.1\n",
+        "{todo}"
+    );
+}
+
+#[test]
+fn a_stale_bashrc_is_found_and_the_advice_corrects_it() {
+    let (scratch, port) = (Scratch::new(), free_port());
+    let home = scratch.path("home");
+    fs::create_dir(&home).unwrap();
+    let text = "alias ll='ls -l'\nexport ROS_MASTER_URI=http://192.0.2.1:11311\n";
+    let bashrc = home.join(".bashrc");
+    fs::write(&bashrc, text).unwrap();
+    let check = || {
+        let mut command = check(&scratch, port);
+        command.env("HOME", &home).env("SHELL", "/bin/bash");
+        Found::by(&mut command)
+    };
+    let found = check();
+    let said = found.said("ROS_MASTER_URI");
+    assert!(
+        said.contains(".bashrc:2 sets http://192.0.2.1:11311 in every new shell"),
+        "{said}"
+    );
+    let warnings = found.of("warning");
+    let todo = warnings
+        .iter()
+        .find(|one| one["subject"] == "ROS_MASTER_URI");
+    let todo = todo.unwrap()["todo"].as_str().unwrap();
+    let command = todo.split('`').nth(1).unwrap();
+    assert!(
+        Command::new("bash")
+            .args(["-ec", command])
+            .status()
+            .unwrap()
+            .success()
+    );
+    let uri = format!("export ROS_MASTER_URI=http://127.0.0.1:{port}\n");
+    assert!(fs::read_to_string(&bashrc).unwrap().ends_with(&uri));
+    assert!(!check().said("ROS_MASTER_URI").contains(".bashrc"));
+}
+
+/// A computer with a port that takes no connection, as behind a firewall that drops packets: its queue is full. Needs
+/// root.
+#[test]
+fn a_firewall_on_another_computer_is_found() {
+    const FULL: &str = "import socket, time\n\
+        s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(0)\n\
+        c = [socket.socket() for _ in range(4)]\n\
+        [x.setblocking(False) for x in c]; [x.connect_ex(s.getsockname()) for x in c]\n\
+        print(s.getsockname()[1], flush=True); time.sleep(600)";
+    let (scratch, computer) = (Scratch::new(), Netns::new());
+    let (near, far) = (computer.near(), computer.far(2));
+    let mut python = Command::new("/usr/bin/python3");
+    python.args(["-c", FULL]);
+    let mut full = Process::start("a full port", &mut computer.inside(&python));
+    let blocked = full.wait_line("its port", |line| !line.is_empty());
+    let rescue = Setup::core(&scratch, free_port())
+        .env("ROS_IP", &near)
+        .start();
+    let register = |node: &str, port: &str| {
+        let api = format!("http://{far}:{port}/");
+        let register = [node, "/chatter", "*", &api].map(rosrescue::xmlrpc::Value::from);
+        rescue.client().ok("registerSubscriber", register.to_vec());
+    };
+    register("/blocked", &blocked);
+    // This port refuses connections, so the computer answers.
+    register("/dead", "1");
+    let check = |uri: String| {
+        let mut command = check(&scratch, rescue.port());
+        command.env("ROS_IP", &near).env("ROS_MASTER_URI", uri);
+        Found::by(&mut command)
+    };
+    let found = check(format!("http://{near}:{}", rescue.port()));
+    let words =
+        format!("{far} is on, but does not answer at 1 of 2 ports tried: {blocked} (/blocked)");
+    found.assert_problem("network", &words);
+    let todo = found.of("problem")[0]["todo"].as_str().unwrap();
+    assert!(
+        todo.contains(&format!("`sudo ufw allow from {near}`")),
+        "{todo}"
+    );
+    // The master of a robot whose computer blocks its port.
+    let found = check(format!("http://{far}:{blocked}"));
+    let said = found.said("network");
+    let words = format!("{blocked} (the master)");
+    assert!(said.contains(&words), "{said}");
 }
 
 #[test]

@@ -1,21 +1,25 @@
 //! Judges port, addresses and names, and the facts about `--cluster`.
 
+use std::collections::BTreeMap;
+
 use super::{
     super::{
         computers::{Cluster, Unusable},
-        facts::{Host, Port, SetupFacts},
+        facts::{Host, Port, Process, SetupFacts},
+        reach::{Outcome, Reached},
         ros::Responder,
     },
     Findings, list, named,
 };
-use crate::{cluster::survey, ros_env};
+use crate::{cluster::survey, commands::counted, ros_env, status::summary::some};
 
 /// A name lookup that takes longer than this, in milliseconds, is a finding: it delays every call to the node.
 const SLOW: u128 = 1000;
 /// Subject of findings about clients that bypass rosrescue.
 const BYPASS: &str = "unprotected";
 const CLUSTER: &str = "--cluster";
-const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
+/// Subject of findings about other computers of the robot.
+const NETWORK: &str = "network";
 
 impl Findings {
     pub(super) fn port(&mut self, facts: &SetupFacts) {
@@ -29,7 +33,8 @@ impl Findings {
             return;
         };
         if let Some(error) = error {
-            let todo = "choose another port or address: --port, ROS_IP";
+            let todo = "run `rosrescue core -p 11411`, and `export ROS_MASTER_URI=http://localhost:11411` where nodes \
+                        start";
             return self.bad("port", format!("cannot listen at {number}: {error}"), todo);
         }
         let Some(taken) = taken else {
@@ -54,33 +59,44 @@ impl Findings {
                     self.note(
                         "port",
                         format!("the running rosrescue is {version}, this program is {own}"),
-                        "restart rosrescue when the robot is at rest",
+                        format!("when the robot is at rest, {}, and start it again", stop(&taken.by)),
                     );
                 }
                 if let Some(why) = unprotected {
-                    let todo = "see docs/operations.md";
+                    let folder = facts.disk.folder.display();
                     self.bad(
                         "checkpoint",
                         format!("the running one is unprotected: {why}"),
-                        todo,
+                        format!(
+                            "`df -h {folder}` shows if the disk is full; {}. Or start rosrescue with another \
+                             --checkpoint",
+                            delete_logs()
+                        ),
                     );
                 }
             }
             Responder::Master(pid) => {
-                let pid = pid.map_or_else(String::new, |pid| format!("kill {pid}, or "));
+                let stop = match pid {
+                    Some(pid) => format!("stop it: `kill {pid}`"),
+                    None => stop(&taken.by),
+                };
                 self.bad(
                     "port",
                     format!("{number} is in use by a master without rosrescue: {by}"),
                     format!(
-                        "stop that roscore or roslaunch ({pid}Ctrl-C where it runs), or keep it and use \
-                         `rosrescue proxy`"
+                        "{stop}, or Ctrl-C where roscore or roslaunch runs. To keep it, start it with `rosmaster \
+                         --core -p 11312`, and `rosrescue proxy --master http://localhost:11312`"
                     ),
                 );
             }
             _ => self.bad(
                 "port",
                 format!("{number} is in use by a program that is not a master: {by}"),
-                "stop it, or choose another port with --port and in ROS_MASTER_URI",
+                format!(
+                    "{}, or run `rosrescue core -p 11411`, and `export ROS_MASTER_URI=http://localhost:11411` where \
+                     nodes start",
+                    stop(&taken.by)
+                ),
             ),
         }
     }
@@ -91,7 +107,7 @@ impl Findings {
             return self.warn(
                 SUBJECT,
                 "is not set: roscpp nodes do not start",
-                "source ROS's setup.bash, or export ROS_MASTER_URI=http://HOST:11311",
+                format!("`export ROS_MASTER_URI={}`", own_uri(facts)),
             );
         };
         let parsed = match ros_env::MasterUri::parse(uri) {
@@ -100,17 +116,27 @@ impl Findings {
                 return self.bad(
                     SUBJECT,
                     error.to_string(),
-                    "export it with a host and a port",
+                    format!("`export ROS_MASTER_URI={}`", own_uri(facts)),
                 );
             }
         };
         if uri.trim() != uri {
-            let todo = "export it without spaces";
+            let todo = format!("`export ROS_MASTER_URI={}`", uri.trim());
             return self.bad(
                 SUBJECT,
                 format!("`{uri}` begins or ends with a space"),
                 todo,
             );
+        }
+        if !ros_env::MasterUri::has_port(uri) {
+            let what = format!(
+                "{uri} has no port: roscpp nodes do not start, and rospy nodes call port 80"
+            );
+            let todo = format!(
+                "`export ROS_MASTER_URI={parsed}`{}",
+                self.lasting(facts, SUBJECT)
+            );
+            return self.bad(SUBJECT, what, todo);
         }
         let Some(host) = &facts.master_host else {
             return;
@@ -120,8 +146,9 @@ impl Findings {
                 SUBJECT,
                 format!("{uri}: {} has no address ({why})", host.name),
                 format!(
-                    "add `ADDRESS {}` to /etc/hosts, or use an address",
-                    host.name
+                    "if it is this computer, `export ROS_MASTER_URI={}`, else {}",
+                    own_uri(facts),
+                    add_host("ADDRESS", &host.name)
                 ),
             ),
             Ok(addresses) if !host.is_here => self.bad(
@@ -130,7 +157,11 @@ impl Findings {
                     "{uri} is another computer ({}), but rosrescue would run here",
                     list(addresses)
                 ),
-                "check on that computer, or export the address of this one",
+                format!(
+                    "run `rosrescue check` on that computer, or `export ROS_MASTER_URI={}`{}",
+                    own_uri(facts),
+                    self.lasting(facts, SUBJECT)
+                ),
             ),
             Ok(_) => match &facts.port {
                 Ok(Port { number, .. }) if *number != parsed.port => self.bad(
@@ -139,7 +170,10 @@ impl Findings {
                         "{uri} has port {}, but rosrescue would use {number}",
                         parsed.port
                     ),
-                    "nodes from this shell would not find it: use the same port for both",
+                    format!(
+                        "nodes from this shell would not find it: `export ROS_MASTER_URI={}`",
+                        own_uri(facts)
+                    ),
                 ),
                 _ => self.ok(SUBJECT, format!("{uri} is this computer")),
             },
@@ -167,7 +201,7 @@ impl Findings {
             self.warn(
                 SUBJECT,
                 format!("the master calls itself {name}, which has no address here ({why})"),
-                format!("add `ADDRESS {name}` to /etc/hosts of this computer"),
+                add_host(&first_address(facts.master_host.as_ref()), name),
             );
         }
     }
@@ -177,24 +211,26 @@ impl Findings {
         let env = &facts.env;
         for (subject, value) in [("ROS_HOSTNAME", &env.hostname), ("ROS_IP", &env.ip)] {
             let Some(value) = value else { continue };
-            if value.trim() != value {
-                let todo = format!("export {subject}={}", value.trim());
-                self.bad(
-                    subject,
-                    format!("`{value}` begins or ends with a space"),
-                    todo,
-                );
+            if value.trim() != value || subject == "ROS_IP" && value.contains(' ') {
+                let todo = match subject {
+                    "ROS_IP" => format!("`export ROS_IP={}`", chosen_address(facts, value)),
+                    _ => format!("`export {subject}={}`", value.trim()),
+                };
+                let what = match value.trim().contains(' ') {
+                    true => format!("`{value}` is more than one address"),
+                    false => format!("`{value}` begins or ends with a space"),
+                };
+                self.bad(subject, what, todo + &self.lasting(facts, subject));
             } else if ros_env::bad_override(&|name| (name == subject).then(|| value.clone()))
                 .is_some()
             {
-                let todo = "write one without port or http://, as in robot or 10.0.0.7";
                 self.bad(
                     subject,
                     format!("`{value}` is not a host name or an address"),
-                    todo,
+                    set_address(facts) + &self.lasting(facts, subject),
                 );
             } else if subject == "ROS_IP" && value.parse::<std::net::IpAddr>().is_err() {
-                let todo = "use ROS_HOSTNAME for a name, and ROS_IP for an address";
+                let todo = format!("`unset ROS_IP; export ROS_HOSTNAME={value}`");
                 self.warn(subject, format!("`{value}` is not an address"), todo);
             }
         }
@@ -204,9 +240,48 @@ impl Findings {
             self.warn(
                 "ROS_IP",
                 format!("{ip} is ignored: ROS_HOSTNAME={hostname} comes first"),
-                "unset one of the two",
+                "`unset ROS_IP`, or `unset ROS_HOSTNAME` to use the address",
             );
         }
+    }
+
+    /// Reports variables that every new shell sets to something else.
+    pub(super) fn shell(&mut self, facts: &SetupFacts) {
+        let env = &facts.env;
+        for setting in &facts.shell {
+            let variable = setting.variable;
+            let present = match variable {
+                "ROS_MASTER_URI" => &env.master_uri,
+                "ROS_IP" => &env.ip,
+                _ => &env.hostname,
+            };
+            let at = format!("{}:{}", setting.file.display(), setting.line);
+            let (file, line) = (setting.file.display(), setting.line);
+            let value = &setting.value;
+            match present {
+                Some(present) if present == value => {}
+                Some(present) => self.warn(
+                    variable,
+                    format!("is {present} here, but {at} sets {value} in every new shell"),
+                    format!("`sed -i '{line}s|.*|export {variable}={present}|' {file}`, or `source {file}` here"),
+                ),
+                None => self.warn(
+                    variable,
+                    format!("is not set here, but {at} sets {value} in every new shell"),
+                    format!("`sed -i {line}d {file}`, or `source {file}` here"),
+                ),
+            }
+        }
+    }
+
+    /// How to correct the file that sets `variable` in every new shell, if there is one.
+    fn lasting(&self, facts: &SetupFacts, variable: &str) -> String {
+        let mut settings = facts.shell.iter();
+        let Some(setting) = settings.find(|setting| setting.variable == variable) else {
+            return String::new();
+        };
+        let (file, line) = (setting.file.display(), setting.line);
+        format!(". {file}:{line} sets the old value: `sed -i {line}d {file}`")
     }
 
     /// Checks the name that nodes of this computer register.
@@ -218,34 +293,43 @@ impl Findings {
             true => ("ROS_IP", &own.name),
             false => ("host name", &own.name),
         };
-        if name.trim() != name {
+        if name.contains(' ') {
             // The finding about the variable reports the spaces.
             return;
         }
+        let set_address = set_address(facts) + &self.lasting(facts, subject);
         let other_computer = other_computer(facts);
         match &own.addresses {
             Err(why) => self.bad(
                 subject,
                 format!("{name} has no address ({why}): no other node reaches the nodes of this computer"),
-                format!("add `ADDRESS {name}` to /etc/hosts, or export ROS_IP=ADDRESS"),
+                match facts.local {
+                    Some(local) => {
+                        format!("{}, or {set_address}", add_host(&local.to_string(), name))
+                    }
+                    None => set_address,
+                },
             ),
             Ok(_) if !own.is_here => self.bad(
                 subject,
                 format!("{}, which is not this computer", leads(own)),
-                format!("correct {name} in /etc/hosts, or export ROS_IP with an address of this computer"),
+                match name.parse::<std::net::IpAddr>() {
+                    Ok(_) => set_address,
+                    Err(_) => format!("{set_address}. `grep -n {name} /etc/hosts` shows a wrong entry"),
+                },
             ),
             Ok(_) if own.is_loopback() => {
                 let what = format!("{}, which other computers cannot reach", leads(own));
-                let todo = "export ROS_IP with this computer's network address before anything starts";
                 match other_computer {
                     Some(other) => {
-                        self.bad(subject, format!("{what}, but {other} is part of the robot"), todo);
+                        let what = format!("{what}, but {other} is part of the robot");
+                        self.bad(subject, what, set_address);
                     }
                     None if is_set => self.note(subject, what, ""),
                     None => self.warn(
                         subject,
                         format!("{what} (Debian's /etc/hosts)"),
-                        format!("fine for a robot with one computer; otherwise {todo}"),
+                        format!("fine for a robot with one computer; otherwise {set_address}"),
                     ),
                 }
             }
@@ -254,7 +338,7 @@ impl Findings {
         self.slow(subject, own);
     }
 
-    /// Checks whether the address in `ROS_IP` may change.
+    /// Checks whether the registered address of this computer may change.
     pub(super) fn lease(&mut self, facts: &SetupFacts) {
         let Some(lease) = &facts.lease else { return };
         let how = match (lease.is_leased, lease.is_wireless) {
@@ -262,37 +346,65 @@ impl Findings {
             (true, false) => "a leased (DHCP) address",
             _ => "an address of Wi-Fi",
         };
-        let ip = facts.env.ip.as_deref().unwrap_or_default();
+        let (address, interface, name) = (&lease.address, &lease.interface, &facts.own.name);
+        let (subject, what) = match (&facts.env.hostname, &facts.env.ip) {
+            (None, Some(_)) => ("ROS_IP", address.clone()),
+            (Some(_), _) if name == address => ("ROS_HOSTNAME", address.clone()),
+            (Some(_), _) => ("ROS_HOSTNAME", format!("{name} is {address},")),
+            (None, None) => ("host name", format!("{name} is {address},")),
+        };
+        let link = if name == address { " is" } else { "" };
         self.warn(
-            "ROS_IP",
+            subject,
             format!(
-                "{ip} is {how} ({}): when it changes, no node reaches this computer's nodes",
-                lease.interface
+                "{what}{link} {how} ({interface}): when it changes, no node reaches this computer's nodes"
             ),
-            "give the interface a fixed address, or use ROS_HOSTNAME with a name that follows the address",
+            format!(
+                "reserve it in the DHCP server for the hardware address that `cat \
+                 /sys/class/net/{interface}/address` prints"
+            ),
         );
     }
 
-    /// Reports running nodes of another master.
+    /// Reports running nodes of other masters.
     pub(super) fn strays(&mut self, facts: &SetupFacts) {
+        let mut by_uri: BTreeMap<&str, Vec<&Process>> = BTreeMap::new();
         for (process, uri) in &facts.strays {
+            by_uri.entry(uri).or_default().push(process);
+        }
+        for (uri, processes) in by_uri {
             let port = ros_env::MasterUri::parse(uri).ok().map(|uri| uri.port);
+            let names: Vec<_> = processes.iter().map(|process| named(process)).collect();
+            let started = match names.as_slice() {
+                [one] => format!("{one} was"),
+                all => format!("{} processes were", all.len()),
+            };
+            let list = match names.as_slice() {
+                [_] => String::new(),
+                all => format!(": {}", some(all)),
+            };
+            let pids: Vec<_> = processes.iter().map(|it| it.pid.to_string()).collect();
+            let again = format!(
+                "`kill {}`, and start them again after `export ROS_MASTER_URI={}`",
+                pids.join(" "),
+                own_uri(facts)
+            );
+            let what = format!("{started} started with ROS_MASTER_URI={uri}");
             if facts.behind.as_ref().map(|behind| behind.uri.port) == port && port.is_some() {
+                let what = format!("{what}, the master behind rosrescue{list}");
                 self.warn(
                     BYPASS,
-                    format!(
-                        "{} was started with ROS_MASTER_URI={uri}, the master behind rosrescue",
-                        named(process)
-                    ),
-                    AGAIN,
+                    what,
+                    format!("their changes are not recorded: {again}"),
                 );
-                continue;
+            } else {
+                let what = format!("{what}{list}");
+                self.warn(
+                    "ROS_MASTER_URI",
+                    what,
+                    format!("if they are nodes of this robot, {again}"),
+                );
             }
-            self.warn(
-                "ROS_MASTER_URI",
-                format!("{} was started with ROS_MASTER_URI={uri}", named(process)),
-                "if it is a node of this robot, restart it with the URI of this robot",
-            );
         }
     }
 
@@ -300,12 +412,21 @@ impl Findings {
     pub(super) fn bypass(&mut self, facts: &SetupFacts) {
         let Some(behind) = &facts.behind else { return };
         let uri = &behind.uri;
-        for who in &behind.bypassing {
-            self.warn(
-                BYPASS,
-                format!("{who} talks directly to the master at {uri}"),
-                AGAIN,
+        let talks = match behind.bypassing.as_slice() {
+            [] => None,
+            [one] => Some(format!("{one} talks directly to the master at {uri}")),
+            all => Some(format!(
+                "{} clients talk directly to the master at {uri}: {}",
+                all.len(),
+                some(all)
+            )),
+        };
+        if let Some(talks) = talks {
+            let todo = format!(
+                "their changes are not recorded: start them again after `export ROS_MASTER_URI={}`",
+                own_uri(facts)
             );
+            self.warn(BYPASS, talks, todo);
         }
         if behind.is_open {
             self.warn(
@@ -313,9 +434,82 @@ impl Findings {
                 format!(
                     "the master at {uri} accepts connections from other computers, which can bypass rosrescue"
                 ),
-                "start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME",
+                format!(
+                    "start it with `env -u ROS_HOSTNAME ROS_IP=127.0.0.1 rosmaster --core -p {}`",
+                    uri.port
+                ),
             );
         }
+    }
+
+    /// Reports computers of the robot that cannot be reached from here.
+    pub(super) fn reached(&mut self, facts: &SetupFacts) {
+        let mut hosts: BTreeMap<&str, Vec<&Reached>> = BTreeMap::new();
+        for reached in &facts.reached {
+            hosts
+                .entry(&reached.address.host)
+                .or_default()
+                .push(reached);
+        }
+        let ports = &facts.ports_of_nodes;
+        for (host, all) in hosts {
+            let own = all.iter().find_map(|it| it.from);
+            let own = own.map_or_else(|| address_of_this(facts), |own| own.to_string());
+            let blocked = all.iter().filter(|it| it.outcome != Outcome::Answered);
+            let list: Vec<_> = blocked
+                .map(|it| format!("{} ({})", it.address.port, it.of))
+                .collect();
+            if list.is_empty() {
+                let tried = counted(all.len(), "port");
+                self.ok(NETWORK, format!("{host} answers at {tried} of nodes"));
+                continue;
+            }
+            let is_on = all.iter().any(|it| match it.outcome {
+                Outcome::Answered => true,
+                Outcome::Blocked { is_on } => is_on,
+            });
+            let (list, number) = (some(&list), list.len());
+            if is_on {
+                self.bad(
+                    NETWORK,
+                    format!(
+                        "{host} is on, but does not answer at {number} of {} tried: {list}. A firewall drops the \
+                         packets",
+                        counted(all.len(), "port")
+                    ),
+                    format!(
+                        "the robot's computers need the master's port and TCP {ports} in both directions: on {host}, \
+                         run `sudo ufw allow from {own}`, or without ufw `sudo iptables -I INPUT -s {own} -j ACCEPT`"
+                    ),
+                );
+            } else {
+                self.warn(
+                    NETWORK,
+                    format!("{host} does not answer at {list}: it is off, out of reach, or behind a firewall"),
+                    format!(
+                        "`ping -c 3 {host}`. Its firewall has to let in TCP {ports} and the master's port from {own}"
+                    ),
+                );
+            }
+        }
+        let Some((firewall, other)) = facts.firewall.zip(other_host(facts)) else {
+            return;
+        };
+        let from = first_address(Some(other));
+        let allow = match firewall {
+            "ufw" => {
+                format!("`sudo ufw status` shows what it allows; `sudo ufw allow from {from}`")
+            }
+            _ => format!("`sudo firewall-cmd --zone=trusted --add-source={from}`"),
+        };
+        self.note(
+            NETWORK,
+            format!(
+                "this computer's firewall ({firewall}) has to let in TCP {ports} and the master's port from {}",
+                other.name
+            ),
+            allow,
+        );
     }
 
     fn slow(&mut self, subject: &'static str, host: &Host) {
@@ -327,7 +521,10 @@ impl Findings {
                     host.name,
                     host.took.as_millis()
                 ),
-                "add it to /etc/hosts: every new connection waits this long",
+                format!(
+                    "every new connection waits this long: {}",
+                    add_host(&first_address(Some(host)), &host.name)
+                ),
             );
         }
     }
@@ -341,8 +538,9 @@ impl Findings {
                     "nodes",
                     format!("{nodes} registered at {name}, which has no address here ({why})"),
                     format!(
-                        "add `ADDRESS {name}` to /etc/hosts of this computer, or set ROS_IP where the \
-                         nodes run"
+                        "where the nodes run, `export ROS_IP=$(hostname -I | cut -d' ' -f1)` and start them again; or \
+                         {}",
+                        add_host("ADDRESS", name)
                     ),
                 );
             }
@@ -369,11 +567,11 @@ impl Findings {
             None => return,
             Some(Ok(cluster)) => cluster,
             Some(Err(Unusable::Options(error))) => {
-                let todo = "correct the options: with these, `core` does not start";
+                let todo = "with these options, core does not start: `rosrescue core --help` explains them";
                 return self.bad(CLUSTER, error.to_string(), todo);
             }
             Some(Err(Unusable::Etcd(error))) => {
-                let todo = "correct the etcd options: with these, `core` does not start";
+                let todo = "with these options, core does not start: `rosrescue core --help` explains them";
                 return self.bad(CLUSTER, error.to_string(), todo);
             }
         };
@@ -397,7 +595,7 @@ impl Findings {
                 format!(
                     "another computer has the same name, {name}: it is at {uri}, this one is at {own}"
                 ),
-                "give this computer a unique name with --cluster-name",
+                format!("give this computer a unique name, as in `rosrescue core --cluster-name {name}-2`"),
             );
         } else {
             self.ok(
@@ -431,8 +629,77 @@ fn leads(host: &Host) -> String {
 
 /// Another computer of the robot, if one is known.
 fn other_computer(facts: &SetupFacts) -> Option<String> {
+    other_host(facts).map(|host| host.name.clone())
+}
+
+fn other_host(facts: &SetupFacts) -> Option<&Host> {
     let hosts = facts.node_hosts.iter().map(|(host, _)| host);
     let mut far = hosts.chain(&facts.master_host);
-    let far = far.find(|host| host.addresses.is_ok() && !host.is_here)?;
-    Some(far.name.clone())
+    far.find(|host| host.addresses.is_ok() && !host.is_here)
+}
+
+/// The first address of `host`, or a placeholder.
+fn first_address(host: Option<&Host>) -> String {
+    let first = host.and_then(|host| host.addresses.as_ref().ok()?.first());
+    first.map_or_else(|| "ADDRESS".to_owned(), ToString::to_string)
+}
+
+/// The `ROS_MASTER_URI` of nodes that use a master of this computer.
+fn own_uri(facts: &SetupFacts) -> String {
+    let own = &facts.own;
+    let port = facts
+        .port
+        .as_ref()
+        .map_or(ros_env::DEFAULT_MASTER_PORT, |port| port.number);
+    let host = match own.is_here && own.addresses.is_ok() {
+        true => own.name.clone(),
+        false => "localhost".to_owned(),
+    };
+    ros_env::MasterUri { host, port }.to_string()
+}
+
+/// This computer's address, or a command that prints it.
+fn address_of_this(facts: &SetupFacts) -> String {
+    let local = facts.local.map(|address| address.to_string());
+    local.unwrap_or_else(|| "$(hostname -I | cut -d' ' -f1)".to_owned())
+}
+
+/// The address in `value` that other computers see, or its first one.
+fn chosen_address(facts: &SetupFacts, value: &str) -> String {
+    let local = facts.local.map(|address| address.to_string());
+    let words = || value.split_whitespace();
+    let local = local.filter(|local| words().any(|word| word == local));
+    local.unwrap_or_else(|| words().next().unwrap_or_default().to_owned())
+}
+
+/// How to register this computer's nodes at an address that others reach.
+fn set_address(facts: &SetupFacts) -> String {
+    let unset = match facts.env.hostname {
+        Some(_) => "unset ROS_HOSTNAME; ",
+        None => "",
+    };
+    let address = address_of_this(facts);
+    format!("`{unset}export ROS_IP={address}` before anything starts")
+}
+
+/// How to give `name` an address on this computer.
+fn add_host(address: &str, name: &str) -> String {
+    format!("`echo {address} {name} | sudo tee -a /etc/hosts`")
+}
+
+/// How to stop the processes that have a port.
+fn stop(processes: &[Process]) -> String {
+    let pids: Vec<_> = processes
+        .iter()
+        .map(|process| process.pid.to_string())
+        .collect();
+    match pids.as_slice() {
+        [] => "`sudo rosrescue check` names the process".to_owned(),
+        pids => format!("stop it: `kill {}`", pids.join(" ")),
+    }
+}
+
+/// How to free space on the disk of ROS's logs. `rosclean purge` would delete the checkpoint, too.
+pub(super) fn delete_logs() -> String {
+    "`find ~/.ros/log -name '*.log*' -mtime +2 -delete` deletes old logs".to_owned()
 }

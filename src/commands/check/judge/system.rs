@@ -8,6 +8,7 @@ use super::{
         units::UnitKind,
     },
     Findings, named,
+    network::delete_logs,
 };
 use crate::{clock, status::software};
 
@@ -42,29 +43,37 @@ impl Findings {
             return self.bad(
                 SUBJECT,
                 format!("{path} is in use by another rosrescue{who}"),
-                "stop it, or use another --checkpoint here",
+                match holder.pid {
+                    Some(pid) => format!("stop it: `kill {pid}`, or use another --checkpoint here"),
+                    None => format!("`fuser {path}` names the process"),
+                },
             );
         }
         if disk.is_folder {
-            return self.bad(SUBJECT, format!("{path} is a folder"), "give a file in it");
+            let todo = format!("`rosrescue core --checkpoint {path}/latest-chkpt.yaml`");
+            return self.bad(SUBJECT, format!("{path} is a folder"), todo);
         }
         let (free, is_read_only) = match &disk.space {
             Ok(space) => *space,
-            Err(why) => return self.bad(SUBJECT, format!("{folder}: {why}"), "repair the disk"),
+            Err(why) => {
+                let todo = "`sudo dmesg | tail` shows what is wrong with the disk";
+                return self.bad(SUBJECT, format!("{folder}: {why}"), todo);
+            }
         };
         if is_read_only {
-            let todo = "mount it writable, or choose another place with --checkpoint";
+            let todo =
+                format!("`sudo mount -o remount,rw $(df --output=target {folder} | tail -n 1)`");
             return self.bad(SUBJECT, format!("{folder} is mounted read-only"), todo);
         }
         if let Some(why) = &disk.refused {
             let todo = format!(
-                "chown it to the user of rosrescue, or choose another --checkpoint than {path}"
+                "`sudo chown $(id -un) {folder}` as the user of rosrescue, or choose another --checkpoint than {path}"
             );
             return self.bad(SUBJECT, format!("{folder} cannot be written: {why}"), todo);
         }
         if let Some(files) = disk.inodes.filter(|files| *files < FEW_INODES) {
             let what = format!("{folder}: {files} more files can be created (inodes, `df -i`)");
-            let todo = "delete small files, such as old logs (rosclean purge)";
+            let todo = delete_logs();
             return match files {
                 ..NO_INODES => self.bad(SUBJECT, what, todo),
                 _ => self.warn(SUBJECT, what, todo),
@@ -73,24 +82,29 @@ impl Findings {
         let mib = free >> 20;
         let (of, source) = disk.mount.clone().unwrap_or_default();
         let what = format!("{path}: {mib} MiB free on {source} ({of})");
-        let todo = "delete old logs (rosclean purge)";
+        let todo = format!(
+            "{}; `du -xh {folder} | sort -h | tail` shows what is large",
+            delete_logs()
+        );
         match free {
             ..NO_SPACE => self.bad(SUBJECT, what, todo),
             NO_SPACE..LITTLE_SPACE => self.warn(SUBJECT, what, todo),
             _ => self.ok(SUBJECT, what),
         }
         if of == "tmpfs" || of == "ramfs" {
-            let todo = "a power cut loses it: choose a place on a disk";
+            let todo = "a power cut loses it: choose a place on a disk with --checkpoint, as `df -h` shows";
             self.note(SUBJECT, format!("{folder} is in memory"), todo);
         } else if of.starts_with("nfs") || of == "cifs" || of.starts_with("fuse.sshfs") {
-            let todo = "choose a disk of this computer: otherwise writes wait for the network";
+            let todo = "writes wait for the network: choose a disk of this computer with --checkpoint, as `df -h -l` \
+                        shows";
             self.warn(
                 SUBJECT,
                 format!("{folder} is on another computer ({of})"),
                 todo,
             );
         } else if source.starts_with("/dev/mmcblk") {
-            let todo = "cards wear out and can stall for seconds. --sync never writes less, but a power cut loses more";
+            let todo = "cards wear out and can stall for seconds. `rosrescue core --sync never` writes less, but a \
+                        power cut loses more";
             self.note(
                 SUBJECT,
                 format!("{folder} is on an SD card or eMMC ({source})"),
@@ -101,7 +115,8 @@ impl Findings {
 
     pub(super) fn files(&mut self, files: u64) {
         let what = format!("{files} open files at most");
-        let todo = "raise it: `ulimit -Hn`, or LimitNOFILE= in the unit";
+        let todo = "`sudo prlimit --pid $$ --nofile=65536` raises it for this shell; `sudo systemctl edit rosrescue` \
+                    for a service (LimitNOFILE=65536)";
         match files {
             ..TOO_FEW_FILES => self.bad("descriptors", what, todo),
             TOO_FEW_FILES..FEW_FILES => self.warn("descriptors", what, todo),
@@ -112,12 +127,13 @@ impl Findings {
     pub(super) fn clock(&mut self, clock: &Clock) {
         let now = clock::wall_text(clock.now);
         if clock.now < EARLIEST {
-            let todo =
-                "set the clock, or wait for the network: tf drops all data when the clock jumps";
+            let todo = "tf drops all data when the clock jumps: `sudo timedatectl set-ntp true`, or without a network \
+                        `sudo date -s '2026-01-31 12:00'` with the right time";
             self.bad("clock", format!("says {now}"), todo);
         } else if clock.now + BEHIND_FILES < clock.newest {
             let newest = clock::wall_text(clock.newest);
-            let todo = "set the clock: otherwise logs and tf are wrong";
+            let todo = "logs and tf are wrong: `sudo timedatectl set-ntp true`, or without a network `sudo date -s \
+                        '2026-01-31 12:00'` with the right time";
             self.warn(
                 "clock",
                 format!("says {now}, before files of {newest}"),
@@ -129,7 +145,7 @@ impl Findings {
             self.note(
                 "clock",
                 format!("says {now}; no time service runs"),
-                "fine for one computer. With several, tf needs chrony or systemd-timesyncd",
+                "fine for one computer. With several, tf needs the same time: `sudo apt-get install chrony`",
             );
         }
     }
@@ -137,7 +153,12 @@ impl Findings {
     pub(super) fn ros(&mut self, facts: &SetupFacts) {
         match &facts.rosmaster {
             None => {}
-            Some(Err(why)) => self.bad("rosmaster", why.clone(), "core needs it"),
+            Some(Err(why)) => self.bad(
+                "rosmaster",
+                why.clone(),
+                "`sudo apt-get install python3-rosmaster` on Debian, `sudo apt-get install ros-noetic-rosmaster` with \
+                 the packages of ros.org",
+            ),
             Some(Ok(program)) => {
                 let path = program.path.display();
                 let version = program.version.as_deref().unwrap_or("of unknown version");
@@ -145,8 +166,7 @@ impl Findings {
                     Some(why) => self.bad(
                         "rosmaster",
                         format!("{path} fails with {}: {why}", program.interpreter),
-                        "remove conda, pyenv or the venv from the PATH (conda deactivate), and source \
-                         ROS's setup.bash",
+                        "`conda deactivate` (or `deactivate` in a venv), then `source /opt/ros/*/setup.bash`",
                     ),
                     None => {
                         let http = software::keeps_alive(version, &facts.kernel);
@@ -156,7 +176,8 @@ impl Findings {
                     }
                 }
                 if !facts.has_rosout {
-                    let todo = "apt-get install rosout (ros-noetic-rosout), or --no-rosout";
+                    let todo = "`sudo apt-get install rosout` on Debian, `sudo apt-get install ros-noetic-rosout` with \
+                                the packages of ros.org, or --no-rosout";
                     self.warn("rosout", "is not installed: nothing collects /rosout", todo);
                 }
             }
@@ -165,7 +186,7 @@ impl Findings {
             self.warn(
                 "python",
                 format!("{} comes first on the PATH and has no ROS", python.display()),
-                "nodes that begin with `#!/usr/bin/env python3` fail: conda deactivate, or put /usr/bin first",
+                "nodes that begin with #!/usr/bin/env python3 fail: `conda deactivate`, or `export PATH=/usr/bin:$PATH`",
             );
         }
         let Some((uri, server)) = &facts.proxied else {
@@ -179,13 +200,15 @@ impl Findings {
                     .unwrap_or_default();
                 self.ok("master", format!("{uri} answers{speaks}"));
             }
-            Responder::Rosrescue { .. } => self.bad(
-                "master",
-                format!("--master {uri} is a rosrescue"),
-                "give the address of the real rosmaster",
-            ),
+            Responder::Rosrescue { proxied, .. } => {
+                let todo = match proxied {
+                    Some(real) => format!("`rosrescue check --master {real}`"),
+                    None => "it has a master of its own: `rosrescue check` without --master".to_owned(),
+                };
+                self.bad("master", format!("--master {uri} is a rosrescue"), todo);
+            }
             Responder::Other => {
-                let todo = "give the address of the real rosmaster";
+                let todo = "give the address of the real rosmaster: `ss -ltnp | grep rosmaster` shows its port";
                 self.bad(
                     "master",
                     format!("what answers at {uri} is not a ROS master"),
@@ -195,7 +218,10 @@ impl Findings {
             Responder::Nobody | Responder::Silent => self.warn(
                 "master",
                 format!("no answer from {uri}"),
-                "start it: at its first start, proxy lets calls wait for a master",
+                format!(
+                    "at its first start, proxy lets calls wait for a master: `rosmaster --core -p {}`",
+                    uri.port
+                ),
             ),
         }
     }
@@ -209,12 +235,20 @@ impl Findings {
             // The finding about the port reports a master at `port`. A master at `proxied` is intended.
             !at(port) && !at(proxied)
         });
-        let others: Vec<_> = others.map(named).collect();
+        let others: Vec<_> = others.collect();
+        let pids: Vec<_> = others
+            .iter()
+            .map(|process| process.pid.to_string())
+            .collect();
+        let others: Vec<_> = others.into_iter().map(named).collect();
         if !others.is_empty() {
             self.warn(
                 "masters",
                 format!("other masters run on this computer: {}", others.join(", ")),
-                "stop those you do not need: their nodes do not see the nodes of rosrescue",
+                format!(
+                    "their nodes do not see the nodes of rosrescue. Stop those you do not need: `kill {}`",
+                    pids.join(" ")
+                ),
             );
         }
     }
@@ -223,24 +257,28 @@ impl Findings {
         let mut own = 0;
         for unit in &facts.units {
             let name = &unit.name;
+            let systemctl = match unit.is_users {
+                true => "systemctl --user",
+                false => "sudo systemctl",
+            };
             match (unit.kind, unit.is_enabled) {
                 (UnitKind::Rosrescue, true) => {
                     own += 1;
                     self.ok("systemd", format!("{name} starts at boot"));
                 }
                 (UnitKind::Rosrescue, false) => {
-                    let todo = format!("systemctl enable {name}");
+                    let todo = format!("`{systemctl} enable {name}`");
                     self.note("systemd", format!("{name} does not start at boot"), todo);
                 }
                 (UnitKind::Roscore, true) if facts.proxied.is_none() => {
-                    let todo = format!("systemctl disable --now {name}");
+                    let todo = format!("`{systemctl} disable --now {name}`");
                     let what = format!("{name} starts another master at boot");
                     self.bad("systemd", what, todo);
                 }
                 (UnitKind::Roslaunch, true) => self.warn(
                     "systemd",
                     format!("{name} runs roslaunch, which starts a master if it finds none"),
-                    "add --wait to its roslaunch, and After=rosrescue.service to the unit",
+                    format!("add --wait to its roslaunch, and After=rosrescue.service: `{systemctl} edit --full {name}`"),
                 ),
                 _ => {}
             }
@@ -251,7 +289,7 @@ impl Findings {
                 .iter()
                 .all(|unit| unit.kind != UnitKind::Rosrescue)
         {
-            let todo = "`rosrescue install` adds one that starts at boot";
+            let todo = "`sudo rosrescue install` adds one that starts at boot";
             self.note("systemd", "there is no rosrescue service", todo);
         }
     }
@@ -264,16 +302,25 @@ impl Findings {
             self.warn(
                 SUBJECT,
                 format!("{}:{} sets ROS_MASTER_URI to {}", one.file.display(), one.line, one.uri),
-                "remove this <env> if its nodes belong to this robot: they use that master, not rosrescue",
+                format!(
+                    "its nodes use that master, not rosrescue. If they belong to this robot, remove the <env>: `nano \
+                     +{} {}`",
+                    one.line,
+                    one.file.display()
+                ),
             );
         }
         if count > SETTINGS_MOST {
             let what = format!("{} more set ROS_MASTER_URI", count - SETTINGS_MOST);
-            self.warn(SUBJECT, what, "fix the first ones, then check again");
+            self.warn(
+                SUBJECT,
+                what,
+                "fix the first ones, then run `rosrescue check` again",
+            );
         }
         let files = launches.files;
         if launches.is_cut {
-            let todo = "check again with only the robot's own packages in ROS_PACKAGE_PATH";
+            let todo = "`ROS_PACKAGE_PATH=$HOME/catkin_ws/src rosrescue check` reads only the robot's own packages";
             self.note(SUBJECT, format!("read {files}, and there are more"), todo);
         } else if count == 0 && files > 0 {
             self.ok(
@@ -290,7 +337,7 @@ impl Findings {
             true => self.warn(
                 "memory",
                 what,
-                "stop something: the kernel kills a program when memory runs out",
+                "the kernel kills a program when memory runs out: `ps -eo rss,pid,comm --sort=-rss | head` shows what uses it",
             ),
             false => self.ok("memory", what),
         }

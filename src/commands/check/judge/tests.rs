@@ -80,6 +80,11 @@ fn robot() -> SetupFacts {
         memory: Some(4 << 30),
         strays: Vec::new(),
         lease: None,
+        local: Some("10.0.0.7".parse().unwrap()),
+        shell: Vec::new(),
+        reached: Vec::new(),
+        ports_of_nodes: "32768-60999".to_owned(),
+        firewall: None,
         behind: None,
         masters: Vec::new(),
         cluster: None,
@@ -91,6 +96,7 @@ fn unit(name: &str, kind: UnitKind, is_enabled: bool) -> Unit {
         name: name.to_owned(),
         kind,
         is_enabled,
+        is_users: false,
     }
 }
 
@@ -145,5 +151,58 @@ fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut S
         "{found:?}"
     );
     assert!(finding.what.contains(words), "{finding:?} lacks {words}");
-    assert!(!finding.todo.is_empty(), "{finding:?}");
+    // The options of --cluster are explained elsewhere.
+    if subject != "--cluster" {
+        assert_has_a_command(finding);
+    }
+}
+
+/// Asserts that the advice contains a command, and that a shell can read each of its commands.
+#[track_caller]
+fn assert_has_a_command(finding: &Finding) {
+    const PROGRAMS: [&str; 29] = [
+        "cat",
+        "conda",
+        "deactivate",
+        "df",
+        "du",
+        "echo",
+        "env",
+        "export",
+        "find",
+        "fuser",
+        "grep",
+        "kill",
+        "nano",
+        "ping",
+        "ps",
+        "rosmaster",
+        "rosnode",
+        "rosrescue",
+        "sed",
+        "source",
+        "ss",
+        "sudo",
+        "systemctl",
+        "unset",
+        "ROS_PACKAGE_PATH=$HOME/catkin_ws/src",
+        "apt-get",
+        "iptables",
+        "ufw",
+        "date",
+    ];
+    let commands: Vec<_> = finding.todo.split('`').skip(1).step_by(2).collect();
+    assert!(!commands.is_empty(), "{finding:?}");
+    for command in commands {
+        let program = command.split_whitespace().next().unwrap_or_default();
+        assert!(PROGRAMS.contains(&program), "{command}: {finding:?}");
+        let shell = std::process::Command::new("bash")
+            .args(["-n", "-c", command])
+            .output();
+        let shell = shell.unwrap();
+        assert!(
+            shell.status.success() && shell.stderr.is_empty(),
+            "{command}: {shell:?}"
+        );
+    }
 }

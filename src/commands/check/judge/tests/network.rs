@@ -6,7 +6,9 @@ use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
         facts::{Lease, PortInUse, SetupFacts, UpstreamMaster},
+        reach::{Outcome, Reached},
         ros::Responder,
+        shell::ShellSetting,
     },
     host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
 };
@@ -177,6 +179,142 @@ fn traps_of_ros_ip_and_ros_hostname() {
     assert_eq!((alone[0].severity, alone[0].subject), (Note, "ROS_IP"));
 }
 
+/// The todo of the only finding that `spoil` causes.
+#[track_caller]
+fn todo(spoil: impl FnOnce(&mut SetupFacts)) -> String {
+    let found = said(spoil);
+    assert_eq!(found.len(), 1, "{found:?}");
+    found[0].todo.clone()
+}
+
+#[test]
+fn each_advice_about_addresses_is_one_command() {
+    let two = |facts: &mut SetupFacts| {
+        facts.env.ip = Some("172.17.0.1 10.0.0.7 ".to_owned());
+        facts.own = nowhere("172.17.0.1 10.0.0.7 ");
+    };
+    one(Problem, "ROS_IP", "is more than one address", two);
+    assert_eq!(todo(two), "`export ROS_IP=10.0.0.7`");
+    // A variable that comes first has to go.
+    let wrong = |facts: &mut SetupFacts| {
+        facts.env.hostname = Some("old".to_owned());
+        facts.own = host("old", "10.0.0.9", false);
+    };
+    let said = todo(wrong);
+    assert!(
+        said.starts_with("`unset ROS_HOSTNAME; export ROS_IP=10.0.0.7` before anything starts"),
+        "{said}"
+    );
+    let unknown = |facts: &mut SetupFacts| {
+        wrong(facts);
+        facts.local = None;
+    };
+    assert!(todo(unknown).contains("ROS_IP=$(hostname -I | cut -d' ' -f1)`"));
+    // An address is not looked for in /etc/hosts.
+    let said = todo(|facts| {
+        facts.env.ip = Some("10.99.99.99".to_owned());
+        facts.own = host("10.99.99.99", "10.99.99.99", false);
+    });
+    assert!(!said.contains("/etc/hosts"), "{said}");
+    let said = todo(|facts| facts.own.took = Duration::from_secs(4));
+    assert!(
+        said.contains("`echo 10.0.0.7 robot | sudo tee -a /etc/hosts`"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_stale_file_of_the_shell_is_found() {
+    let setting = |variable, value: &str| ShellSetting {
+        file: "/home/r/.bashrc".into(),
+        line: 120,
+        variable,
+        value: value.to_owned(),
+    };
+    one(
+        Warning,
+        "ROS_MASTER_URI",
+        "is http://robot:11311/ here, but /home/r/.bashrc:120 sets http://old:11311 in every new shell",
+        |facts| facts.shell = vec![setting("ROS_MASTER_URI", "http://old:11311")],
+    );
+    one(
+        Warning,
+        "ROS_IP",
+        "is not set here, but /home/r/.bashrc:120 sets 10.0.0.9",
+        |facts| facts.shell = vec![setting("ROS_IP", "10.0.0.9")],
+    );
+    let same = setting("ROS_MASTER_URI", "http://robot:11311/");
+    assert_eq!(said(|facts| facts.shell = vec![same]), []);
+    // This shell has the wrong address from that file.
+    let said = todo(|facts| {
+        facts.env.ip = Some("10.0.0.9".to_owned());
+        facts.own = host("10.0.0.9", "10.0.0.9", false);
+        facts.shell = vec![setting("ROS_IP", "10.0.0.9")];
+    });
+    assert!(said.ends_with("`sed -i 120d /home/r/.bashrc`"), "{said}");
+}
+
+#[test]
+fn a_uri_without_a_port_is_found() {
+    let port = "has no port: roscpp nodes do not start";
+    one(Problem, "ROS_MASTER_URI", port, |facts| {
+        facts.env.master_uri = Some("http://robot".to_owned());
+    });
+}
+
+#[test]
+fn a_firewall_between_the_computers_is_found() {
+    let base = |port, of: &str, outcome| Reached {
+        address: MasterUri::parse(&format!("http://base:{port}")).unwrap(),
+        of: of.to_owned(),
+        from: Some("10.0.0.7".parse().unwrap()),
+        outcome,
+    };
+    let blocked = |is_on| Outcome::Blocked { is_on };
+    let far = |facts: &mut SetupFacts| {
+        facts.node_hosts = vec![(host("base", "10.0.0.9", false), vec!["/a".to_owned()])];
+    };
+    let words = "base is on, but does not answer at 1 of 2 ports tried: 40001 (/a). A firewall";
+    one(Problem, "network", words, |facts| {
+        far(facts);
+        facts.reached = vec![
+            base(22, "/b", Outcome::Answered),
+            base(40_001, "/a", blocked(false)),
+        ];
+    });
+    let found = todo(|facts| {
+        far(facts);
+        facts.reached = vec![base(40_001, "/a", blocked(true))];
+    });
+    for words in [
+        "TCP 32768-60999",
+        "`sudo ufw allow from 10.0.0.7`",
+        "iptables",
+    ] {
+        assert!(found.contains(words), "{found}");
+    }
+    let words = "base does not answer at 40001 (/a): it is off, out of reach, or behind a firewall";
+    one(Warning, "network", words, |facts| {
+        far(facts);
+        facts.reached = vec![base(40_001, "/a", blocked(false))];
+    });
+    let answered = said(|facts| {
+        far(facts);
+        facts.reached = vec![base(40_001, "/a", Outcome::Answered)];
+    });
+    assert_eq!(answered, []);
+    one(
+        Note,
+        "network",
+        "firewall (ufw) has to let in TCP 32768-60999",
+        |facts| {
+            far(facts);
+            facts.firewall = Some("ufw");
+        },
+    );
+    assert_eq!(said(|facts| facts.firewall = Some("ufw")), []);
+}
+
 #[test]
 fn names_that_lead_nowhere_or_elsewhere() {
     one(Problem, "host name", "robot has no address", |facts| {
@@ -286,10 +424,37 @@ fn addresses_that_may_change_and_nodes_of_another_master() {
             facts.env.ip = Some("10.0.0.7".to_owned());
             facts.own = host("10.0.0.7", "10.0.0.7", true);
             facts.lease = Some(Lease {
+                address: "10.0.0.7".to_owned(),
                 interface: "eth0".to_owned(),
                 is_leased: true,
                 is_wireless: false,
             });
+        },
+    );
+    one(
+        Warning,
+        "host name",
+        "robot is 10.0.0.7, an address of Wi-Fi (wlan0)",
+        |facts| {
+            facts.lease = Some(Lease {
+                address: "10.0.0.7".to_owned(),
+                interface: "wlan0".to_owned(),
+                is_leased: false,
+                is_wireless: true,
+            });
+        },
+    );
+    one(
+        Warning,
+        "ROS_MASTER_URI",
+        "48 processes were started with ROS_MASTER_URI=http://other:11311: node (process 1, port 40001), ",
+        |facts| {
+            facts.strays = (1..49)
+                .map(|number| {
+                    let process = process(number, "node", 40_000 + u16::try_from(number).unwrap());
+                    (process, "http://other:11311".to_owned())
+                })
+                .collect();
         },
     );
     one(
