@@ -48,7 +48,7 @@ fi
 assets=target/package
 rm -rf "$assets"
 mkdir -p "$assets/completions"
-"$program" man "$assets/man"
+"$program" man --folder "$assets/man"
 gzip -9n "$assets"/man/*.1
 for shell in bash zsh fish; do
     "$program" completions "$shell" >"$assets/completions/$shell"

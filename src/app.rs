@@ -160,11 +160,22 @@ struct Supervised {
     rosout: bool,
 }
 
-/// Tells the operator that the master is protected, as soon as calls pass. Never ends.
+/// Pause between two checks whether changes are recorded again.
+const PROTECTED_AGAIN: Duration = Duration::from_secs(1);
+
+/// Tells the operator that the master is protected, as soon as calls pass and changes are recorded. Never ends.
 async fn announce(context: &Context, say: impl Fn(&str)) {
     let mut gate = context.gate.clone();
     gate.wait_for(|state| state.is_open() || state == State::Elsewhere)
         .await;
+    if context.ledger.unprotected().is_some() {
+        say(
+            "ROS Rescue enabled, but UNPROTECTED: a crash of rosrescue itself would lose the state",
+        );
+        while context.ledger.unprotected().is_some() {
+            tokio::time::sleep(PROTECTED_AGAIN).await;
+        }
+    }
     say("ROS Rescue enabled. Master is now fault tolerant!!");
     std::future::pending().await
 }

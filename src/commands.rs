@@ -36,6 +36,7 @@ use thiserror::Error;
 use crate::{
     cli::{OutputArgs, Tool},
     log::{plain, plain_json},
+    status::summary::counted,
 };
 
 /// Exit status of a command that has a result. [`CommandFailure`] has the other statuses.
@@ -139,10 +140,4 @@ fn print_line(text: &str) -> Result<bool, CommandFailure> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(CommandFailure::Failed(format!("cannot print: {error}"))),
     }
-}
-
-/// A count with its noun, as in `1 message` and `2 messages`.
-fn counted(count: usize, thing: &str) -> String {
-    let plural = if count == 1 { "" } else { "s" };
-    format!("{count} {thing}{plural}")
 }

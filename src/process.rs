@@ -70,8 +70,8 @@ pub enum ProcessError {
     #[error("--rosmaster: `{}` is not an executable program", path.display())]
     NotAProgram { path: PathBuf },
     /// The master's port is taken.
-    #[error("--master-port: port {port} on loopback is in use; choose another one")]
-    PortInUse { port: u16 },
+    #[error("--master-port: port {port} on loopback is in use by {by}; choose another one")]
+    PortInUse { port: u16, by: String },
     /// The system refused to start the program.
     #[error("cannot start `{}`: {source}", program.display())]
     Spawn { program: PathBuf, source: io::Error },
@@ -117,7 +117,8 @@ impl Rosmaster {
             return if is_free(port) {
                 Ok(port)
             } else {
-                Err(ProcessError::PortInUse { port })
+                let by = listeners::named(port);
+                Err(ProcessError::PortInUse { port, by })
             };
         }
         if let Some(port) = remembered.filter(|port| is_free(*port)) {

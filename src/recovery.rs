@@ -285,7 +285,7 @@ impl Driver {
                 () = wait::for_some(self.ended.as_mut()) => {
                     if !self.examiner.gate.state().is_open() {
                         let master = self.examiner.upstream.address();
-                        self.log_waiting(&format!("{master} closes the connection without a reason"));
+                        self.log_waiting(&format!("{master} closes the connection without a reason"), false);
                     }
                     return Input::ConnectionLost;
                 }
@@ -456,10 +456,13 @@ impl Driver {
                 Some(Input::PortTaken)
             }
             Done::NotConnected(error) => {
-                self.log_waiting(&error.to_string());
+                let may_be_absent = matches!(error, ConnectError::Refused { .. });
+                self.log_waiting(&error.to_string(), may_be_absent);
                 Some(match error {
                     ConnectError::Refused { .. } => Input::Refused,
-                    ConnectError::Unreachable { .. } => Input::Unreachable,
+                    ConnectError::NoAddress { .. } | ConnectError::Unreachable { .. } => {
+                        Input::Unreachable
+                    }
                 })
             }
             // The data that was read and written may belong to two different masters.

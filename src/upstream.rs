@@ -53,6 +53,9 @@ pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 pub enum ConnectError {
     #[error("nothing listens at {master}")]
     Refused { master: String },
+    /// The master's host has no address.
+    #[error("{host} has no address: {source}")]
+    NoAddress { host: String, source: io::Error },
     /// The master's host gave no answer, or there is no route to it.
     #[error("cannot reach {master}: {source}")]
     Unreachable { master: String, source: io::Error },
@@ -298,7 +301,11 @@ impl Upstream {
             source,
         };
         let connecting = async {
-            let (addresses, confirmed) = self.find(&address).await?;
+            let found = self.find(&address).await;
+            let (addresses, confirmed) = found.map_err(|source| ConnectError::NoAddress {
+                host: address.host.clone(),
+                source,
+            })?;
             // At an old address there may be nobody any more, as after the restart of a container. Trying it must not
             // delay the next lookup for long.
             let limit = if confirmed {
@@ -306,18 +313,20 @@ impl Upstream {
             } else {
                 self.probe_timeout
             };
-            timeout(limit, open(addresses)).await?
-        };
-        match timeout(CONNECT_LIMIT, connecting).await {
-            Err(_) => Err(unreachable(io::ErrorKind::TimedOut.into())),
-            Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
-                Err(ConnectError::Refused {
-                    master: address.to_string(),
-                })
+            match timeout(limit, open(addresses)).await {
+                Ok(Ok(stream)) => Ok(stream),
+                Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
+                    Err(ConnectError::Refused {
+                        master: address.to_string(),
+                    })
+                }
+                Ok(Err(error)) => Err(unreachable(error)),
+                Err(_) => Err(unreachable(io::ErrorKind::TimedOut.into())),
             }
-            Ok(Err(error)) => Err(unreachable(error)),
-            Ok(Ok(stream)) => Ok((address, stream)),
-        }
+        };
+        let stream = timeout(CONNECT_LIMIT, connecting).await;
+        let stream = stream.unwrap_or_else(|_| Err(unreachable(io::ErrorKind::TimedOut.into())));
+        Ok((address.clone(), stream?))
     }
 
     /// Looks up the master's addresses. If that fails, returns the last known ones and false: a failing name server must

@@ -144,6 +144,10 @@ pub struct ReportArgs {
     /// Number of the rescue in `rosrescue status` or `rosrescue history` [default: the last one]
     #[arg(value_name = "NUMBER")]
     pub number: Option<u64>,
+    /// Ask the rosrescue at this address, http://HOST:PORT, instead of reading files. It has the last 20 reports
+    /// of its session
+    #[arg(long, value_name = "URI", conflicts_with = "checkpoint")]
+    pub uri: Option<String>,
     #[command(flatten)]
     pub place: CheckpointArgs,
     #[command(flatten)]

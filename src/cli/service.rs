@@ -74,6 +74,9 @@ pub struct CompletionsArgs {
 /// Options of `rosrescue man`.
 #[derive(Args, Clone, Debug)]
 pub struct ManArgs {
-    /// Folder for all pages [default: print rosrescue(1)]
+    /// Command whose page is printed [default: rosrescue itself]
+    pub command: Option<String>,
+    /// Write all pages into this folder instead
+    #[arg(long, conflicts_with = "command")]
     pub folder: Option<PathBuf>,
 }

@@ -32,7 +32,7 @@ pub enum Tool {
     Install(InstallArgs),
     /// Show what changed, when, and who did it
     Log(LogArgs),
-    /// Print the manual page, or write all manual pages into a folder
+    /// Print the manual page of a command, or write all manual pages into a folder
     Man(ManArgs),
     /// Print the parameters of a checkpoint, for `rosparam load`
     Params(ParamsArgs),

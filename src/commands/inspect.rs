@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, fmt};
 use serde::Serialize;
 
 use super::{
-    CommandFailure, Exit,
+    CommandFailure, Exit, counted,
     files::{self, Opened, size},
     print,
 };
@@ -203,8 +203,8 @@ impl fmt::Display for Inspected {
         if !self.pending.is_empty() {
             writeln!(
                 f,
-                "pending     {} writes that no master has run yet",
-                self.pending.len()
+                "pending     {} that no master has run yet",
+                counted(self.pending.len(), "write")
             )?;
         }
         writeln!(f, "\nnodes")?;

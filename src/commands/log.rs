@@ -75,10 +75,11 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
         return Ok(Exit::Good);
     }
     if !args.follow {
-        return Ok(match found {
-            true => Exit::Good,
-            false => Exit::Bad,
-        });
+        if found {
+            return Ok(Exit::Good);
+        }
+        eprintln!("rosrescue: {}", nothing_found(&path, &wanted));
+        return Ok(Exit::Bad);
     }
     loop {
         tokio::time::sleep(LOOK).await;
@@ -93,6 +94,17 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
                 return Ok(Exit::Good);
             }
         }
+    }
+}
+
+/// Why the log shows nothing.
+fn nothing_found(path: &Path, wanted: &Wanted<'_>) -> String {
+    let path = path.display();
+    match wanted.is_everything() {
+        true => format!("there is no change in the log beside {path}"),
+        false => format!(
+            "no change in the log beside {path} matches. Names are full names, as in /arm/gain"
+        ),
     }
 }
 

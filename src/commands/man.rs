@@ -13,8 +13,19 @@ pub(super) async fn run(args: &ManArgs) -> Result<Exit, CommandFailure> {
     command.build();
     match &args.folder {
         None => {
+            let shown = match &args.command {
+                None => command,
+                Some(name) => {
+                    let found = command.find_subcommand(name).cloned();
+                    found.ok_or_else(|| {
+                        CommandFailure::Usage(format!(
+                            "there is no command `{name}`; to write all pages, use --folder {name}"
+                        ))
+                    })?
+                }
+            };
             let mut page = Vec::new();
-            let written = clap_mangen::Man::new(command).render(&mut page);
+            let written = clap_mangen::Man::new(shown).render(&mut page);
             written.map_err(|error| CommandFailure::Failed(format!("no page: {error}")))?;
             print_line(String::from_utf8_lossy(&page).trim_end())?;
         }

@@ -1,14 +1,28 @@
-//! `rosrescue report`: prints the report of a rescue, from the files beside the checkpoint.
+//! `rosrescue report`: prints the report of a rescue, from the files beside the checkpoint or from a running rosrescue.
 
-use super::{CommandFailure, Exit, files, print};
-use crate::{cli::ReportArgs, recovery::report_file};
+use super::{CommandFailure, Exit, files, print, running::Running};
+use crate::{
+    cli::{ReportArgs, TargetArgs},
+    recovery::report_file,
+};
 
 pub(super) async fn run(args: &ReportArgs) -> Result<Exit, CommandFailure> {
-    let present = files::present(&args.place).await;
-    let mut reports: Vec<_> = report_file::read(&present)
-        .into_iter()
-        .map(|kept| kept.report)
-        .collect();
+    let (place, mut reports) = match &args.uri {
+        Some(_) => {
+            let target = TargetArgs {
+                uri: args.uri.clone(),
+            };
+            let running = Running::find(&target)?;
+            let place = format!("at {}", running.address);
+            (place, running.status().await?.last_rescues)
+        }
+        None => {
+            let present = files::present(&args.place).await;
+            let kept = report_file::read(&present).into_iter();
+            let reports: Vec<_> = kept.map(|kept| kept.report).collect();
+            (format!("beside {}", present.display()), reports)
+        }
+    };
     let found = match args.number {
         Some(number) => reports.iter().position(|report| report.number == number),
         None => reports.len().checked_sub(1),
@@ -19,7 +33,7 @@ pub(super) async fn run(args: &ReportArgs) -> Result<Exit, CommandFailure> {
             .map(|report| report.number.to_string())
             .collect();
         return Err(CommandFailure::Failed(match numbers.as_slice() {
-            [] => format!("there is no report beside {}", present.display()),
+            [] => format!("there is no report {place}"),
             all => format!(
                 "there is no report of that rescue; there are {}",
                 all.join(", ")

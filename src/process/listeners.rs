@@ -54,6 +54,18 @@ fn descends(pid: u32, ancestor: u32) -> bool {
     std::iter::successors(Some(pid), parent).any(|pid| pid == ancestor)
 }
 
+/// The processes that listen at `port`, for people.
+pub(crate) fn named(port: u16) -> String {
+    let processes = at(port);
+    let named = processes
+        .iter()
+        .map(|pid| format!("{} (process {pid})", super::name_of(*pid)));
+    match processes.is_empty() {
+        true => "a process that only root can see".to_owned(),
+        false => named.collect::<Vec<_>>().join(", "),
+    }
+}
+
 /// The processes in this network namespace that listen at `port`. Only root sees those of other users.
 pub(crate) fn at(port: u16) -> Vec<u32> {
     let sockets = sockets(port);

@@ -68,7 +68,8 @@ impl ExamineError {
     /// The [`Input`] that reports this error to the lifecycle.
     pub(crate) fn as_input(&self) -> Input {
         match self {
-            Self::Silent { .. } | Self::Connect(ConnectError::Unreachable { .. }) => {
+            Self::Silent { .. }
+            | Self::Connect(ConnectError::NoAddress { .. } | ConnectError::Unreachable { .. }) => {
                 Input::Unreachable
             }
             Self::Look(InspectError::Call(

@@ -70,7 +70,7 @@ impl MasterProcess {
         };
         this.watch(pid, async move {
             process::ended(pid).await;
-            "it was not started by this rosrescue".to_owned()
+            "exit status unknown: an earlier rosrescue started it".to_owned()
         });
         this
     }

@@ -176,16 +176,17 @@ impl Driver {
         }
     }
 
-    pub(super) fn log_waiting(&mut self, what: &str) {
+    /// Logs why the master cannot be used yet. `may_be_absent` says that no program may listen at its address.
+    pub(super) fn log_waiting(&mut self, what: &str, may_be_absent: bool) {
         // Waiting for a child that is about to listen needs no message.
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
             match self.process {
-                Some(_) => self.log_once(format!("waiting for the master: {what}")),
-                None => self.log_once(format!(
+                None if may_be_absent => self.log_once(format!(
                     "waiting for the master, which you must start: {what}"
                 )),
+                _ => self.log_once(format!("waiting for the master: {what}")),
             }
         }
     }

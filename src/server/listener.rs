@@ -23,7 +23,7 @@ use super::{
     deadlines::{Deadlines, Timed},
     service,
 };
-use crate::{limit::rarely, task::boxed};
+use crate::{limit::rarely, process::listeners, task::boxed};
 
 /// Number of connections that the kernel holds while rosrescue is busy or restarting.
 const BACKLOG: i32 = 1024;
@@ -47,12 +47,13 @@ const LINGER_PAUSE: Duration = Duration::from_millis(20);
 pub enum ListenError {
     /// Another process has the port.
     #[error(
-        "port {} is in use at {}: another master or rosrescue runs there; stop it, or choose \
-         another port with {option}",
+        "port {} is in use at {} by {by}: stop it, or choose another port with {option}",
         address.port(), address.ip()
     )]
     InUse {
         address: SocketAddr,
+        /// The processes that listen at the port.
+        by: String,
         /// The option that chooses the port.
         option: &'static str,
     },
@@ -84,7 +85,12 @@ pub fn bind(
                 listeners.push(listener);
             }
             Err(source) if source.kind() == io::ErrorKind::AddrInUse => {
-                return Err(ListenError::InUse { address, option });
+                let by = listeners::named(address.port());
+                return Err(ListenError::InUse {
+                    address,
+                    by,
+                    option,
+                });
             }
             Err(error) if !listeners.is_empty() => {
                 tracing::debug!(%address, %error, "not served");

@@ -240,8 +240,10 @@ impl Status {
 
     fn master_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "master      {}", self.master)?;
-        if let Some(pid) = self.master_pid {
-            write!(f, ", process {pid}")?;
+        match self.master_pid {
+            Some(pid) if self.open => write!(f, ", process {pid}")?,
+            Some(pid) => write!(f, ", not serving; the last one was process {pid}")?,
+            None => {}
         }
         if let Some(speaks) = &self.master_speaks {
             write!(f, ", {speaks}")?;
@@ -319,8 +321,8 @@ impl fmt::Display for Status {
         if self.pending_writes > 0 {
             writeln!(
                 f,
-                "pending     {} changes for the next master",
-                self.pending_writes
+                "pending     {} for the next master",
+                counted(self.pending_writes, "change")
             )?;
         }
         if self.late_answers.times > 0 {
@@ -340,6 +342,12 @@ fn died(times: u64) -> String {
         1 => ", died once".to_owned(),
         times => format!(", died {times} times"),
     }
+}
+
+/// A count with its noun, as in `1 message` and `2 messages`.
+pub(crate) fn counted(count: usize, thing: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{count} {thing}{plural}")
 }
 
 /// Lists names for people, and shortens long lists.
@@ -373,6 +381,12 @@ pub(crate) fn size(bytes: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_is_singular() {
+        assert_eq!(counted(1, "change"), "1 change");
+        assert_eq!(counted(2, "change"), "2 changes");
+    }
 
     #[test]
     fn sizes() {

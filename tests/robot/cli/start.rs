@@ -143,6 +143,42 @@ fn a_master_uri_that_does_not_lead_here_is_warned_of() {
     assert!(!rescue.stderr().iter().any(|line| warns(line)));
 }
 
+#[test]
+fn an_unprotected_start_does_not_call_the_master_fault_tolerant() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port());
+    let rescue = setup.args(["--checkpoint", "/proc/1/checkpoint"]).start();
+    let said = rescue.output().join("\n");
+    assert!(
+        said.contains("ROS Rescue enabled, but UNPROTECTED"),
+        "{said}"
+    );
+    assert!(!said.contains("fault tolerant"), "{said}");
+}
+
+#[test]
+fn a_start_after_a_kill_says_once_that_the_session_continues() {
+    let scratch = Scratch::new();
+    let mut rescue = Setup::core(&scratch, free_port()).start();
+    let client = rescue.client();
+    let master = client.master_pid().expect("the master's process id");
+    rescue.kill();
+    rescue.start_again();
+    rescue.wait_line("that the session continues", |line| {
+        line.starts_with("the session continues (rosrescue was not stopped cleanly): ")
+    });
+    rescue.wait_serving();
+    // It is not the master's parent, so it cannot know the exit status.
+    crate::support::signal(master, Signal::KILL);
+    let line = rescue.wait_line("how the master ended", |line| {
+        line.contains("rosmaster has ended")
+    });
+    assert!(
+        line.contains("exit status unknown: an earlier rosrescue started it"),
+        "{line}"
+    );
+}
+
 /// The gate stays open although rosmaster closes connections that were idle for four seconds.
 #[test]
 fn probes_keep_the_sentinel_from_being_idle() {
@@ -204,7 +240,31 @@ fn an_address_that_cannot_be_served_is_named() {
     ] {
         let said = refused(&scratch, Setup::bare(&scratch, arguments), 1);
         assert!(named.iter().all(|word| said.contains(word)), "{said}");
+        // This test has the port.
+        let by = format!("(process {})", std::process::id());
+        assert_eq!(said.contains(&by), named[1] == "in use", "{said}");
     }
+}
+
+#[test]
+fn a_proxy_whose_masters_host_has_no_address_says_so() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let arguments = [
+        "proxy",
+        "--master",
+        "http://nobody.invalid:11312",
+        "--listen",
+        &port,
+    ];
+    let mut rescue = Setup::bare(&scratch, arguments).spawn();
+    let line = rescue.wait_line("why it waits", |line| {
+        line.contains("waiting for the master")
+    });
+    assert!(
+        line.contains("waiting for the master: nobody.invalid has no address"),
+        "{line}"
+    );
 }
 
 /// The kernel closes the sockets of a killed rosrescue a moment after its end.

@@ -54,6 +54,12 @@ fn the_log_shows_who_changed_what_and_the_state_at_any_time(mode: Mode) {
     let new = FakeNode::start("/driver");
     new.publish(&client, "/scan", "x/Y");
 
+    let nothing = run(&robot, &["log", "--param", "/arm/gian"]);
+    assert_eq!(nothing.exit(), 1, "{nothing:?}");
+    assert!(
+        nothing.stderr.contains("no change in the log beside "),
+        "{nothing:?}"
+    );
     let found = gain(&[]);
     let of = |entry: &Json, key: &str| entry[key].as_str().unwrap_or_default().to_owned();
     assert_eq!(found.len(), 2, "{found:?}");

@@ -92,6 +92,13 @@ fn it_says_what_nodes_notice_and_what_to_do() {
         "{away:?}"
     );
     assert!(away.stdout.contains("Nodes keep working"), "{away:?}");
+    let last = format!(", not serving; the last one was process {dead}");
+    assert!(away.stdout.contains(&last), "{away:?}");
+    assert!(
+        away.stdout
+            .contains("pending     1 change for the next master"),
+        "{away:?}"
+    );
     assert!(
         away.stdout
             .contains("\nto do       start the master at http://"),
@@ -114,6 +121,14 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     assert!(
         after.stdout.contains("a new master got the whole state"),
         "{after:?}"
+    );
+    // A report from another computer, without its files.
+    let empty = Scratch::new();
+    let uri = robot.client().uri();
+    let report = Tool::rosrescue(&empty, port, &["report", "--uri", &uri]).ended(0);
+    assert!(
+        report.contains("a new master got the whole state"),
+        "{report}"
     );
     let json = Tool::rosrescue(&robot.scratch, port, &["status", "--json"]).json(0);
     let rescue = &json["last_rescues"][0];

@@ -289,9 +289,15 @@ fn installed_completions_match_the_command_line() {
         page.contains(".TH rosrescue 1") && page.contains("ROSRESCUE_CHECKPOINT"),
         "{page}"
     );
-    said(
-        &rosrescue(&scratch, &["man", scratch.path("pages").to_str().unwrap()]),
-        0,
+    let page = said(&rosrescue(&scratch, &["man", "status"]), 0);
+    assert!(page.contains(".TH rosrescue-status 1"), "{page}");
+    let refused = said(&rosrescue(&scratch, &["man", "stauts"]), 2);
+    assert!(
+        refused.contains("there is no command `stauts`"),
+        "{refused}"
     );
+    let folder = scratch.path("pages");
+    let folder = folder.to_str().unwrap();
+    said(&rosrescue(&scratch, &["man", "--folder", folder]), 0);
     assert!(scratch.path("pages/rosrescue-install.1").exists());
 }
