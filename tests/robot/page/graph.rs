@@ -108,7 +108,7 @@ fn a_death_recolours_a_box_where_it_is() {
     browser.shows(
         "it is named on the first screen, right after the condition",
         &format!(
-            "document.querySelector('#condition + #trouble').innerText.includes('/doomed') && {first}.bottom < 500"
+            "document.querySelector('#condition + #trouble').innerText.includes('/doomed') && {first}.bottom < 844"
         ),
     );
     // The rescue unregisters it.
