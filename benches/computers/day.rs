@@ -145,6 +145,7 @@ impl Robot<'_> {
         let claim = Op::Claim {
             guard: view.guard(),
             claim: 1,
+            begins: true,
             seq: 0,
             settled: true,
         };

@@ -32,7 +32,7 @@ fn with_files(
     let short: Vec<_> = names
         .iter()
         .filter(|name| name.parse::<IpAddr>().is_err())
-        .filter_map(|name| Some(name.split_once('.').map_or(&**name, |(first, _)| first)))
+        .map(|name| name.split_once('.').map_or(&**name, |(first, _)| first))
         .filter(|name| !name.eq_ignore_ascii_case("localhost"))
         .map(str::to_owned)
         .collect();

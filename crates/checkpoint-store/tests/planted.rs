@@ -1,5 +1,7 @@
 //! Files that others have planted beside a checkpoint.
 
+#![allow(clippy::unwrap_used, reason = "a test")]
+
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::os::unix::fs::symlink;
