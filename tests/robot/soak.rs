@@ -364,7 +364,7 @@ impl Stage<'_> {
                 let start = Instant::now();
                 while !is_so() {
                     assert!(
-                        start.elapsed() < Duration::from_secs(20),
+                        start.elapsed() < PATIENCE,
                         "{at}: {:#?}\nacknowledged: {wanted:#?}\nlog: {}",
                         Own::read(&client, writer.index),
                         self.rescue.log(),

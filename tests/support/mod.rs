@@ -56,7 +56,9 @@ pub(crate) use name_server::NameServer;
 pub(crate) use namespace::{is_isolated, isolate};
 pub(crate) use netns::{Netns, ip};
 pub(crate) use node::{Library, Node};
-pub(crate) use patience::{Finish, PATIENCE, comes_true, eventually, eventually_some, holds};
+pub(crate) use patience::{
+    Control, Finish, PATIENCE, comes_true, eventually, eventually_some, holds, within,
+};
 pub(crate) use process::{Process, alive, behind, signal, stop};
 pub(crate) use relay::Relay;
 pub(crate) use report::report;

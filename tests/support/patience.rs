@@ -1,7 +1,10 @@
 //! Waiting for a condition, with a limit, instead of for a fixed time.
 
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::sleep;
+use std::thread::{self, JoinHandle, sleep};
 use std::time::{Duration, Instant};
 
 /// The time limit for anything that a test waits for, chosen for two busy cores.
@@ -55,6 +58,68 @@ pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool
         sleep(STEP);
     }
     true
+}
+
+/// Measures how busy the computer is: two threads exchange a byte, again and again, while something else is measured.
+#[derive(Debug)]
+pub(crate) struct Control {
+    done: Arc<AtomicBool>,
+    thread: JoinHandle<Duration>,
+}
+
+impl Control {
+    /// How many times longer than an exchange something may take. A call of a ROS node takes some 20 turns of several
+    /// processes on the processor.
+    const NOISE: u32 = 50;
+    const PAUSE: Duration = Duration::from_millis(5);
+
+    pub(crate) fn start() -> Self {
+        let done = Arc::new(AtomicBool::new(false));
+        let (mut near, mut far) = UnixStream::pair().unwrap();
+        thread::spawn(move || {
+            let mut byte = [0];
+            while far.read_exact(&mut byte).is_ok() && far.write_all(&byte).is_ok() {}
+        });
+        let stop = done.clone();
+        let thread = thread::spawn(move || {
+            let mut longest = Duration::ZERO;
+            loop {
+                let is_last = stop.load(Ordering::Relaxed);
+                let start = Instant::now();
+                near.write_all(&[0]).unwrap();
+                near.read_exact(&mut [0]).unwrap();
+                sleep(Self::PAUSE);
+                longest = longest.max(start.elapsed().saturating_sub(Self::PAUSE));
+                if is_last {
+                    return longest;
+                }
+            }
+        });
+        Self { done, thread }
+    }
+
+    /// Ends the measurement. Returns how long something may have taken meanwhile that takes less than `limit` on a
+    /// computer with nothing else to do.
+    pub(crate) fn allows(self, limit: Duration) -> Duration {
+        self.done.store(true, Ordering::Relaxed);
+        limit + Self::NOISE * self.thread.join().unwrap()
+    }
+}
+
+/// Does `work`. Panics if it takes longer than `limit`, and longer than other work did meanwhile because the computer is
+/// busy.
+#[track_caller]
+pub(crate) fn within<T>(limit: Duration, what: &str, work: impl FnOnce() -> T) -> T {
+    let control = Control::start();
+    let start = Instant::now();
+    let result = work();
+    let took = start.elapsed();
+    let allowed = control.allows(limit);
+    assert!(
+        took < allowed,
+        "{what} took {took:?}; allowed are {allowed:?}"
+    );
+    result
 }
 
 /// Tells threads to end when it is dropped, even after a panic.

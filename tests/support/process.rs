@@ -219,17 +219,12 @@ impl Process {
     pub(crate) fn wait_line(&mut self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
         let what = format!("{} says {what}", self.name);
         eventually_some(&what, || {
-            let ended = self.exited();
+            // The process's last output may still be in the pipe when it has ended.
+            let is_complete = self.readers.iter().all(JoinHandle::is_finished);
+            let ended = self.exited().filter(|_| is_complete);
             let found = self.output().into_iter().find(|line| wanted(line));
             if let (None, Some(status)) = (&found, ended) {
-                // The process's last output may still be in the pipe.
-                thread::sleep(Duration::from_millis(200));
-                let found = self.output().into_iter().find(|line| wanted(line));
-                assert!(
-                    found.is_some(),
-                    "did not happen: {what}; the process ended with {status}"
-                );
-                return found;
+                panic!("did not happen: {what}; the process ended with {status}");
             }
             found
         })

@@ -3,7 +3,8 @@
 //! happens to the master, and no exception reaches them.
 //!
 //! The limit is [`PASS`], or [`NOISE`] times what the same driver takes at the same time with an undisturbed
-//! bare rosmaster if that is longer, because starting rosmasters takes all cores of a small computer.
+//! bare rosmaster if that is longer, because starting rosmasters takes all cores of a small computer. If a driver stalls
+//! and the undisturbed one is not [`CALM`] either, the computer is busy and the event is repeated.
 //!
 //! `ROSRESCUE_LOOP_SECONDS` sets the length of a crash loop; the full length is 600. `ROSRESCUE_HANGS` sets how often a
 //! master hangs; on a computer without other load none of 20 should make a pass longer than 150 ms.
@@ -30,6 +31,10 @@ const PASS_HUNG: f64 = 190.0;
 const BETWEEN_HANGS: Duration = Duration::from_secs(13);
 /// How many times longer a pass may take than the longest one of an undisturbed driver.
 const NOISE: f64 = 3.0;
+/// The longest pass of an undisturbed driver on a computer with little other load, in milliseconds, with a reserve.
+const CALM: f64 = 40.0;
+/// How often an event takes place on a busy computer until no driver stalls.
+const ATTEMPTS: usize = 5;
 /// Pause between two kills.
 const PAUSE: Duration = Duration::from_secs(2);
 /// Default length of a crash loop.
@@ -81,7 +86,15 @@ impl Drivers {
 
     /// Panics if a pass takes longer than `limit` while `event` takes place, or if anything fails.
     #[track_caller]
-    fn assert_no_stall(&mut self, what: &str, limit: f64, event: impl FnOnce()) {
+    fn assert_no_stall(&mut self, what: &str, limit: f64, mut event: impl FnMut()) {
+        let is_calm = (1..=ATTEMPTS).any(|_| self.is_calm(what, limit, &mut event));
+        assert!(is_calm, "{what}: drivers stall each time");
+    }
+
+    /// Whether no pass takes longer than `limit` while `event` takes place. Panics if one does on a computer that is not
+    /// busy, or if anything fails.
+    #[track_caller]
+    fn is_calm(&mut self, what: &str, limit: f64, event: impl FnOnce()) -> bool {
         self.go_on();
         let before: Vec<_> = self.all().map(|driver| driver.said("pass").len()).collect();
         event();
@@ -106,10 +119,12 @@ impl Drivers {
                 assert!(!log.contains(bad), "{bad}:\n{}", driver.log());
             }
         }
+        let is_calm = longest[..2].iter().all(|ms| *ms <= allowed);
         assert!(
-            longest[..2].iter().all(|ms| *ms <= allowed),
+            is_calm || longest[2] > CALM,
             "{what}: passes of {longest:?} ms"
         );
+        is_calm
     }
 }
 

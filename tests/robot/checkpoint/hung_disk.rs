@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, FailingDisk, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, Trouble, eventually,
-    free_port, holds, params, signal, status,
+    free_port, holds, params, signal, status, within,
 };
 use rustix::process::Signal;
 
@@ -18,15 +18,6 @@ const LATE: Duration = Duration::from_secs(30);
 fn unprotected(client: &Client) -> Option<String> {
     let reason = status(client)["unprotected"].clone();
     reason.as_str().map(str::to_owned)
-}
-
-#[track_caller]
-fn within<T>(limit: Duration, what: &str, work: impl FnOnce() -> T) -> T {
-    let start = Instant::now();
-    let result = work();
-    let taken = start.elapsed();
-    assert!(taken < limit, "{what} took {taken:?}");
-    result
 }
 
 /// Makes all kinds of reads while `write` is under way on a disk that hangs.
