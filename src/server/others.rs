@@ -15,9 +15,11 @@ use tokio::{
     time::Instant,
 };
 
+mod control;
 mod forwarded;
 mod members;
 
+use self::control::Control;
 pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
@@ -25,14 +27,12 @@ use super::{
     replies::{HttpReply, UntilWritten, forwarded, no_such_page, text, xml},
 };
 use crate::{
-    checkpoint::format::Origin,
     cluster::{
         journal::RECORD_BYTES_MAX,
-        merge::wire::Ask,
         sharing::Source,
         standing::{Pass, Place, Standing},
     },
-    master::{CALLER_ID, Kind, Method, Request},
+    master::{Kind, Request},
     nodes::served::Served,
     order::ANSWER_LIMIT,
     ros_env::MasterUri,
@@ -40,7 +40,7 @@ use crate::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
     },
-    xmlrpc::{self, Reply, Value},
+    xmlrpc::{self, Reply},
 };
 
 /// Pause before a call is sent to the same leader again.
@@ -49,8 +49,6 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 const CATCH_UP: Duration = Duration::from_millis(20);
 /// The error if the leader's address in etcd is unusable.
 const NO_ADDRESS: &str = "the leader's address cannot be used";
-/// The method by which `rosrescue handover` asks the leader to give up leadership.
-pub(crate) const HANDOVER: &str = "rosrescue/handover";
 
 /// A handover request: the computer that should lead, and a channel for the result. The result is the previous leader's
 /// name, or why the handover failed.
@@ -96,9 +94,6 @@ impl Shown {
         *shown = shown.max(place);
     }
 }
-
-/// rosrescue's own method by which a follower tells the leader that it has passed an answer on to its caller.
-const PASSED_ON: &str = "rosrescue/passedOn";
 
 /// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
 /// the answer, because some notifications must wait for that.
@@ -163,8 +158,7 @@ impl Drop for PassOn {
             return;
         };
         let (leader, term) = (self.leader.clone(), self.term);
-        let params = [CALLER_ID, self.number.as_str()];
-        let call = Request::new(Method::named(PASSED_ON), params);
+        let call = Control::answer_passed_on(&self.number);
         let body = Bytes::from(xmlrpc::encode_call(&call.into()));
         runtime.spawn(async move {
             if let Err(error) = leader.forward(term, &Head::default(), &body).await {
@@ -231,6 +225,11 @@ impl Others {
             kind,
             from: said.unwrap_or_else(|| peer.ip()).to_canonical(),
         };
+        let control = on_its_way.call.as_ref();
+        let control = control.and_then(|call| Control::read(call, asked_term));
+        if let Some(control) = control {
+            return self.answer_control(&on_its_way, control, asked_term).await;
+        }
         let mut standing = self.standing.clone();
         self.conduct(&on_its_way, &mut standing, asked_term).await
     }
@@ -253,23 +252,12 @@ impl Others {
             {
                 return Ok(not_leading(term));
             }
-            if let (Some(term), Some(ask)) = (asked_term, call.merges()) {
-                let merged = self.merge(call.calls, ask, Origin::At(call.from)).await;
-                return Ok(merged.unwrap_or_else(|| not_leading(term)));
-            }
             let mut by_mirror = false;
             let retry = match now {
                 Standing::Leads {
                     pass: Pass::Calls, ..
                 }
                 | Standing::Alone => {
-                    if let Some(to) = call.hands_over() {
-                        return Ok(self.hand_over(to).await);
-                    }
-                    if let Some(number) = call.was_passed_on() {
-                        self.passing.end(number);
-                        return Ok(passed_on());
-                    }
                     let Call {
                         calls, head, body, ..
                     } = call;
@@ -308,14 +296,6 @@ impl Others {
                 Standing::Follows { uri, term } => {
                     let uri = MasterUri::parse(&uri).map_err(|_| Closed(NO_ADDRESS))?;
                     let leader = self.peers.at(&uri);
-                    if call.hands_over().is_some() {
-                        // The request is sent only once, because after a failure the next leader would hand over too.
-                        let silent = || handed_over(Err("the leader does not answer".to_owned()));
-                        return Ok(call
-                            .forward(&leader, term)
-                            .await
-                            .unwrap_or_else(|_| silent()));
-                    }
                     let removes = call.removes().await;
                     if unanswered.is_none() && call.kind.mutates() {
                         unanswered = call
@@ -367,26 +347,6 @@ impl Others {
             }
         }
     }
-
-    /// Makes the writes of a computer that was cut off. `None` if this computer no longer leads.
-    async fn merge(&self, calls: &Calls, ask: Ask, origin: Origin) -> Option<HttpReply> {
-        let mut standing = self.standing.clone();
-        tokio::select! {
-            biased;
-            _ = standing.wait_for(|now| *now == Standing::Alone) => None,
-            answer = calls.write_queue.merge(ask, origin) => Some(xml(&answer?.to_reply())),
-        }
-    }
-
-    async fn hand_over(&self, to: &str) -> HttpReply {
-        let (tell, told) = oneshot::channel();
-        // The channel closes only when rosrescue stops.
-        let _ = self.handovers.send((to.to_owned(), tell)).await;
-        handed_over(
-            told.await
-                .unwrap_or_else(|_| Err("rosrescue is stopping".to_owned())),
-        )
-    }
 }
 
 /// The address that stands for this computer in the robot's journal, which other computers read. `uri` is its advertised
@@ -398,36 +358,7 @@ pub(crate) fn own_address(uri: &str) -> IpAddr {
     advertised.unwrap_or_else(local)
 }
 
-/// The answer to a handover request.
-fn handed_over(result: Result<String, String>) -> HttpReply {
-    let (code, text, who) = match result {
-        Ok(who) => (1, "another computer may lead now".to_owned(), who),
-        Err(why) => (0, why, String::new()),
-    };
-    let reply: [Value; 3] = [code.into(), text.as_str().into(), who.as_str().into()];
-    xml(&Reply::Value(reply.to_vec().into()))
-}
-
 impl Call<'_> {
-    /// The computer that should lead, if the call requests a handover.
-    fn hands_over(&self) -> Option<&str> {
-        let call = self.call.as_ref()?;
-        let is_it = matches!(call.method(), Method::Unknown(name) if **name == *HANDOVER);
-        is_it.then(|| call.text(1).unwrap_or_default())
-    }
-
-    /// The writes to merge, if the call comes from a computer that was cut off.
-    fn merges(&self) -> Option<Ask> {
-        Ask::read(self.call.as_ref()?)
-    }
-
-    /// The answer's number, if the call reports that a follower has passed an answer on.
-    fn was_passed_on(&self) -> Option<u64> {
-        let call = self.call.as_ref()?;
-        let is_it = matches!(call.method(), Method::Unknown(name) if **name == *PASSED_ON);
-        is_it.then(|| call.text(1)?.parse().ok()).flatten()
-    }
-
     /// Passes the leader's answer on to the caller. Notes the answer's place in the journal: from now on the mirror
     /// answers here only if it has reached that place.
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
@@ -568,11 +499,6 @@ fn instead(mut reply: HttpReply, removed: Option<Reply>) -> HttpReply {
     let mut told = xml(&removed);
     std::mem::swap(told.extensions_mut(), reply.extensions_mut());
     told
-}
-
-fn passed_on() -> HttpReply {
-    let reply: [Value; 3] = [1.into(), "passed on".into(), 0.into()];
-    xml(&Reply::Value(reply.to_vec().into()))
 }
 
 fn not_leading(term: u64) -> HttpReply {

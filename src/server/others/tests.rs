@@ -7,17 +7,20 @@ use tokio::{
     net::TcpListener,
 };
 
-use super::*;
+use super::{
+    control::{HANDOVER, PASSED_ON},
+    *,
+};
 use crate::{
     checkpoint::format::{Record, RecordContent, Session},
     cli::{Reads, SyncPolicy},
     gate,
     ledger::Ledger,
-    master::Master,
+    master::{Master, Method},
     ros_env::MasterUri,
     upstream::{Upstream, pool::Pool},
     write_queue::write_queue,
-    xmlrpc::{decode_reply, encode_call, encode_reply},
+    xmlrpc::{Value, decode_reply, encode_call, encode_reply},
 };
 
 const OWN: &str = "http://127.0.0.1:11311/";
