@@ -340,7 +340,7 @@ pub enum ReapNodes {
     Report,
     /// Nodes of this computer, within 2 s after their process has ended
     Local,
-    /// Also nodes that fail a health check, and those whose port another node registers
+    /// Also nodes that fail a health check
     All,
 }
 

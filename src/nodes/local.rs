@@ -15,11 +15,10 @@ use super::{
     origin::{Misaddressed, say_misaddressed},
 };
 use crate::{
-    checkpoint::format::Origin,
     clock,
     health::{
         AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
-        Reach, Reap, Registrants, first_taking, port_of,
+        Reach, Reap, Registrants, port_of,
     },
     ledger::{Ledger, activity::LastCalls},
     limit::rarely,
@@ -332,34 +331,16 @@ impl Known {
 }
 
 impl MoveJudge for LocalNodes {
-    fn reaps_all(&self) -> bool {
-        self.reap == Reap::All
+    fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
+        calls.iter().position(|call| Moving::is_any(mirror, call))
     }
 
-    fn first_apart(&self, mirror: &Master, calls: &[(&Request, Origin)]) -> Option<usize> {
-        let mut moves = calls.iter();
-        let moving = moves.position(|(call, _)| Moving::is_any(mirror, call));
-        let calls = calls.iter();
-        let calls = calls.map(|(call, origin)| (*call, origin.other_computer()));
-        let taking = match self.reaps_all() {
-            true => first_taking(mirror, calls),
-            false => None,
-        };
-        moving.into_iter().chain(taking).min()
-    }
-
-    fn judge(&self, ledger: &Ledger, call: &Request, origin: Origin) -> Option<Option<Eviction>> {
-        let from = origin.other_computer();
-        let (moving, taking) = ledger.with_mirror(|mirror| {
-            let taking = self.reaps_all();
-            let taking = taking.then(|| Eviction::before(mirror, call, from));
-            (Moving::by(mirror, call), taking.flatten())
-        });
-        if moving.is_empty() && taking.is_none() {
+    fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
+        let moving = ledger.with_mirror(|mirror| Moving::by(mirror, call));
+        if moving.is_empty() {
             return None;
         }
-        let taken = taking.map(|taking| taking.nodes).unwrap_or_default();
-        let mut gone: BTreeSet<_> = taken.into_iter().collect();
+        let mut gone = BTreeSet::new();
         for moving in moving {
             let evidence = self.evidence_now(&moving);
             self.note_feud(&moving, evidence);

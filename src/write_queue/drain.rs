@@ -425,7 +425,7 @@ impl Drain {
         let mut length = 1;
         if first.raw.is_some() && !first.way_made {
             if let Some(call) = first.call.as_deref()
-                && let Some(eviction) = self.link.judge.judge(&ledger, call, first.origin)
+                && let Some(eviction) = self.link.judge.judge(&ledger, call)
             {
                 first.way_made = true;
                 if let Some(eviction) = eviction {
@@ -434,8 +434,7 @@ impl Drain {
                     return vec![evict::unregistration(eviction, by)];
                 }
             } else {
-                let calls = items.iter();
-                let calls = calls.map_while(|item| Some((item.call.as_deref()?, item.origin)));
+                let calls = items.iter().map_while(|item| item.call.as_deref());
                 let calls: Vec<_> = calls.collect();
                 let judge = &self.link.judge;
                 let apart = ledger.with_mirror(|mirror| judge.first_apart(mirror, &calls));
@@ -616,10 +615,6 @@ impl Drain {
             let Some(item) = merge::judged(&ledger, item) else {
                 continue;
             };
-            let call = item.answerable();
-            if let Some(call) = call.filter(|_| self.link.judge.reaps_all() && item.raw.is_some()) {
-                evict::while_standing_in(&ledger, call, item.origin);
-            }
             if let Some(item) = answers.add(&ledger, item) {
                 self.queue.push_back(item);
             }

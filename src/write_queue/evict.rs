@@ -1,12 +1,14 @@
 //! Unregisters a dead node before a call that would make the master shut down an innocent node: the call registers the
-//! dead node's name at another address, or its port for another node. The registering node is not asked first, because
-//! it cannot answer before its registration is done.
+//! dead node's name at another address. The registering node is not asked first, because it cannot answer before its
+//! registration is done.
+//!
+//! A call that registers another name at the port of a node proves nothing: anybody can register any address. Earlier,
+//! `--reap all` unregistered the node at the port before such a call, also a living one.
 
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
 
 use super::batch::{CallAnswer, Item};
 use crate::{
-    checkpoint::format::Origin,
     health::Eviction,
     ledger::Ledger,
     master::{Master, Request},
@@ -14,24 +16,14 @@ use crate::{
 
 /// Judges calls that could make the master shut down an innocent node. By default, it objects to none.
 pub(crate) trait MoveJudge: Send + Sync {
-    /// Whether a node is unregistered when another node registers its port.
-    fn reaps_all(&self) -> bool {
-        false
-    }
-
     /// The index of the first of `calls` that must be judged and sent alone.
-    fn first_apart(&self, _mirror: &Master, _calls: &[(&Request, Origin)]) -> Option<usize> {
+    fn first_apart(&self, _mirror: &Master, _calls: &[&Request]) -> Option<usize> {
         None
     }
 
-    /// Judges a call. `None` if it moves no name and takes no port. Otherwise the eviction that must precede the call,
+    /// Judges a call. `None` if it moves no name. Otherwise the eviction that must precede the call,
     /// if there is one.
-    fn judge(
-        &self,
-        _ledger: &Ledger,
-        _call: &Request,
-        _origin: Origin,
-    ) -> Option<Option<Eviction>> {
+    fn judge(&self, _ledger: &Ledger, _call: &Request) -> Option<Option<Eviction>> {
         None
     }
 
@@ -42,17 +34,6 @@ pub(crate) trait MoveJudge: Send + Sync {
 /// Objects to no call.
 #[cfg(test)]
 impl MoveJudge for () {}
-
-/// Unregisters the nodes whose port `call` takes, while the mirror answers in a master's place.
-pub(super) fn while_standing_in(ledger: &Ledger, call: &Request, origin: Origin) {
-    let from = origin.other_computer();
-    let eviction = ledger.with_mirror(|mirror| Eviction::before(mirror, call, from));
-    if let Some(eviction) = eviction
-        && ledger.stand_in(Instant::now(), &eviction.call).is_some()
-    {
-        say(&eviction.nodes, call.caller().unwrap_or_default());
-    }
-}
 
 /// The call that unregisters the nodes of `eviction`. `by` is the node that takes their port or name.
 pub(super) fn unregistration(eviction: Eviction, by: String) -> Item {
@@ -69,6 +50,6 @@ fn say(nodes: &[String], by: &str) {
     tracing::info!(
         ?nodes,
         by,
-        "unregistered dead nodes: their ports or names belong to other nodes now"
+        "unregistered dead nodes: their names belong to other nodes now"
     );
 }

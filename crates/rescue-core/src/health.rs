@@ -16,18 +16,16 @@ mod rates;
 mod repeats;
 #[cfg(test)]
 mod simulation;
-mod taken_port;
 mod unreachable;
 
 pub use addresses::{AddressChanges, NodeAddresses};
 pub use feuds::{Feud, Feuds};
 pub use kernel::{Death, Evidence, LocalName, Owner, Process, Registrants};
 pub use liveness::{Health, Liveness};
-pub use moves::{Moving, Reap};
+pub use moves::{Eviction, Moving, Reap};
 pub use origin::Reach;
 pub use rates::Rates;
 pub use repeats::Repeats;
-pub use taken_port::{Eviction, first_taking};
 pub use unreachable::Unreachable;
 
 use std::collections::BTreeMap;

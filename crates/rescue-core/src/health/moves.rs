@@ -17,7 +17,7 @@ pub enum Reap {
     Report,
     /// Nodes of this computer whose end the kernel proves.
     Local,
-    /// Also nodes that fail a health check, or whose port another node registers.
+    /// Also nodes that fail a health check.
     All,
 }
 
@@ -108,6 +108,28 @@ impl Moving {
     }
 }
 
+/// Nodes that are gone, and the call that unregisters them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Eviction {
+    pub nodes: Vec<String>,
+    pub call: Request,
+}
+
+impl Eviction {
+    /// The eviction of these nodes. `None` if none of them has registrations.
+    pub fn of(mirror: &Master, nodes: impl IntoIterator<Item = String>) -> Option<Self> {
+        let nodes: Vec<_> = nodes.into_iter().collect();
+        let calls: Vec<_> = nodes
+            .iter()
+            .flat_map(|node| mirror.forget_calls(node))
+            .collect();
+        (!calls.is_empty()).then(|| Self {
+            nodes,
+            call: Request::multicall(calls),
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -163,5 +185,45 @@ mod tests {
         for evidence in [Evidence::Listens, Evidence::Unknown, Evidence::Replaced] {
             assert!(first(&other, evidence));
         }
+    }
+
+    fn offer(node: &str, service: &str, port: u16) -> Request {
+        let (service_api, api) = (
+            format!("rosrpc://h:{port}"),
+            format!("http://h:{}/", port - 1),
+        );
+        Request::new(Method::RegisterService, [node, service, &service_api, &api])
+    }
+
+    fn master(calls: impl IntoIterator<Item = Request>) -> Master {
+        let mut master = Master::default();
+        for call in calls {
+            assert!(crate::master::is_success(&master.apply(&call).reply));
+        }
+        master
+    }
+
+    /// A node whose service was taken over leaves a reference that a master never removes.
+    #[test]
+    fn the_reference_left_by_a_taken_over_service_is_removed_and_the_provider_keeps_the_service() {
+        let mut mirror = master([
+            offer("/old", "/s", 11),
+            offer("/old", "/lost", 11),
+            offer("/heir", "/s", 21),
+            offer("/heir", "/lost", 21),
+            Request::new(
+                Method::UnregisterService,
+                ["/heir", "/lost", "rosrpc://h:21"],
+            ),
+            publish("/old", "http://h:10/"),
+        ]);
+        let before = master([offer("/heir", "/s", 21)]).snapshot().services;
+        let eviction = Eviction::of(&mirror, ["/old".to_owned()]).unwrap();
+        let applied = mirror.apply(&eviction.call);
+        assert_eq!(mirror.api_of("/old"), None);
+        assert_eq!(mirror.snapshot().services, before);
+        // No node is told to shut down.
+        let told = |notice| matches!(notice, crate::master::Notice::Shutdown { .. });
+        assert!(!applied.notices.into_iter().any(told));
     }
 }

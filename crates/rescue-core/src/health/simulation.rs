@@ -273,19 +273,13 @@ impl World {
         let from = Self::from(&self.programs[index]);
         let params = [name.as_str(), "/t", "x/Y", api.as_str()];
         let call = Request::new(Method::RegisterPublisher, params);
-        let taking = match self.reap {
-            Reap::All => Eviction::before(&self.mirror, &call, from),
-            _ => None,
-        };
-        let taken = taking.map_or(Vec::new(), |taking| taking.nodes);
-        self.assert_port_is_lost(&taken, index);
-        let mut gone: BTreeSet<_> = taken.into_iter().collect();
+        let mut gone = BTreeSet::new();
         for moving in Moving::by(&self.mirror, &call) {
             let evidence = self.evidence(&moving.node, &moving.from);
             if moving.is_unregistered_first(self.reap, evidence) {
                 self.counts.prevented += u64::from(moving.hits_another(evidence));
                 gone.insert(moving.node);
-            } else if !gone.contains(&moving.node) {
+            } else {
                 self.shut_down(&moving);
             }
         }
@@ -305,28 +299,6 @@ impl World {
         }
         // rosrescue looks at once, before the kernel gives a port to another program.
         self.look(false);
-    }
-
-    /// Checks that the nodes `taken` listen no more at the port that the program `index` registers.
-    fn assert_port_is_lost(&mut self, taken: &[String], index: usize) {
-        for name in taken {
-            let holder = self.holder[name];
-            let program = &self.programs[holder];
-            // Documented: a program with several names loses the earlier ones. Nor can an address that is forwarded to a
-            // container, or two containers behind one address, tell their programs apart.
-            let places = [program.place, self.programs[index].place];
-            let excused = holder == index
-                || places.contains(&Place::Forwarded)
-                || places == [Place::OtherNetwork; 2];
-            let lives = program.runs && !program.closed;
-            assert!(
-                !lives || excused,
-                "a living node is unregistered: {name} {program:?}"
-            );
-            self.counts.unproved += u64::from(lives && holder != index);
-            self.counts.evicted += 1;
-            self.programs[holder].names.remove(name);
-        }
     }
 
     /// The master tells what listens at the old address to shut down.
