@@ -24,7 +24,6 @@ mod verify;
 mod wait;
 
 use std::{
-    fmt::Display,
     io::{self, Write},
     pin::Pin,
     process::ExitCode,
@@ -35,7 +34,7 @@ use thiserror::Error;
 
 use crate::{
     cli::{OutputArgs, Tool},
-    log::{plain, plain_json},
+    printable::{Lines, Printable},
     status::summary::counted,
 };
 
@@ -116,26 +115,35 @@ pub fn run(tool: &Tool) -> ExitCode {
     match ended {
         Ok(exit) => ExitCode::from(exit as u8),
         Err(failure) => {
-            eprintln!("rosrescue: {}", plain(&failure.to_string()));
+            note(&failure.to_string());
             ExitCode::from(failure.status())
         }
     }
 }
 
 /// Prints `result` as text or JSON. A reader that has closed the pipe, such as `head`, is not an error.
-fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), CommandFailure> {
-    let text = if output.json {
-        let json = serde_json::to_string_pretty(result);
-        plain_json(&json.map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?)
-    } else {
-        plain(&result.to_string())
+fn print(result: &(impl Lines + Serialize), output: &OutputArgs) -> Result<(), CommandFailure> {
+    let text = match output.json {
+        true => json(result, true)?,
+        false => Printable::lines(result),
     };
-    print_line(text.trim_end()).map(drop)
+    print_line(&text).map(drop)
 }
 
-/// Prints `text`. Returns false if the reader has closed the pipe.
-fn print_line(text: &str) -> Result<bool, CommandFailure> {
-    match writeln!(io::stdout(), "{text}") {
+/// `value` as JSON, on several lines if `pretty`.
+fn json(value: &impl Serialize, pretty: bool) -> Result<Printable, CommandFailure> {
+    let text = Printable::json(value, pretty);
+    text.map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))
+}
+
+/// Prints a sentence to standard error.
+fn note(sentence: &str) {
+    eprintln!("rosrescue: {}", Printable::line(sentence));
+}
+
+/// Prints `text` without empty lines at its end. Returns false if the reader has closed the pipe.
+fn print_line(text: &Printable) -> Result<bool, CommandFailure> {
+    match writeln!(io::stdout(), "{}", text.as_str().trim_end()) {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(CommandFailure::Failed(format!("cannot print: {error}"))),

@@ -58,6 +58,7 @@ pub(crate) mod ledger;
 pub(crate) mod limit;
 pub mod log;
 pub(crate) mod nodes;
+pub(crate) mod printable;
 pub(crate) mod process;
 pub mod program;
 pub(crate) mod recovery;

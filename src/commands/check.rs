@@ -22,6 +22,7 @@ use self::facts::SetupFacts;
 use super::{CommandFailure, Exit, counted, print, running::Running};
 use crate::{
     cli::{CheckArgs, OptionValue, TargetArgs},
+    printable::{Lines, Page, display_lines, line},
     ros_env::MasterUri,
 };
 
@@ -136,8 +137,8 @@ impl<'a> Report<'a> {
     }
 }
 
-impl fmt::Display for Report<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Report<'_> {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         for finding in &self.findings {
             let severity = match finding.severity {
                 Severity::Ok => "ok",
@@ -145,18 +146,20 @@ impl fmt::Display for Report<'_> {
                 Severity::Warning => "WARNING",
                 Severity::Problem => "PROBLEM",
             };
-            writeln!(f, "{severity:<9}{:<16}{}", finding.subject, finding.what)?;
+            line!(f, "{severity:<9}{:<16}{}", finding.subject, finding.what)?;
             if !finding.todo.is_empty() {
-                writeln!(f, "{:<25}> {}", "", finding.todo)?;
+                line!(f, "{:<25}> {}", "", finding.todo)?;
             }
         }
         match (self.problems, self.warnings) {
-            (0, 0) => writeln!(f, "No problems found."),
+            (0, 0) => line!(f, "No problems found."),
             (problems, warnings) => {
                 let (problems, warnings) =
                     (counted(problems, "problem"), counted(warnings, "warning"));
-                writeln!(f, "{problems}, {warnings}")
+                line!(f, "{problems}, {warnings}")
             }
         }
     }
 }
+
+display_lines!(Report<'_>);

@@ -3,11 +3,16 @@
 use clap::CommandFactory;
 
 use super::{CommandFailure, Exit, print_line};
-use crate::cli::{Cli, CompletionsArgs};
+use crate::{
+    cli::{Cli, CompletionsArgs},
+    printable::Printable,
+};
 
 pub(super) async fn run(args: &CompletionsArgs) -> Result<Exit, CommandFailure> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut Cli::command(), "rosrescue", &mut script);
-    print_line(String::from_utf8_lossy(&script).trim_end())?;
+    print_line(&Printable::own(
+        String::from_utf8_lossy(&script).into_owned(),
+    ))?;
     Ok(Exit::Good)
 }

@@ -8,6 +8,7 @@ use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
 use crate::{
     checkpoint::compare::{Described, compare},
     cli::DiffArgs,
+    printable::{Lines, Page, display_lines, line},
 };
 
 pub(super) async fn run(args: &DiffArgs) -> Result<Exit, CommandFailure> {
@@ -56,15 +57,18 @@ struct Diff {
     differences: Vec<Described>,
 }
 
-impl fmt::Display for Diff {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Diff {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         if self.differences.is_empty() {
-            return writeln!(f, "{} and {} do not differ", self.a, self.b);
+            return line!(f, "{} and {} do not differ", self.a, self.b);
         }
         let [a, b] = self.names;
-        writeln!(f, "{a} is {}\n{b} is {}", self.a, self.b)?;
+        line!(f, "{a} is {}", self.a)?;
+        line!(f, "{b} is {}", self.b)?;
         self.differences
             .iter()
-            .try_for_each(|line| writeln!(f, "{}", line.text))
+            .try_for_each(|line| line!(f, "{}", line.text))
     }
 }
+
+display_lines!(Diff);

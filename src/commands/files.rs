@@ -8,7 +8,7 @@ use std::{
 };
 
 use super::{
-    CommandFailure,
+    CommandFailure, note,
     running::{Running, is_here},
 };
 use crate::{
@@ -209,7 +209,7 @@ pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, Command
         ))),
         Err(NoPast::Later(unread)) => {
             for sentence in unread {
-                eprintln!("rosrescue: {sentence}");
+                note(&sentence);
             }
             let time = clock::wall_text_millis(time.min(clock::wall_millis()));
             Err(CommandFailure::Usage(format!(
@@ -223,11 +223,11 @@ pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, Command
 fn opened_at(past: PastState, args: &ReadArgs) -> Result<Opened, CommandFailure> {
     let PastState { path, moment, .. } = past;
     if past.is_set_back {
-        eprintln!(
-            "rosrescue: the clock was set back: changes after record {} have this time or an earlier one, and are not \
-             shown. `rosrescue log` lists them in their order",
+        note(&format!(
+            "the clock was set back: changes after record {} have this time or an earlier one, and are not shown. \
+             `rosrescue log` lists them in their order",
             moment.seq
-        );
+        ));
     }
     let rebuilt = moment.rebuilt;
     let mut damage = past.unread;
@@ -244,7 +244,7 @@ fn opened_at(past: PastState, args: &ReadArgs) -> Result<Opened, CommandFailure>
         )));
     }
     for sentence in &damage {
-        eprintln!("rosrescue: {sentence}");
+        note(sentence);
     }
     Ok(Opened {
         path,
@@ -292,7 +292,7 @@ pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Command
         )));
     }
     for sentence in &opened.damage {
-        eprintln!("rosrescue: {sentence}");
+        note(sentence);
     }
     Ok(opened)
 }

@@ -12,6 +12,7 @@ use super::{
 use crate::{
     cli::HandoverArgs,
     cluster::machine::Role,
+    printable::{Lines, Page, display_lines},
     status::computers::{Computers, LeaderStatus},
     xmlrpc::{Reply, Value},
 };
@@ -62,8 +63,8 @@ impl Outcome {
     }
 }
 
-impl fmt::Display for Outcome {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Outcome {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let Self { from, seconds, .. } = self;
         match (&self.to, &self.wanted) {
             (Some(to), _) if self.handed_over && to == from => write!(f, "{to} leads already"),
@@ -86,6 +87,8 @@ impl fmt::Display for Outcome {
         }
     }
 }
+
+display_lines!(Outcome);
 
 pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;

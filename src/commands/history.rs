@@ -12,6 +12,7 @@ use super::{
 use crate::{
     cli::HistoryArgs,
     clock,
+    printable::{Lines, Page, display_lines, line},
     recovery::report_file::{self, ReportRecord},
 };
 
@@ -106,10 +107,10 @@ struct Row {
     path: String,
 }
 
-impl fmt::Display for History {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for History {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         if self.kept.is_empty() {
-            return writeln!(f, "no checkpoint at {} or beside it", self.checkpoint);
+            return line!(f, "no checkpoint at {} or beside it", self.checkpoint);
         }
         for row in &self.kept {
             let (name, written, what) = (&row.name, &row.written, row.what);
@@ -132,12 +133,14 @@ impl fmt::Display for History {
                     .map_or_else(String::new, |how| format!(" ({how})"));
                 write!(f, " after {total_ms:.0} ms: {cause}{ended}")?;
             }
-            writeln!(f)?;
-            writeln!(f, "     {}", row.path)?;
+            line!(f)?;
+            line!(f, "     {}", row.path)?;
             if let Some(problem) = &row.problem {
-                writeln!(f, "     {problem}")?;
+                line!(f, "     {problem}")?;
             }
         }
         Ok(())
     }
 }
+
+display_lines!(History);

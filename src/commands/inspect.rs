@@ -15,6 +15,7 @@ use crate::{
     clock,
     hide::Hide,
     master::{Counts, Master},
+    printable::{Lines, Page, display_lines, line},
     xmlrpc::{Struct, Value},
 };
 
@@ -161,28 +162,29 @@ fn topics(state: &Master) -> Vec<Topic> {
     topics.collect()
 }
 
-impl fmt::Display for Inspected {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Inspected {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let Self {
             session, journal, ..
         } = self;
-        writeln!(f, "checkpoint  {} ({})", self.file, size(self.bytes))?;
+        line!(f, "checkpoint  {} ({})", self.file, size(self.bytes))?;
         for sentence in self.damage.iter().chain(&self.torn) {
-            writeln!(f, "            {sentence}")?;
+            line!(f, "            {sentence}")?;
         }
         let end = match session.closed {
             true => "stopped cleanly",
             false => "running, or not stopped cleanly",
         };
-        writeln!(
+        line!(
             f,
             "session     {} of {}, {end}",
-            session.id, session.started
+            session.id,
+            session.started
         )?;
-        writeln!(f, "written     {}", self.written)?;
+        line!(f, "written     {}", self.written)?;
         let master = session.master_uri.as_deref().unwrap_or("none yet");
-        writeln!(f, "master      {master}")?;
-        writeln!(f, "state       {}", self.counts)?;
+        line!(f, "master      {master}")?;
+        line!(f, "state       {}", self.counts)?;
         let calls: Vec<_> = journal
             .calls
             .iter()
@@ -194,22 +196,23 @@ impl fmt::Display for Inspected {
             calls.join(", ")
         };
         match journal.snapshot {
-            Some(seq) => writeln!(
+            Some(seq) => line!(
                 f,
                 "journal     {calls} since the snapshot, which ends with record {seq}"
             )?,
-            None => writeln!(f, "journal     {calls}; there is no complete snapshot")?,
+            None => line!(f, "journal     {calls}; there is no complete snapshot")?,
         }
         if !self.pending.is_empty() {
-            writeln!(
+            line!(
                 f,
                 "pending     {} that no master has run yet",
                 counted(self.pending.len(), "write")
             )?;
         }
-        writeln!(f, "\nnodes")?;
+        line!(f)?;
+        line!(f, "nodes")?;
         for node in &self.nodes {
-            writeln!(f, "  {} at {}", node.name, node.address)?;
+            line!(f, "  {} at {}", node.name, node.address)?;
             for (verb, names) in [
                 ("publishes", &node.publishes),
                 ("subscribes", &node.subscribes),
@@ -217,32 +220,36 @@ impl fmt::Display for Inspected {
                 ("watches", &node.watches),
             ] {
                 if !names.is_empty() {
-                    writeln!(f, "    {verb:<11}{}", names.join(", "))?;
+                    line!(f, "    {verb:<11}{}", names.join(", "))?;
                 }
             }
         }
-        writeln!(f, "\ntopics")?;
+        line!(f)?;
+        line!(f, "topics")?;
         for topic in &self.topics {
             let kind = topic.kind.as_deref().unwrap_or("of unknown type");
             let (publishers, subscribers) = (topic.publishers, topic.subscribers);
-            writeln!(
+            line!(
                 f,
                 "  {}  {kind}  {publishers} publishing, {subscribers} subscribing",
                 topic.name
             )?;
         }
-        writeln!(f, "\nparameters")?;
+        line!(f)?;
+        line!(f, "parameters")?;
         write_params(f, "", &self.parameters)
     }
 }
 
-fn write_params(f: &mut fmt::Formatter<'_>, path: &str, members: &Struct) -> fmt::Result {
+display_lines!(Inspected);
+
+fn write_params(f: &mut Page, path: &str, members: &Struct) -> fmt::Result {
     for (key, value) in members {
         match value {
             Value::Struct(inner) if !inner.is_empty() => {
                 write_params(f, &format!("{path}/{key}"), inner)?;
             }
-            value => writeln!(f, "  {path}/{key}: {}", shown(value))?,
+            value => line!(f, "  {path}/{key}: {}", shown(value))?,
         }
     }
     Ok(())

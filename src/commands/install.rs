@@ -28,6 +28,7 @@ use super::{
 use crate::{
     cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
     config::Config,
+    printable::{Lines, Page, display_lines, line},
     process, resolver,
     ros_env::MasterUri,
     server::listener,
@@ -455,32 +456,34 @@ impl Change {
     }
 }
 
-impl fmt::Display for Plan {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Plan {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         if self.changes.is_empty() {
-            writeln!(f, "nothing to change")?;
+            line!(f, "nothing to change")?;
         }
         for change in &self.changes {
             match change {
                 Change::Write { path, text } => {
-                    writeln!(f, "write   {}", path.display())?;
+                    line!(f, "write   {}", path.display())?;
                     for line in text.lines() {
-                        writeln!(f, "        {line}")?;
+                        line!(f, "        {line}")?;
                     }
                 }
-                Change::Remove { path } => writeln!(f, "remove  {}", path.display())?,
-                Change::Run { command } => writeln!(f, "run     {}", command.join(" "))?,
+                Change::Remove { path } => line!(f, "remove  {}", path.display())?,
+                Change::Run { command } => line!(f, "run     {}", command.join(" "))?,
             }
         }
         for note in &self.notes {
-            writeln!(f, "note    {note}")?;
+            line!(f, "note    {note}")?;
         }
         for obstacle in &self.obstacles {
-            writeln!(f, "cannot  {obstacle}")?;
+            line!(f, "cannot  {obstacle}")?;
         }
         Ok(())
     }
 }
+
+display_lines!(Plan);
 
 fn run_command(words: &[String], errors: Stdio) -> io::Result<system::ExitStatus> {
     let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;

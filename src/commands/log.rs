@@ -6,7 +6,7 @@ use std::{
 
 use serde::Serialize;
 
-use super::{CommandFailure, Exit, files, print_line};
+use super::{CommandFailure, Exit, files, note, print_line};
 use crate::{
     checkpoint::{
         compare::{Difference, What},
@@ -17,7 +17,7 @@ use crate::{
     },
     cli::LogArgs,
     clock,
-    log::{plain, plain_json},
+    printable::Printable,
     recovery::report_file,
     status::report::Report,
 };
@@ -307,13 +307,13 @@ fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
         Ok(text) => text,
         Err(error) => {
             if error.kind() != io::ErrorKind::NotFound {
-                eprintln!("rosrescue: cannot read `{path}`: {error}");
+                note(&format!("cannot read `{path}`: {error}"));
             }
             return Thin::default();
         }
     };
     wanted.thin(&text).unwrap_or_else(|why| {
-        eprintln!("rosrescue: left out `{path}`: {why}");
+        note(&format!("left out `{path}`: {why}"));
         Thin::default()
     })
 }
@@ -371,16 +371,14 @@ fn show(entry: &Entry, json: bool) -> Result<bool, CommandFailure> {
     };
     let text = text_of(entry);
     if json {
-        let line = serde_json::to_string(&Line { time, text, entry });
-        let line = line.map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?;
-        return print_line(&plain_json(&line));
+        return print_line(&super::json(&Line { time, text, entry }, false)?);
     }
     let who = match (&entry.caller, &entry.from) {
         (Some(caller), Some(from)) => format!("{caller} ({from})  "),
         (Some(caller), None) => format!("{caller}  "),
         _ => String::new(),
     };
-    print_line(&plain(&format!("{time}  {who}{text}")))
+    print_line(&Printable::line(&format!("{time}  {who}{text}")))
 }
 
 fn text_of(entry: &Entry) -> String {

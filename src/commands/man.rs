@@ -5,7 +5,10 @@ use std::fs;
 use clap::CommandFactory;
 
 use super::{CommandFailure, Exit, print_line};
-use crate::cli::{Cli, ManArgs};
+use crate::{
+    cli::{Cli, ManArgs},
+    printable::Printable,
+};
 
 pub(super) async fn run(args: &ManArgs) -> Result<Exit, CommandFailure> {
     let mut command = Cli::command();
@@ -27,7 +30,7 @@ pub(super) async fn run(args: &ManArgs) -> Result<Exit, CommandFailure> {
             let mut page = Vec::new();
             let written = clap_mangen::Man::new(shown).render(&mut page);
             written.map_err(|error| CommandFailure::Failed(format!("no page: {error}")))?;
-            print_line(String::from_utf8_lossy(&page).trim_end())?;
+            print_line(&Printable::own(String::from_utf8_lossy(&page).into_owned()))?;
         }
         Some(folder) => {
             let written =

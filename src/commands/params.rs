@@ -7,11 +7,12 @@ use std::{
 
 use serde::Serialize;
 
-use super::{CommandFailure, Exit, files, print};
+use super::{CommandFailure, Exit, files, note, print};
 use crate::{
     checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
     cli::ParamsArgs,
     hide::Hide,
+    printable::{Lines, Page, display_lines},
     xmlrpc::{Struct, Value},
 };
 
@@ -41,7 +42,7 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {
         }
     }
     for sentence in left_out {
-        eprintln!("rosrescue: {sentence}");
+        note(&sentence);
     }
     Ok(Exit::Good)
 }
@@ -71,8 +72,10 @@ fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -
 #[serde(transparent)]
 struct Tree(Struct);
 
-impl fmt::Display for Tree {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Tree {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         write!(f, "{} parameters", self.0.len())
     }
 }
+
+display_lines!(Tree);

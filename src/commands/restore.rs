@@ -18,6 +18,7 @@ use crate::{
     cli::RestoreArgs,
     hide::Hide,
     master::{CALLER_ID, Master, Method, Request},
+    printable::{Lines, Page, display_lines, line},
     xmlrpc::Value,
 };
 
@@ -187,43 +188,48 @@ struct Left {
 }
 
 /// Shows the plan.
-impl fmt::Display for Restored {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Restored {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let plan = &self.plan;
-        writeln!(f, "from  {}\nto    {}", self.file, self.master)?;
+        line!(f, "from  {}", self.file)?;
+        line!(f, "to    {}", self.master)?;
         for Set { name, from, to } in &plan.set {
             match from {
-                Some(from) => writeln!(f, "set {name}: {from} -> {to}")?,
-                None => writeln!(f, "set {name}: {to}")?,
+                Some(from) => line!(f, "set {name}: {from} -> {to}")?,
+                None => line!(f, "set {name}: {to}")?,
             }
         }
         plan.delete
             .iter()
-            .try_for_each(|name| writeln!(f, "delete {name}"))?;
+            .try_for_each(|name| line!(f, "delete {name}"))?;
         for Left { what, why } in &plan.left_out {
-            writeln!(f, "left out: {what}: {why}")?;
+            line!(f, "left out: {what}: {why}")?;
         }
         let (set, delete) = (plan.set.len(), plan.delete.len());
         match set + delete {
-            0 => writeln!(f, "nothing to do"),
-            _ => writeln!(f, "{set} parameters to set, {delete} to delete"),
+            0 => line!(f, "nothing to do"),
+            _ => line!(f, "{set} parameters to set, {delete} to delete"),
         }
     }
 }
+
+display_lines!(Restored);
 
 #[derive(Serialize)]
 #[serde(transparent)]
 struct Outcome<'a>(&'a Restored);
 
-impl fmt::Display for Outcome<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Outcome<'_> {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let failed = &self.0.failed;
         failed
             .iter()
-            .try_for_each(|sentence| writeln!(f, "failed: {sentence}"))?;
+            .try_for_each(|sentence| line!(f, "failed: {sentence}"))?;
         match failed.len() {
-            0 => writeln!(f, "done and read back"),
-            count => writeln!(f, "done, except for {count}"),
+            0 => line!(f, "done and read back"),
+            count => line!(f, "done, except for {count}"),
         }
     }
 }
+
+display_lines!(Outcome<'_>);

@@ -11,6 +11,8 @@ use rustix::termios::{
 };
 use tokio::sync::mpsc;
 
+use crate::printable::Printable;
+
 /// Switches to the alternate screen and hides the cursor.
 const ENTER: &str = "\x1b[?1049h\x1b[?25l";
 const LEAVE: &str = "\x1b[?25h\x1b[?1049l";
@@ -50,9 +52,23 @@ impl Terminal {
     }
 
     /// Shows `text`, cut to the terminal's size.
-    pub(super) fn draw(&self, text: &str) {
+    pub(super) fn draw(&self, text: &Printable) {
+        self.put_lines(text.as_str().lines());
+    }
+
+    /// Shows `sentence` and under it `text`.
+    pub(super) fn draw_under(&self, sentence: &str, text: &Printable) {
+        let sentence = Printable::line(sentence);
+        self.put_lines(
+            [sentence.as_str(), ""]
+                .into_iter()
+                .chain(text.as_str().lines()),
+        );
+    }
+
+    fn put_lines<'a>(&self, lines: impl Iterator<Item = &'a str>) {
         let (columns, rows) = size();
-        let lines = text.lines().take(rows);
+        let lines = lines.take(rows);
         let lines: Vec<String> = lines
             .map(|line| line.chars().take(columns).collect())
             .collect();

@@ -2,7 +2,7 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    fmt::{self, Write},
+    fmt,
     time::Duration,
 };
 
@@ -13,7 +13,7 @@ use tokio::{
 };
 
 use super::{
-    CommandFailure, Exit, plain, plain_json, print_line,
+    CommandFailure, Exit, note, print_line,
     running::Running,
     terminal::{self, Terminal},
 };
@@ -21,6 +21,7 @@ use crate::{
     cli::TopArgs,
     clock,
     master::Counts,
+    printable::{Lines, Page, Printable, display_lines, line},
     status::{
         computers::Computers,
         condition::Condition,
@@ -153,35 +154,38 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
     }
 }
 
-impl fmt::Display for Top {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut head = String::new();
+impl Lines for Top {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
+        let mut head = Page::default();
         let Condition {
             since,
             text,
             action,
             ..
         } = &self.condition;
-        writeln!(
+        line!(
             head,
             "rosrescue top   {}   {}",
             clock::wall_text(self.at),
             self.uri
         )?;
-        writeln!(
+        line!(
             head,
             "{}, for {}",
             self.condition.title(),
             clock::span(self.at - since)
         )?;
-        writeln!(head, "{text}")?;
+        line!(head, "{text}")?;
         if let Some(action) = action {
-            writeln!(head, "To do: {action}")?;
+            line!(head, "To do: {action}")?;
         }
-        writeln!(
+        line!(
             head,
             "{:.1} calls per second, {} in all; {} answered by rosrescue, {} timed out",
-            self.calls_per_second, self.calls, self.calls_without_master, self.calls_unanswered
+            self.calls_per_second,
+            self.calls,
+            self.calls_without_master,
+            self.calls_unanswered
         )?;
         let Counts {
             nodes,
@@ -191,7 +195,7 @@ impl fmt::Display for Top {
             params,
             ..
         } = self.state;
-        writeln!(
+        line!(
             head,
             "nodes {nodes}, publishers {publishers}, subscribers {subscribers}, services {services}, \
              parameters {params}"
@@ -202,26 +206,33 @@ impl fmt::Display for Top {
             ("not checked:", &self.nodes.unchecked_nodes),
         ] {
             if !names.is_empty() {
-                writeln!(head, "{what} {}", self.nodes.since(names))?;
+                line!(head, "{what} {}", self.nodes.since(names))?;
             }
         }
         if let Some(cluster) = &self.cluster {
-            writeln!(head, "computers: {}", cluster.line())?;
+            line!(head, "computers: {}", cluster.line())?;
         }
-        let mut foot = format!("\nrescues so far: {}\n", self.rescues);
+        let mut foot = Page::default();
+        line!(foot)?;
+        line!(foot, "rescues so far: {}", self.rescues)?;
         if self.late_answers.times > 0 {
-            foot += &format!("late: {}\n", self.late_answers);
+            line!(foot, "late: {}", self.late_answers)?;
         }
         for report in self.last_rescues.iter().rev().take(RESCUES) {
-            writeln!(foot, "{}", report.line())?;
+            line!(foot, "{}", report.line())?;
         }
         // One empty line and the table's heading.
-        let taken = head.lines().count() + foot.lines().count() + 2;
-        write!(f, "{head}\n{:<32}", "CALLER")?;
-        writeln!(
+        let taken = head.count() + foot.count() + 2;
+        f.append(&head);
+        line!(f)?;
+        write!(f, "{:<32}", "CALLER")?;
+        line!(
             f,
             "{:>9}{:>9}{:>9}{:>11}",
-            "CALLS/S", "CALLS", "MEAN ms", "LONGEST ms"
+            "CALLS/S",
+            "CALLS",
+            "MEAN ms",
+            "LONGEST ms"
         )?;
         for row in self.callers.iter().take(self.height.saturating_sub(taken)) {
             let ms = |ms: Option<f64>| ms.map_or_else(String::new, |ms| format!("{ms:.1}"));
@@ -234,11 +245,14 @@ impl fmt::Display for Top {
             write!(f, "{:>9}{:>11}", ms(row.mean_ms), ms(row.longest_ms))?;
             let at = row.longest_at.map(clock::wall_text).unwrap_or_default();
             // The time of day.
-            writeln!(f, " {}", at.get(11..19).unwrap_or(""))?;
+            line!(f, " {}", at.get(11..19).unwrap_or(""))?;
         }
-        f.write_str(&foot)
+        f.append(&foot);
+        Ok(())
     }
 }
+
+display_lines!(Top);
 
 /// The signals that end the command.
 struct Ends(Vec<Signal>);
@@ -287,7 +301,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
     seconds.tick().await;
     let mut before: Option<Sample> = None;
-    let mut shown = String::new();
+    let mut shown = Printable::default();
     let mut rounds = 0;
     loop {
         let now = Instant::now();
@@ -301,10 +315,8 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
                 let top = top(status, before.as_ref(), now, height);
                 before = Some(sample);
                 shown = match args.json {
-                    true => serde_json::to_string(&top)
-                        .map(|json| plain_json(&json))
-                        .map_err(|error| CommandFailure::Failed(format!("no JSON: {error}")))?,
-                    false => plain(&top.to_string()),
+                    true => super::json(&top, false)?,
+                    false => Printable::lines(&top),
                 };
                 None
             }
@@ -313,10 +325,10 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
         };
         match (&terminal, &failed) {
             (Some(terminal), None) => terminal.draw(&shown),
-            (Some(terminal), Some(failure)) => terminal.draw(&format!("{failure}\n\n{shown}")),
+            (Some(terminal), Some(failure)) => terminal.draw_under(&failure.to_string(), &shown),
             (None, None) if !print_line(&shown)? => return Ok(Exit::Good),
             (None, None) => {}
-            (None, Some(failure)) => eprintln!("rosrescue: {failure}"),
+            (None, Some(failure)) => note(&failure.to_string()),
         }
         rounds += 1;
         if args.count.is_some_and(|count| rounds >= count) {

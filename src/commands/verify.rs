@@ -5,7 +5,11 @@ use std::fmt;
 use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, print};
-use crate::{cli::VerifyArgs, master::Counts};
+use crate::{
+    cli::VerifyArgs,
+    master::Counts,
+    printable::{Lines, Page, display_lines, line},
+};
 
 pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, CommandFailure> {
     let opened = files::open(&files::find(&args.file, &args.place).await?)?;
@@ -45,31 +49,31 @@ struct Verified {
     damage: Vec<String>,
 }
 
-impl fmt::Display for Verified {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Verified {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let verdict = match (self.whole, self.exact) {
             (true, _) => "is whole",
             (false, true) => "is damaged, but nothing is lost",
             (false, false) => "is damaged",
         };
-        writeln!(f, "{} {verdict}", self.file)?;
+        line!(f, "{} {verdict}", self.file)?;
         for sentence in &self.damage {
-            writeln!(f, "damage   {sentence}")?;
+            line!(f, "damage   {sentence}")?;
         }
         let source = match (self.snapshot, self.records) {
             (Some(_), records) => format!("the snapshot and {records} records"),
             (None, 0) => "nothing".to_owned(),
             (None, records) => format!("{records} records without a snapshot"),
         };
-        writeln!(f, "usable   {source}: {}", self.usable)?;
+        line!(f, "usable   {source}: {}", self.usable)?;
         if let Some(torn) = &self.torn {
-            writeln!(
+            line!(
                 f,
                 "torn     {torn}: normal after a crash or during a write. It contains nothing that was confirmed"
             )?;
         }
         if !self.whole && (self.snapshot, self.records) != (None, 0) {
-            writeln!(
+            line!(
                 f,
                 "to do    use --damaged with inspect, diff, params or restore to use the readable part"
             )?;
@@ -77,3 +81,5 @@ impl fmt::Display for Verified {
         Ok(())
     }
 }
+
+display_lines!(Verified);

@@ -12,6 +12,7 @@ use super::{
 use crate::{
     cli::{For, WaitArgs},
     master::Method,
+    printable::{Lines, Page, display_lines},
     status::{condition::ConditionName, summary::Status},
     xmlrpc::{Reply, Value},
 };
@@ -32,8 +33,8 @@ struct Waited {
     seconds: f64,
 }
 
-impl fmt::Display for Waited {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Waited {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let Self { uri, seconds, .. } = self;
         match self.met {
             true => write!(f, "ready after {seconds:.1} s: {uri}"),
@@ -45,6 +46,8 @@ impl fmt::Display for Waited {
         }
     }
 }
+
+display_lines!(Waited);
 
 pub(super) async fn run(args: &WaitArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;

@@ -44,6 +44,7 @@ use crate::{
     ledger::Ledger,
     master::Master,
     nodes::Nodes,
+    printable::plain_json,
     process::usage,
     status::{
         Board,
@@ -201,7 +202,8 @@ fn script(text: &'static str) -> HttpReply {
 
 fn json(text: serde_json::Result<String>) -> HttpReply {
     match text {
-        Ok(json) => reply(StatusCode::OK, JSON, json + "\n"),
+        // People read pages with curl on a terminal, too.
+        Ok(json) => reply(StatusCode::OK, JSON, plain_json(json) + "\n"),
         Err(error) => super::replies::text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")),
     }
 }

@@ -5,7 +5,12 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
-use crate::{clock, cluster::machine::Role, ros_env::MasterUri};
+use crate::{
+    clock,
+    cluster::machine::Role,
+    printable::{Page, line},
+    ros_env::MasterUri,
+};
 
 /// The facts about all computers of the robot. Times of day are seconds since 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -192,10 +197,10 @@ impl Computers {
     }
 
     /// Writes the lines of `rosrescue status`. `now` is in seconds since 1970.
-    pub(crate) fn lines(&self, now: f64, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    pub(crate) fn lines(&self, now: f64, f: &mut Page) -> fmt::Result {
         let ago = |at: f64| format!("{} ({} ago)", clock::wall_text(at), clock::span(now - at));
         match (&self.leader, self.leaderless_since) {
-            (Some(leader), None) => writeln!(
+            (Some(leader), None) => line!(
                 f,
                 "leader      {} at {}, since {}, term {}",
                 leader.name,
@@ -203,32 +208,32 @@ impl Computers {
                 ago(leader.since),
                 leader.term
             )?,
-            (Some(leader), Some(since)) => writeln!(
+            (Some(leader), Some(since)) => line!(
                 f,
                 "leader      NONE since {}; the last was {}, term {}",
                 ago(since),
                 leader.name,
                 leader.term
             )?,
-            (None, _) => writeln!(f, "leader      NONE known yet")?,
+            (None, _) => line!(f, "leader      NONE known yet")?,
         }
         for (number, computer) in self.computers.iter().enumerate() {
             let head = if number == 0 { "computers" } else { "" };
             write!(f, "{head:<12}{}", computer.name)?;
             match (computer.name == self.name, computer.heard) {
-                (true, _) => writeln!(f, " (this one) {}", computer.doing(self.leads()))?,
-                (false, None) => writeln!(f, " is AWAY, no contact since the start")?,
+                (true, _) => line!(f, " (this one) {}", computer.doing(self.leads()))?,
+                (false, None) => line!(f, " is AWAY, no contact since the start")?,
                 (false, Some(heard)) if computer.away => {
-                    writeln!(f, " is AWAY, last contact {}", ago(heard))?;
+                    line!(f, " is AWAY, last contact {}", ago(heard))?;
                 }
-                (false, Some(_)) => writeln!(f, " {}", computer.doing(self.leads()))?,
+                (false, Some(_)) => line!(f, " {}", computer.doing(self.leads()))?,
             }
         }
         if let Some(Trouble { since, why }) = &self.etcd_trouble {
-            writeln!(f, "etcd        NO ANSWER since {}: {why}", ago(*since))?;
+            line!(f, "etcd        NO ANSWER since {}: {why}", ago(*since))?;
         }
         if self.uncommitted > 0 {
-            writeln!(f, "not in etcd {} changes made here", self.uncommitted)?;
+            line!(f, "not in etcd {} changes made here", self.uncommitted)?;
         }
         if let Some(Taken {
             at,
@@ -239,7 +244,7 @@ impl Computers {
         {
             let from = from.as_ref().map(|from| format!(" from {from}"));
             let order = if *in_order { " (handover)" } else { "" };
-            writeln!(
+            line!(
                 f,
                 "takeover    {}{}{order}, took {}; {} by this computer so far",
                 ago(*at),
@@ -252,7 +257,7 @@ impl Computers {
             )?;
         }
         if self.lost_writes > 0 {
-            writeln!(
+            line!(
                 f,
                 "lost        {} of the changes made while cut off: others had changed the same data. The log lists them",
                 self.lost_writes
@@ -297,21 +302,22 @@ mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
+    use crate::printable::{Lines, Printable};
 
     /// Prints the lines of `rosrescue status`.
-    struct Lines<'a>(&'a Computers);
+    struct Shown<'a>(&'a Computers);
 
-    impl fmt::Display for Lines<'_> {
-        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            self.0.lines(clock::wall_time(), f)
+    impl Lines for Shown<'_> {
+        fn lines(&self, page: &mut Page) -> fmt::Result {
+            self.0.lines(clock::wall_time(), page)
         }
     }
 
     /// The lines, with `THEN` for times.
     fn lines(facts: &ClusterFacts) -> Vec<String> {
         let time = regex::Regex::new(r"\S+Z \([^)]* ago\)").unwrap();
-        let text = Lines(&Computers::from(facts)).to_string();
-        let plain = text.lines().map(|line| time.replace(line, "THEN"));
+        let text = Printable::lines(&Shown(&Computers::from(facts)));
+        let plain = text.as_str().lines().map(|line| time.replace(line, "THEN"));
         plain.map(String::from).collect()
     }
 

@@ -4,8 +4,11 @@ use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
-use crate::limit::{Pair, all_clear, rarely};
 use crate::{clock, master::Counts};
+use crate::{
+    limit::{Pair, all_clear, rarely},
+    printable::{Lines, Page, display_lines, line},
+};
 
 /// Limits the log lines about the beginning and the end of an outage.
 pub(crate) static AWAY: Pair = Pair::new();
@@ -266,8 +269,8 @@ impl Report {
 }
 
 /// The report in a few lines.
-impl fmt::Display for Report {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Report {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let Phases {
             absence_ms,
             inspection_ms,
@@ -281,24 +284,26 @@ impl fmt::Display for Report {
         if let Some(ended) = &self.ended {
             write!(f, " ({ended})")?;
         }
-        writeln!(f, "; {} after {total_ms:.0} ms", self.outcome())?;
+        line!(f, "; {} after {total_ms:.0} ms", self.outcome())?;
         let without = match self.same_master {
             true => "without an answer",
             false => "without a master",
         };
-        writeln!(
+        line!(
             f,
             "  {absence_ms:.0} ms {without}, {inspection_ms:.0} ms to read it, \
              {injection_ms:.0} ms to restore it; {}",
             self.felt()
         )?;
-        writeln!(f, "  master process {}: {}", self.master_pid, self.restored)?;
+        line!(f, "  master process {}: {}", self.master_pid, self.restored)?;
         for (what, list) in self.lists() {
-            writeln!(f, "  {what}: {}", list.join(", "))?;
+            line!(f, "  {what}: {}", list.join(", "))?;
         }
         Ok(())
     }
 }
+
+display_lines!(Report);
 
 /// Converts a duration to milliseconds, rounded to hundredths.
 pub(crate) fn ms(duration: Duration) -> f64 {

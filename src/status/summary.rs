@@ -15,6 +15,7 @@ use crate::{
     health::{Feud, Health},
     master::Counts,
     nodes::origin::Misaddressed,
+    printable::{Lines, Page, display_lines, line},
 };
 
 /// Version of the format. It changes when a field is removed or changes its meaning, not when a
@@ -224,7 +225,7 @@ impl Status {
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)
     }
 
-    fn nodes_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    fn nodes_line(&self, f: &mut Page) -> fmt::Result {
         let nodes = &self.nodes;
         let lists = [
             (&nodes.dead_nodes, "dead but registered"),
@@ -235,10 +236,10 @@ impl Status {
         for (names, what) in lists.into_iter().filter(|(names, _)| !names.is_empty()) {
             write!(f, "; {} {what}: {}", names.len(), nodes.since(names))?;
         }
-        writeln!(f)
+        line!(f)
     }
 
-    fn master_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    fn master_line(&self, f: &mut Page) -> fmt::Result {
         write!(f, "master      {}", self.master)?;
         match self.master_pid {
             Some(pid) if self.open => write!(f, ", process {pid}")?,
@@ -251,13 +252,13 @@ impl Status {
         if self.master_is_open {
             write!(f, ", open to other computers")?;
         }
-        writeln!(f, "{}", died(self.deaths))
+        line!(f, "{}", died(self.deaths))
     }
 }
 
 /// Writes the status in ten lines, plus one for each problem.
-impl fmt::Display for Status {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for Status {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let Condition {
             since,
             text,
@@ -265,22 +266,22 @@ impl fmt::Display for Status {
             ..
         } = &self.condition;
         let until = self.started + self.uptime;
-        writeln!(
+        line!(
             f,
             "{}, since {} ({})",
             self.condition.title(),
             clock::wall_text(*since),
             clock::span(until - since)
         )?;
-        writeln!(f, "            {text}")?;
+        line!(f, "            {text}")?;
         if let Some(action) = action {
-            writeln!(f, "to do       {action}")?;
+            line!(f, "to do       {action}")?;
         }
         let mode = match self.mode {
             Mode::Core => "core",
             Mode::Proxy => "proxy",
         };
-        writeln!(
+        line!(
             f,
             "rosrescue   {} {mode}, process {}, up {}{}, guarded by {}",
             self.version,
@@ -289,18 +290,18 @@ impl fmt::Display for Status {
             died(self.worker_restarts),
             self.guarded_by
         )?;
-        writeln!(f, "address     {}", self.uri)?;
+        line!(f, "address     {}", self.uri)?;
         if self.elsewhere {
-            writeln!(f, "master      none on this computer")?;
+            line!(f, "master      none on this computer")?;
         } else {
             self.master_line(f)?;
         }
         if let Some(cluster) = &self.cluster {
             cluster.lines(until, f)?;
         }
-        writeln!(f, "state       {}", self.state)?;
+        line!(f, "state       {}", self.state)?;
         self.nodes_line(f)?;
-        writeln!(
+        line!(
             f,
             "calls       {}, {:.1} per second; {} answered by rosrescue, {} timed out",
             self.counter("calls"),
@@ -309,7 +310,7 @@ impl fmt::Display for Status {
             self.counter("calls_unanswered")
         )?;
         let journal = &self.journal;
-        writeln!(
+        line!(
             f,
             "checkpoint  {}, {}, {} free",
             self.checkpoint,
@@ -319,21 +320,26 @@ impl fmt::Display for Status {
                 .map_or_else(|| "unknown".to_owned(), size)
         )?;
         if self.pending_writes > 0 {
-            writeln!(
+            line!(
                 f,
                 "pending     {} for the next master",
                 counted(self.pending_writes, "change")
             )?;
         }
         if self.late_answers.times > 0 {
-            writeln!(f, "late        {}", self.late_answers)?;
+            line!(f, "late        {}", self.late_answers)?;
         }
         match self.last_rescues.last() {
-            Some(report) => write!(f, "rescues     {}, the last:\n{report}", self.rescues),
-            None => writeln!(f, "rescues     none needed so far"),
+            Some(report) => {
+                line!(f, "rescues     {}, the last:", self.rescues)?;
+                report.lines(f)
+            }
+            None => line!(f, "rescues     none needed so far"),
         }
     }
 }
+
+display_lines!(Status);
 
 /// How often something has died, as a phrase.
 fn died(times: u64) -> String {

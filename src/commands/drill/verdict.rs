@@ -9,7 +9,10 @@ use super::{
     robot::DrillDifference,
     topics,
 };
-use crate::commands::counted;
+use crate::{
+    commands::counted,
+    printable::{Lines, Page, display_lines, line},
+};
 
 /// Maximum number of sentences of one kind.
 const MOST: usize = 12;
@@ -113,8 +116,8 @@ pub(super) fn names(killed: &[(&'static str, u32)]) -> String {
     names.collect::<Vec<_>>().join(" and ")
 }
 
-impl fmt::Display for DrillVerdict {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Lines for DrillVerdict {
+    fn lines(&self, f: &mut Page) -> fmt::Result {
         let verdict = if self.passed { "PASSED" } else { "FAILED" };
         let what = match self.kills.as_slice() {
             [] => "killed nothing".to_owned(),
@@ -137,47 +140,49 @@ impl fmt::Display for DrillVerdict {
             seconds,
             ..
         } = self;
-        writeln!(
+        line!(
             f,
             "{verdict}: {what} in {seconds:.1} s, rosrescue {version} at {uri}"
         )?;
         for failure in &self.failures {
-            writeln!(f, "  failed        {failure}")?;
+            line!(f, "  failed        {failure}")?;
         }
         for kill in &self.kills {
             let after = match kill.recovered_ms {
                 Some(ms) => format!("calls passed to the master again after {ms:.0} ms"),
                 None => "calls did not pass again".to_owned(),
             };
-            writeln!(f, "  {:<14}{}: {after}", kill.signal, names(&kill.killed))?;
+            line!(f, "  {:<14}{}: {after}", kill.signal, names(&kill.killed))?;
         }
         for (what, waits) in [
             ("reads", &self.calls.reads),
             ("writes", &self.calls.writes),
             ("notifications", &self.calls.notifications),
         ] {
-            writeln!(f, "  {what:<14}{waits}")?;
+            line!(f, "  {what:<14}{waits}")?;
         }
         for topic in &self.topics {
-            writeln!(f, "  topic         {topic}")?;
+            line!(f, "  topic         {topic}")?;
         }
         let (nodes, facts) = (self.nodes, self.registrations_and_parameters);
         if self.passed {
-            writeln!(
+            line!(
                 f,
                 "  nodes         {nodes} nodes are the same processes as before"
             )?;
-            writeln!(
+            line!(
                 f,
                 "  state         {facts} registrations, types and parameters are there as before"
             )?;
         }
         for note in &self.notes {
-            writeln!(f, "  note          {note}")?;
+            line!(f, "  note          {note}")?;
         }
         Ok(())
     }
 }
+
+display_lines!(DrillVerdict);
 
 impl fmt::Display for Waits {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

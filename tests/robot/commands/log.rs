@@ -3,7 +3,7 @@
 use rosrescue::xmlrpc::Value;
 use serde_json::Value as Json;
 
-use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes, params};
+use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes, page, params};
 
 fn run(robot: &Robot, arguments: &[&str]) -> Tool {
     Tool::rosrescue(&robot.scratch, robot.port(), arguments)
@@ -15,6 +15,53 @@ fn entries(robot: &Robot, arguments: &[&str]) -> Vec<Json> {
     text.lines()
         .map(|line| serde_json::from_str(line).unwrap())
         .collect()
+}
+
+/// A caller's name looks like a line of the log about the operator.
+#[test]
+fn a_line_break_in_a_name_forges_no_line() {
+    const FORGED: &str =
+        "2026-11-27T19:00:00.000Z  /operator (10.0.0.5)  set /estop: true -> false";
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    let breaks = [
+        "\n", "\u{85}", "\u{2028}", "\u{2029}", "\u{202e}", "\u{200b}",
+    ];
+    for end in breaks {
+        let name = format!("/cam{end}{FORGED}");
+        client.ok(
+            "setParam",
+            params![name.as_str(), "/speed", end.len() as i32],
+        );
+        client.ok("setParam", params!["/n", name.as_str(), 1]);
+        let nobody = "http://127.0.0.1:1/";
+        client.ok(
+            "registerSubscriber",
+            params![name.as_str(), "/t", "x/Y", nobody],
+        );
+    }
+    let mut texts = vec![page(&client, "/"), page(&client, "/status.json")];
+    for arguments in [
+        &["log"][..],
+        &["log", "--json"],
+        &["status"],
+        &["status", "--json"],
+        &["top", "--count", "1"],
+        &["top", "--count", "1", "--json"],
+        &["inspect"],
+        &["inspect", "--json"],
+        &["history"],
+        &["verify"],
+    ] {
+        texts.push(run(&robot, arguments).stdout);
+    }
+    for text in texts {
+        let forged = text.lines().any(|line| line.starts_with("2026-11-27T19"));
+        assert!(!forged, "{text}");
+        for end in &breaks[1..] {
+            assert!(!text.contains(end), "{end:?} in {text}");
+        }
+    }
 }
 
 /// Sets a parameter so often that several generations of the checkpoint are replaced.
