@@ -222,7 +222,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
     reaches.retain(|_, reach| reach.answer_counts());
     let sign = match &addresses {
         None => None,
-        // Whoever listens there is none of them.
+        // What listens there is another program.
         Some(_) if reaches.is_empty() => None,
         Some(at) if is_among(&own(at), &listening) => Some(Reaction::Alive),
         Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {

@@ -10,10 +10,7 @@ use std::{
 
 use tokio::sync::Notify;
 
-use super::{
-    Nodes, health_check, liveness,
-    origin::{Misaddressed, say_misaddressed},
-};
+use super::{Nodes, health_check, liveness, origin::say_misaddressed};
 use crate::{
     clock,
     health::{
@@ -26,7 +23,7 @@ use crate::{
     process::listeners,
     replay::Token,
     resolver,
-    status::stats::Stats,
+    status::{stats::Stats, summary::Misaddressed},
     upstream::sockets,
     write_queue::MoveJudge,
 };
@@ -130,7 +127,7 @@ impl LocalNodes {
         }
     }
 
-    /// Nodes of other computers that are registered under an address that leads to whoever uses it.
+    /// Nodes of other computers that are registered under an address that means each computer itself.
     pub(crate) fn misaddressed(&self) -> Vec<Misaddressed> {
         self.lock().misaddressed.values().cloned().collect()
     }

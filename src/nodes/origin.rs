@@ -7,7 +7,6 @@ use std::{
     time::Duration,
 };
 
-use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
 
 use super::Nodes;
@@ -16,18 +15,8 @@ use crate::{
     limit::rarely,
     resolver,
     ros_env::MasterUri,
+    status::summary::Misaddressed,
 };
-
-/// A node that has registered from another computer under an address that leads to whoever uses it, such as `localhost`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Misaddressed {
-    pub(crate) node: String,
-    pub(crate) api: String,
-    /// The address of the computer from which the node has registered.
-    pub(crate) from: IpAddr,
-    /// When rosrescue noticed it, in seconds since 1970.
-    pub(crate) since: f64,
-}
 
 /// The addresses to which the host of `api` leads from here. `None` if it has none within `limit`.
 pub(crate) async fn addresses(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {

@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Facts, Guarded, Mode,
-    summary::{IllNode, LostAddress, some},
+    summary::{IllNode, LostAddress, Misaddressed, some},
 };
-use crate::{clock, gate::State, health::Feud, nodes::origin::Misaddressed};
+use crate::{clock, gate::State, health::Feud};
 
 /// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

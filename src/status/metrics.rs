@@ -42,7 +42,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status, process: &[ProcessMetric])
         ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),
         ("rescues_total", "recoveries after a death or a restart", Some(status.rescues as f64)),
         ("late_answers_total", "times that the same master was late and rosrescue answered in its place", Some(status.late_answers.times as f64)),
-        ("late_answers_seconds_total", "how long rosrescue answered in the place of a late master", Some(status.late_answers.seconds)),
+        ("late_answers_seconds_total", "how long rosrescue answered because the master was late", Some(status.late_answers.seconds)),
         ("pending_writes", "writes answered by the mirror that the master has not run yet", Some(status.pending_writes as f64)),
         ("nodes", "nodes registered", Some(status.state.nodes as f64)),
         ("publishers", "publishers, counted once for each topic", Some(status.state.publishers as f64)),

@@ -14,7 +14,6 @@ use crate::{
     clock,
     health::{Feud, Health},
     master::Counts,
-    nodes::origin::Misaddressed,
     printable::{Lines, Page, display_lines, line},
 };
 
@@ -89,6 +88,17 @@ pub(crate) struct NodesStatus {
     /// such as `localhost`.
     #[serde(default)]
     pub(crate) misaddressed_nodes: Vec<Misaddressed>,
+}
+
+/// A node that has registered from another computer under an address that means each computer itself, such as `localhost`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Misaddressed {
+    pub(crate) node: String,
+    pub(crate) api: String,
+    /// The address of the computer from which the node has registered.
+    pub(crate) from: IpAddr,
+    /// When rosrescue noticed it, in seconds since 1970.
+    pub(crate) since: f64,
 }
 
 /// An address that this computer has lost.

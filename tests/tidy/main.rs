@@ -176,6 +176,7 @@ fn only_the_clock_reads_the_wall_clock() {
         "clock.rs",
         "commands/check/facts.rs",
         "nodes/addresses.rs",
+        "nodes/liveness.rs",
         "nodes/local.rs",
         "recovery/reporting.rs",
         "server/clients.rs",

@@ -9,7 +9,7 @@ use crate::support::{
     eventually_some, free_port, page, params,
 };
 
-/// A robot whose nodes are dead is not well because its master is. A node that ends in order is no trouble.
+/// A robot whose nodes are dead is not well because its master is. A node that stops cleanly is no trouble.
 #[test]
 fn nodes_that_died_come_before_everything_else() {
     let robot = Robot::start(Mode::Core);
@@ -22,7 +22,7 @@ fn nodes_that_died_come_before_everything_else() {
     assert!(status().stdout.starts_with("protected, since "));
     orderly.terminate();
     eventually("the node has unregistered", || {
-        !State::read(&robot.client()).knows("/orderly")
+        State::try_read(&robot.client()).is_ok_and(|state| !state.knows("/orderly"))
     });
     let good = status();
     assert_eq!(good.exit(), 0, "{good:?}");
@@ -55,7 +55,7 @@ fn nodes_that_died_come_before_everything_else() {
     crate::support::signal(master, rustix::process::Signal::KILL);
     robot.await_recovery(master);
     eventually("the dead node is unregistered", || {
-        !State::read(&robot.client()).knows("/dead")
+        State::try_read(&robot.client()).is_ok_and(|state| !state.knows("/dead"))
     });
     let after = status();
     let said = "1 node died, and rosrescue unregistered them: /dead since 2";

@@ -145,7 +145,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     robot.await_gate();
     assert_eq!(robot.master_pid(), pid, "the same master stays in use");
     assert_eq!(robot.counter("masters_restored"), injections + 1);
-    // Nothing has died, so this is no rescue.
+    // Nothing has died, so this does not count as a rescue.
     let status = robot.status().expect("a status");
     assert_eq!(status["rescues"], 0, "{status}");
     assert_eq!(status["late_answers"]["times"], 1, "{status}");

@@ -79,7 +79,7 @@ fn nodes_of_another_computer_that_are_registered_as_localhost_survive_rescues() 
         action.contains(&format!("export ROS_IP={from}")),
         "{action}"
     );
-    // A program of this computer has the port of the listener. It is somebody else.
+    // A program of this computer has the port of the listener. It is another program.
     let state = State::read(&client);
     let listener = client.ok("lookupNode", params!["/test", "/listener"]);
     let listener_port = listener.as_str().unwrap().trim_end_matches('/');
@@ -115,13 +115,13 @@ fn nodes_of_another_computer_that_are_registered_as_localhost_survive_rescues() 
         client.master_pid().is_some_and(|pid| pid != dead)
     });
     publisher.unpublish(&client, "/chatter");
-    // The stranger registers at what looks like the same port. Neither of the two is gone.
-    stranger.publish(&client, "/stranger", "std_msgs/String");
-    rescue(&client);
     let told = stranger.calls().into_iter();
     let told: Vec<_> = told.filter(|call| call.from_rosrescue).collect();
     let update = told.iter().find(|call| call.method == "publisherUpdate");
     assert!(update.is_none(), "a stranger was notified: {update:?}");
+    // The stranger registers at what looks like the same port. Neither of the two is gone.
+    stranger.publish(&client, "/stranger", "std_msgs/String");
+    rescue(&client);
     let now = State::read(&client);
     for node in ["/talker", "/listener", "/stranger"] {
         assert!(now.knows(node), "{node}");

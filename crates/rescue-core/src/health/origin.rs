@@ -2,7 +2,7 @@
 //! registration came from.
 //!
 //! A node that registers as `localhost`, or under a host name that means this computer, from another computer is not at
-//! that address as seen from here. Whatever listens there is somebody else, and if nobody does, the node may live.
+//! that address as seen from here. What listens there is another program, and if nothing does, the node may live.
 
 use std::net::IpAddr;
 
@@ -17,7 +17,7 @@ pub enum Reach {
     Doubtful,
     /// The address is this computer's, and the node is on another computer. Nothing at the address proves anything.
     Elsewhere {
-        /// Whether the address leads to the computer of whoever uses it, so no other computer reaches the node either.
+        /// Whether it is a loopback address, so no other computer reaches the node either.
         loopback: bool,
     },
 }
