@@ -72,7 +72,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
     /// Reads the whole content of the file at `path`. A file of more than `limit` bytes is an error, as is one that is
     /// not a regular file of [ours](crate::regular_file).
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
-    /// Does the same for a regular file that the operator has named, whoever owns it.
+    /// Does the same for a regular file that the operator has named, with any owner.
     fn read_named(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
         self.read(path, limit)
     }

@@ -334,8 +334,8 @@ fn the_status_page_is_served_under_every_name_of_the_computer() {
     }
 }
 
-/// rosrescue recognises its own requests to end itself if the master's address leads back to it. Whoever has seen such
-/// a request could use its mark otherwise.
+/// rosrescue recognises its own requests to end itself if the master's address leads back to it. A program
+/// that has seen such a request could use its mark otherwise.
 #[test]
 fn a_mark_that_was_seen_in_a_request_to_the_master_does_not_end_rosrescue() {
     let scratch = Scratch::new();

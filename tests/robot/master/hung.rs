@@ -57,7 +57,7 @@ fn a_call_to_a_path_that_rosmaster_does_not_have_never_takes_effect() {
                 wire
             })
             .collect();
-        // The mirror answers in the place of the hung master.
+        // The mirror answers in place of the hung master.
         client.set_param("/after", 2);
         assert_eq!(client.param("/after"), Some(2.into()));
         assert_eq!(client.param("/wrong"), None);
