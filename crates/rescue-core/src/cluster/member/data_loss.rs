@@ -128,7 +128,7 @@ impl Member {
         let floor = before.revision.max(known);
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
         if self.data_loss.present.is_some() {
-            // Nobody else can repair a journal that this computer is to continue.
+            // No other computer can repair a journal that this one is to continue.
             return older || !is_readable && self.machine.role() == Role::CatchingUp;
         }
         let torn = view.is_torn() || view.term() < known || !is_readable;
