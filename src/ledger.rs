@@ -19,7 +19,7 @@ mod shared;
 mod summary;
 
 use std::{
-    sync::{Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
+    sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
     time::Instant,
 };
 
@@ -43,7 +43,7 @@ use crate::{
         merge::Verdict,
         sharing::{Change, Sharing, Source},
     },
-    master::{Master, Method, Request},
+    master::{Master, Method, Request, Write},
     order::{Order, Subject},
     replay::{self, Answered, Token},
     status::stats::Stats,
@@ -220,9 +220,13 @@ impl Ledger {
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
         let mut sources = Vec::with_capacity(answered.len());
-        let mut unrecorded = false;
+        let (mut unrecorded, mut has_record) = (false, false);
         let at = clock::wall_millis();
         for (index, (answered, source, origin)) in answered.into_iter().enumerate() {
+            let is_recorded = inner.take_ahead(answered.call);
+            has_record |= is_recorded;
+            // The journal must not keep a call that the master has refused.
+            unrecorded |= is_recorded && !answered.executed;
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
@@ -238,27 +242,62 @@ impl Ledger {
                     unrecorded = true;
                 }
             }
-            if answered.executed {
+            if answered.executed && !is_recorded {
                 let call = answered.call.clone().into();
                 entries.push(RecordContent::labelled(call, Label { at, origin }));
                 sources.push(source);
             }
         }
         inner.doubted |= recorded.doubtful;
-        let has_entries = !entries.is_empty();
-        if has_entries {
+        if !entries.is_empty() {
+            has_record = true;
             self.stats.writes_recorded.add(entries.len() as u64);
             inner.append_from(entries, &sources);
         }
+        // The answer does not show what became of the call.
+        unrecorded |= inner.withdraw();
         if unrecorded {
             inner.changed_unrecorded();
         }
-        if unrecorded || has_entries {
+        if unrecorded || has_record {
             recorded.mark = inner.mark();
             drop(inner);
             self.recorded();
         }
         Ok(recorded)
+    }
+
+    /// Writes `call` to the journal before the master has answered it, so that the disk and the master work at the same
+    /// time. Does nothing unless the master surely accepts the call, and with several computers, whose journal holds
+    /// only answered calls. The caller must pass the answer to [`Self::record`], or call [`Self::withdraw`].
+    pub(crate) fn record_ahead(&self, call: &Arc<Request>, origin: Origin) {
+        let mut inner = self.lock();
+        let is_certain = !inner.injecting
+            && !inner.doubted
+            && matches!(inner.shared, Shared::Nobody)
+            && inner.journal.is_some()
+            && Write::of(call).is_some_and(|write| inner.mirror.accepts(&write));
+        if !is_certain {
+            return;
+        }
+        let at = clock::wall_millis();
+        let entry = RecordContent::labelled(Request::clone(call).into(), Label { at, origin });
+        self.stats.writes_recorded.count();
+        inner.append(vec![entry]);
+        inner.ahead = Some(call.clone());
+        drop(inner);
+        self.write();
+        if self.sync == SyncPolicy::Always {
+            self.work.notify_one();
+        }
+    }
+
+    /// Notes that no answer of the master to the call of [`Self::record_ahead`] will be recorded. A complete checkpoint
+    /// removes the call from the journal.
+    pub(crate) fn withdraw(&self) {
+        if self.lock().withdraw() {
+            self.work.notify_one();
+        }
     }
 
     /// Records and applies a call made by rosrescue before there is a master.

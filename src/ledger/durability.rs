@@ -167,6 +167,8 @@ impl Ledger {
         let result = {
             let mut inner = self.lock();
             let checkpoint = inner.checkpoint();
+            // The checkpoint replaces the journal and lacks that call, so its answer makes a new record.
+            inner.ahead = None;
             inner.whole.taken = inner.version;
             inner.journal.as_mut()?.run_whole(checkpoint, work)?
         };
@@ -187,7 +189,8 @@ impl Ledger {
     /// Sets a new store, which is still empty.
     pub fn set_store(&self, store: Store) {
         let journal = Journal::new(store, self.durable.clone(), self.sync);
-        self.lock().journal = Some(journal);
+        let mut inner = self.lock();
+        (inner.journal, inner.ahead) = (Some(journal), None);
     }
 
     /// A checkpoint of the present state.

@@ -1,6 +1,6 @@
 //! What the ledger's lock protects.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
 use tokio::sync::Notify;
 
@@ -36,6 +36,8 @@ pub(super) struct Inner {
     /// Changes whenever the mirror changes.
     pub(super) version: u64,
     pub(super) whole: Whole,
+    /// The write on its way to the master that the journal already holds, and the mirror does not.
+    pub(super) ahead: Option<Arc<Request>>,
     pub(super) pending: PendingWrites,
     pub(super) activity: Activity,
     pub(super) order: Order,
@@ -68,6 +70,7 @@ impl Inner {
             shared: Shared::Nobody,
             version: 0,
             whole: Whole::default(),
+            ahead: None,
             pending: PendingWrites::default(),
             activity: Activity::default(),
             order: Order::default(),
@@ -192,6 +195,23 @@ impl Inner {
     pub(super) fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
         self.share_state();
+    }
+
+    /// Whether the journal already holds `call`, which is being answered. After this it no longer counts as ahead.
+    pub(super) fn take_ahead(&mut self, call: &Request) -> bool {
+        let is_it = |ahead: &mut Arc<Request>| std::ptr::eq(&raw const **ahead, call);
+        self.ahead.take_if(is_it).is_some()
+    }
+
+    /// Notes that the mirror will not get the call that the journal holds ahead of it, if there is one. A complete
+    /// checkpoint is due then.
+    pub(super) fn withdraw(&mut self) -> bool {
+        let is_ahead = self.ahead.take().is_some();
+        if is_ahead {
+            self.version += 1;
+            self.changed_unrecorded();
+        }
+        is_ahead
     }
 
     /// Number of the journal's last record.

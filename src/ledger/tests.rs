@@ -462,3 +462,119 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     next.with_activity(|_, activity| activity.restore_displaced(rebuilt.displaced));
     assert_eq!(next.checkpoint().displaced, checkpoint.displaced);
 }
+
+/// A ledger with a file, and the state and number of records that the next start would find in it.
+struct Recorded {
+    folder: tempfile::TempDir,
+    ledger: Arc<Ledger>,
+}
+
+impl Recorded {
+    async fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let ledger = ledger();
+        ledger.set_store(Store::open(&folder.path().join("c")).unwrap().0);
+        let this = Self { folder, ledger };
+        this.checkpoint().await;
+        this
+    }
+
+    async fn checkpoint(&self) {
+        let begun = self
+            .ledger
+            .on_store_whole(|store, checkpoint| store.begin(&checkpoint));
+        begun.await.unwrap().unwrap();
+        self.ledger.set_attempted(Ok(()));
+    }
+
+    async fn found(&self) -> (Master, usize) {
+        // Runs after all records.
+        self.ledger.on_store(|_| ()).await.unwrap();
+        let loaded = crate::checkpoint::store::read(&self.folder.path().join("c"));
+        let loaded = loaded.unwrap().unwrap();
+        let count = loaded.records.len();
+        let rebuilt = crate::checkpoint::session::rebuild(loaded.checkpoint, loaded.records);
+        (rebuilt.mirror, count)
+    }
+
+    /// Passes the master's answer to `call` to the ledger.
+    fn answer(&self, call: &Request, reply: &Reply) {
+        let now = Instant::now();
+        self.ledger.record_here(now, 0, &[(call, reply)]).unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_write_on_its_way_to_the_master_is_in_the_file_once() {
+    let it = Recorded::new().await;
+    let call = Arc::new(publish("/t"));
+    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    // Nothing shows the write before the master has answered.
+    assert!(it.ledger.with_mirror(Master::is_empty));
+    let (found, before) = it.found().await;
+    assert_eq!(found.counts().publishers, 1);
+    it.answer(&call, &answered(&call, &mut Master::default()));
+    assert!(!it.ledger.checkpoint_due());
+    let (found, after) = it.found().await;
+    assert_eq!((found.counts().publishers, after), (1, before));
+}
+
+#[tokio::test]
+async fn a_write_whose_record_a_checkpoint_has_replaced_is_recorded_again() {
+    let it = Recorded::new().await;
+    let call = Arc::new(publish("/t"));
+    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    it.checkpoint().await;
+    assert!(it.found().await.0.is_empty());
+    it.answer(&call, &answered(&call, &mut Master::default()));
+    assert_eq!(it.found().await.0.counts().publishers, 1);
+}
+
+#[tokio::test]
+async fn a_recorded_write_that_is_refused_or_never_answered_leaves_the_file() {
+    let refused = Reply::Value(vec![Value::from(-1), "no".into(), 0.into()].into());
+    for reply in [Some(refused), None] {
+        let it = Recorded::new().await;
+        let call = Arc::new(publish("/t"));
+        it.ledger.record_ahead(&call, Origin::Rosrescue);
+        match reply {
+            Some(reply) => it.answer(&call, &reply),
+            None => it.ledger.withdraw(),
+        }
+        assert!(it.ledger.checkpoint_due());
+        // A reply that no rosmaster gives puts the mirror in doubt, and the master's state is read.
+        it.ledger.adopt(Master::default());
+        it.checkpoint().await;
+        assert!(it.found().await.0.is_empty());
+    }
+}
+
+#[tokio::test]
+async fn a_write_that_the_mirror_answers_instead_stays_in_the_file() {
+    let it = Recorded::new().await;
+    let call = Arc::new(publish("/t"));
+    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    it.ledger.stand_in(Instant::now(), &call).unwrap();
+    it.ledger.withdraw();
+    assert!(!it.ledger.checkpoint_due());
+    assert_eq!(it.found().await.0.counts().publishers, 1);
+    assert_eq!(pending(&it.ledger), [Request::clone(&call)]);
+}
+
+#[tokio::test]
+async fn only_a_write_that_the_master_surely_accepts_is_recorded_before_its_answer() {
+    let it = Recorded::new().await;
+    for call in [
+        call("deleteParam", &["/n", "/unset"]),
+        call("setParam", &["/n", "/", "no namespace"]),
+        call("registerPublisher", &["/n", "/t", "no type", "http://n:1/"]),
+        call("getParam", &["/n", "/a"]),
+        Request::multicall([publish("/t")]),
+    ] {
+        it.ledger.record_ahead(&Arc::new(call), Origin::Rosrescue);
+    }
+    let (_, before) = it.found().await;
+    it.ledger
+        .record_ahead(&Arc::new(publish("/t")), Origin::Rosrescue);
+    assert_eq!(it.found().await.1, before + 1);
+}

@@ -231,6 +231,7 @@ impl Drain {
             .take_if(|batch| batch.incarnation != incarnation)
         {
             // The new master never got these calls.
+            self.link.ledger.withdraw();
             self.take_back(batch.items);
         }
         if self.opaque.incarnation != incarnation {
@@ -275,6 +276,11 @@ impl Drain {
             let answers = items.iter().filter_map(|item| item.delivery.as_ref());
             order.sent(tells, answers.map(Delivery::number).collect());
         });
+        if let [item] = items.as_slice()
+            && let Some(call) = item.call.as_ref().filter(|_| item.raw.is_some())
+        {
+            self.link.ledger.record_ahead(call, item.origin);
+        }
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
         self.in_flight = Some(InFlight {
@@ -381,6 +387,7 @@ impl Drain {
             }
             return;
         }
+        self.link.ledger.withdraw();
         self.take_back(items);
         if error.may_have_run() {
             self.link.ledger.abandon_batch();
@@ -488,6 +495,7 @@ impl Drain {
         else {
             // The gate is about to open for another master.
             self.lost = true;
+            self.link.ledger.withdraw();
             return self.take_back(items);
         };
         if registered {
@@ -564,6 +572,7 @@ impl Drain {
         let opaque = opaque.map(|(item, _)| item).collect();
         self.take_back(opaque);
         self.answer_queue();
+        self.link.ledger.withdraw();
         self.link.ledger.release(Order::settled);
     }
 
@@ -627,6 +636,7 @@ impl Drain {
     fn send_elsewhere(&mut self) {
         (self.grace, self.connection) = (None, None);
         let in_flight = self.in_flight.take().map(|batch| batch.items);
+        self.link.ledger.withdraw();
         self.link.ledger.release(Order::settled);
         let opaque = std::mem::take(&mut self.opaque).answers;
         let items = in_flight.into_iter().flatten();
