@@ -25,7 +25,6 @@ use crate::{
 mod assemble;
 mod cluster;
 mod context;
-mod earlier;
 mod life;
 mod notify;
 mod startup;

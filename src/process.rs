@@ -216,9 +216,6 @@ fn command(program: &Path) -> Command {
     command
 }
 
-/// The suffixes of PID files after the checkpoint's name.
-pub(crate) const PID_FILES: [&str; 2] = [".rosmaster-pid", ".rosout-pid"];
-
 /// Path of a file that belongs to `checkpoint`.
 pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     let mut name = checkpoint.as_os_str().to_owned();

@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use super::{RunError, earlier, life};
+use super::{RunError, life};
 use crate::{
     checkpoint::{
         folder,
@@ -45,7 +45,6 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let own = config.clone();
     let opened = wait::within(OPENING, move || {
         let path = &own.checkpoint;
-        earlier::take_over(&own);
         let found = Folder::look(path);
         let mut opened = Store::open(path);
         if let Ok((store, _)) = &mut opened {
