@@ -13,10 +13,9 @@ use crate::{
     checkpoint::{compare::plain, format::shown},
     cli::InspectArgs,
     clock,
-    hide::Hide,
+    hide::{Hide, Masked},
     master::{Counts, Master},
     printable::{Lines, Page, display_lines, line},
-    xmlrpc::{Struct, Value},
 };
 
 pub(super) async fn run(args: &InspectArgs) -> Result<Exit, CommandFailure> {
@@ -45,7 +44,7 @@ struct Inspected {
     nodes: Vec<Node>,
     topics: Vec<Topic>,
     /// The parameters. Values that match `--hide-values` are masked.
-    parameters: Struct,
+    parameters: Masked<'static>,
     journal: Journal,
     /// Methods of the writes that no master has run yet.
     pending: Vec<String>,
@@ -243,13 +242,12 @@ impl Lines for Inspected {
 
 display_lines!(Inspected);
 
-fn write_params(f: &mut Page, path: &str, members: &Struct) -> fmt::Result {
-    for (key, value) in members {
-        match value {
-            Value::Struct(inner) if !inner.is_empty() => {
-                write_params(f, &format!("{path}/{key}"), inner)?;
-            }
-            value => line!(f, "  {path}/{key}: {}", shown(value))?,
+fn write_params(f: &mut Page, path: &str, value: &Masked<'_>) -> fmt::Result {
+    for (key, value) in value.members().into_iter().flatten() {
+        let name = format!("{path}/{key}");
+        match value.members() {
+            Some(_) => write_params(f, &name, &value)?,
+            None => line!(f, "  {name}: {}", shown(&value))?,
         }
     }
     Ok(())

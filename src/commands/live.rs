@@ -109,7 +109,7 @@ fn refusal(result: &Value) -> Option<String> {
     match answer {
         Some([Value::Int(1), ..]) => None,
         Some([_, message, ..]) => Some(message.as_str().unwrap_or("no reason given").to_owned()),
-        _ => Some(crate::checkpoint::format::shown(result)),
+        _ => Some("its answer is not that of a master".to_owned()),
     }
 }
 

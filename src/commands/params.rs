@@ -11,7 +11,7 @@ use super::{CommandFailure, Exit, files, note, print};
 use crate::{
     checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
     cli::ParamsArgs,
-    hide::Hide,
+    hide::{Hide, Masked},
     printable::{Lines, Page, display_lines},
     xmlrpc::{Struct, Value},
 };
@@ -24,7 +24,8 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {
         tree = without(&tree, "", hide, &mut left_out);
     }
     if args.output.json {
-        print(&Tree(tree), &args.output)?;
+        // What is hidden was left out: a masked value would be taken for the real one.
+        print(&Tree(Hide::nothing().mask_tree(&tree)), &args.output)?;
     } else {
         for name in OF_THE_SESSION {
             if tree.shift_remove(name.trim_start_matches('/')).is_some() {
@@ -59,7 +60,7 @@ fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -
                     kept.insert(key.clone(), Value::Struct(members));
                 }
             }
-            value if hide.mask(&name, value) == *value => {
+            value if hide.mask(&name, value).value() == value => {
                 drop(kept.insert(key.clone(), value.clone()))
             }
             _ => left_out.push(format!("left out {name}: it is hidden")),
@@ -70,11 +71,12 @@ fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -
 
 #[derive(Serialize)]
 #[serde(transparent)]
-struct Tree(Struct);
+struct Tree(Masked<'static>);
 
 impl Lines for Tree {
     fn lines(&self, f: &mut Page) -> fmt::Result {
-        write!(f, "{} parameters", self.0.len())
+        let count = self.0.members().into_iter().flatten().count();
+        write!(f, "{count} parameters")
     }
 }
 

@@ -1,6 +1,11 @@
 //! Decides which parameter values are hidden. Passwords and the like must not appear on a page or in a terminal.
+//!
+//! What shows values to people or other programs takes a [`Masked`] value, and only [`Hide`] makes one. So no output can
+//! forget the rule.
 
-use std::str::FromStr;
+mod json;
+
+use std::{borrow::Cow, str::FromStr};
 
 use regex::{Regex, RegexBuilder};
 
@@ -15,6 +20,27 @@ pub const HIDDEN: &str = "(hidden)";
 /// Chooses the parameters with hidden values by their full names.
 #[derive(Clone, Debug)]
 pub struct Hide(Option<Regex>);
+
+/// A parameter's value without what is hidden in it. It is written as JSON, and as text by
+/// [`shown`](crate::checkpoint::format::shown).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Masked<'a>(Cow<'a, Value>);
+
+impl Masked<'_> {
+    pub fn value(&self) -> &Value {
+        &self.0
+    }
+
+    /// The members of a struct that is not empty, each masked. `None` for any other value.
+    pub fn members(&self) -> Option<impl Iterator<Item = (&str, Masked<'_>)>> {
+        let members = match self.value() {
+            Value::Struct(members) if !members.is_empty() => members,
+            _ => return None,
+        };
+        let members = members.iter();
+        Some(members.map(|(key, value)| (key.as_str(), Masked(Cow::Borrowed(value)))))
+    }
+}
 
 /// Parses a regular expression, which ignores case. An empty one hides nothing.
 impl FromStr for Hide {
@@ -40,42 +66,45 @@ impl Hide {
         names.any(|name| self.matches(name))
     }
 
+    /// Hides nothing.
+    pub fn nothing() -> Self {
+        Self(None)
+    }
+
     /// The `value` of the parameter `name`, with [`HIDDEN`] in place of each hidden part. Each member of a struct has
     /// its own name and is judged by it, also inside lists. The name of the whole tree is the empty string.
-    pub fn mask(&self, name: &str, value: &Value) -> Value {
-        self.mask_below(name, value, self.hides(name))
+    pub fn mask<'a>(&self, name: &str, value: &'a Value) -> Masked<'a> {
+        Masked(self.mask_below(name, value, self.hides(name)))
     }
 
     /// Masks the whole parameter tree like [`mask`](Self::mask).
-    pub fn mask_tree(&self, tree: &Struct) -> Struct {
+    pub fn mask_tree(&self, tree: &Struct) -> Masked<'static> {
         let members = tree.iter().map(|(key, value)| {
-            let shown = self.mask(&format!("/{key}"), value);
-            (key.clone(), shown)
+            let shown = self.mask(&format!("/{key}"), value).0;
+            (key.clone(), shown.into_owned())
         });
-        members.collect()
+        Masked(Cow::Owned(Value::Struct(members.collect())))
     }
 
     /// Does the same as [`mask`](Self::mask) for a caller that already knows whether `name` is hidden.
-    fn mask_below(&self, name: &str, value: &Value, hidden: bool) -> Value {
+    fn mask_below<'a>(&self, name: &str, value: &'a Value, hidden: bool) -> Cow<'a, Value> {
         match value {
             Value::Struct(members) if !members.is_empty() => {
                 let members = members.iter().map(|(key, value)| {
                     let name = format!("{name}/{key}");
-                    let shown = self.mask_below(&name, value, hidden || self.matches(&name));
-                    (key.clone(), shown)
+                    let hidden = hidden || self.matches(&name);
+                    let shown = self.mask_below(&name, value, hidden);
+                    (key.clone(), shown.into_owned())
                 });
-                Value::Struct(members.collect())
+                Cow::Owned(Value::Struct(members.collect()))
             }
-            _ if hidden => HIDDEN.into(),
+            _ if hidden => Cow::Owned(HIDDEN.into()),
             Value::Array(elements) => {
                 let elements = elements.iter();
-                Value::Array(
-                    elements
-                        .map(|it| self.mask_below(name, it, false))
-                        .collect(),
-                )
+                let shown = elements.map(|it| self.mask_below(name, it, false).into_owned());
+                Cow::Owned(Value::Array(shown.collect()))
             }
-            _ => value.clone(),
+            _ => Cow::Borrowed(value),
         }
     }
 
@@ -143,7 +172,7 @@ mod tests {
                 tree(&[("a", HIDDEN.into()), ("b", HIDDEN.into())]),
             ),
         ]);
-        assert_eq!(hide.mask("", &given), expected);
+        assert_eq!(*hide.mask("", &given).value(), expected);
     }
 
     #[test]

@@ -3,7 +3,6 @@
 mod decode;
 mod encode;
 mod error;
-mod json;
 mod number;
 mod prolog;
 mod python;

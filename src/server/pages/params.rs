@@ -4,7 +4,7 @@
 use serde::Serialize;
 
 use crate::{
-    hide::Hide,
+    hide::{Hide, Masked},
     xmlrpc::{Struct, Value},
 };
 
@@ -157,13 +157,7 @@ impl ParamEntry {
                 ..Self::named(name, kind)
             };
         }
-        let mut text = String::new();
-        match value {
-            // A list may contain structs, whose members may have to be hidden by their names.
-            Value::Array(_) => write(&hide.mask(full, value), &mut text),
-            Value::String(words) => text.extend(words.chars().take(TEXT + 1)),
-            value => write(value, &mut text),
-        }
+        let mut text = text_of(&hide.mask(full, value));
         let end = text.char_indices().nth(TEXT).map(|(end, _)| end);
         if let Some(end) = end {
             text.truncate(end);
@@ -174,6 +168,16 @@ impl ParamEntry {
             ..Self::named(name, kind)
         }
     }
+}
+
+/// The value in one line, longer than the length that can be shown if it must be shortened.
+fn text_of(value: &Masked<'_>) -> String {
+    let mut text = String::new();
+    match value.value() {
+        Value::String(words) => text.extend(words.chars().take(TEXT + 1)),
+        value => write(value, &mut text),
+    }
+    text
 }
 
 /// Writes a value in one line, and stops soon after the length that can be shown.

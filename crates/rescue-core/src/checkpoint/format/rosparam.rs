@@ -1,7 +1,10 @@
 //! Converts parameters to YAML for `rosparam load`.
 
 use super::{EncodeError, emit};
-use crate::xmlrpc::{Struct, Value};
+use crate::{
+    hide::Masked,
+    xmlrpc::{Struct, Value},
+};
 
 /// Maximum number of characters of a value in a message.
 const SHOWN: usize = 100;
@@ -24,9 +27,9 @@ pub fn for_rosparam(tree: &Struct) -> Result<(Vec<u8>, Vec<String>), EncodeError
 }
 
 /// `value` in one line for messages: as in a checkpoint, but shortened.
-pub fn shown(value: &Value) -> String {
+pub fn shown(value: &Masked<'_>) -> String {
     let mut line = Vec::new();
-    if emit::flow(&mut line, value, 0).is_err() {
+    if emit::flow(&mut line, value.value(), 0).is_err() {
         return "(nested too deep)".to_owned();
     }
     let line = String::from_utf8_lossy(&line);
@@ -83,6 +86,7 @@ fn refusal(value: &Value) -> Option<&'static str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hide::Hide;
 
     fn tree(members: &[(&str, Value)]) -> Struct {
         members.into()
@@ -126,6 +130,7 @@ mod tests {
 
     #[test]
     fn a_long_value_is_shortened_for_display() {
+        let shown = |value: &Value| shown(&Hide::nothing().mask("", value));
         assert_eq!(shown(&"ü".into()), "\"ü\"");
         let long = shown(&"ü".repeat(1000).into());
         assert_eq!(long.chars().count(), SHOWN + 1);
