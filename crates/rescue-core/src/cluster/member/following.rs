@@ -243,6 +243,14 @@ impl Member {
             return;
         };
         let before = std::mem::take(&mut self.reading.before);
+        // Another journal has begun since. What was read of the earlier one is no loss.
+        let known = self.view();
+        let is_late = (before.revision..known.revision).contains(&read.view.revision);
+        if is_late && read.view.origin != known.origin {
+            self.reading.load_at = Some(now);
+            self.reading.check_due |= checks;
+            return;
+        }
         self.note_readable(read.view.origin, read.is_readable);
         if self.has_lost(&read.view, &before, read.is_readable) {
             return self.start_over(now, &read.view);
