@@ -237,7 +237,8 @@ impl Member {
             let until = since + self.settings().ttl * PATIENCE;
             self.machine.hold_claims(until);
         }
-        if self.data_loss.is_left(self.view()) {
+        // A request of this computer may have succeeded since.
+        if self.data_loss.is_left(self.view()) || self.leader().is_none() {
             return;
         }
         // Another computer has led since, so its journal counts. Those that have read it claim first.

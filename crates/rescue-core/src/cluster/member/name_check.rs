@@ -42,8 +42,11 @@ impl Member {
         let mut there = living.map(|sign| sign.uri.clone());
         if let Some(leader) = &view.leader {
             let own = self.machine.settings();
-            // Only one process runs on a computer at a time, so this leader is another computer.
-            if leader.id == own.id {
+            // After a loss of etcd's data, this process leads under another id, with one more `+`.
+            let process = |id: &str| id.trim_end_matches('+').to_owned();
+            let is_this = process(&leader.id) == process(&own.id);
+            // Only one process runs on a computer at a time, so any other leader is another computer.
+            if is_this {
                 self.namesake.led = true;
             } else if self.namesake.led && leader.name == own.name && !self.data_loss.is_left(view)
             {
