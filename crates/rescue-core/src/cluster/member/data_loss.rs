@@ -115,7 +115,7 @@ impl Member {
     fn contradicts(&self, view: &View, before: &View) -> bool {
         // After a loss, a new journal does not continue the lost one.
         let is_lost = self.data_loss.present.is_some();
-        !is_lost && !view.continues(before) && !Mutant::TrustsDeletedKeys.lives()
+        !is_lost && !view.continues(before) && !trusts()
     }
 
     /// Whether etcd has lost data, if a read that began when etcd had shown `before` shows `view`.
@@ -132,7 +132,7 @@ impl Member {
             return older || !is_readable && self.machine.role() == Role::CatchingUp;
         }
         let torn = view.is_torn() || view.term() < known || !is_readable;
-        let torn = torn && !Mutant::TrustsDeletedKeys.lives();
+        let torn = torn && !trusts();
         older || torn || self.contradicts(view, before)
     }
 
@@ -250,4 +250,9 @@ impl Member {
             self.reading.load_by(now);
         }
     }
+}
+
+/// Whether a defect of the past hides what is not a matter of etcd's revision.
+fn trusts() -> bool {
+    Mutant::TrustsDeletedKeys.lives() || Mutant::TrustsLostEtcd.lives()
 }
