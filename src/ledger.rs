@@ -62,6 +62,8 @@ pub(crate) struct Recorded {
     pub mark: Mark,
     /// Whether the mirror may differ from the master now.
     pub doubtful: bool,
+    /// Whether the file holds a call that the master has not executed, so the answers wait for a complete checkpoint.
+    pub is_ahead: bool,
 }
 
 /// What is needed to plan an injection, which brings a master to the mirror's state.
@@ -226,7 +228,7 @@ impl Ledger {
             let is_recorded = inner.take_ahead(answered.call);
             has_record |= is_recorded;
             // The journal must not keep a call that the master has refused.
-            unrecorded |= is_recorded && !answered.executed;
+            recorded.is_ahead |= is_recorded && !answered.executed;
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
@@ -255,7 +257,8 @@ impl Ledger {
             inner.append_from(entries, &sources);
         }
         // The answer does not show what became of the call.
-        unrecorded |= inner.withdraw();
+        recorded.is_ahead |= inner.withdraw();
+        unrecorded |= recorded.is_ahead;
         if unrecorded {
             inner.changed_unrecorded();
         }

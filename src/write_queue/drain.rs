@@ -524,7 +524,9 @@ impl Drain {
                 .zip(replies.into_iter().map(CallAnswer::Made))
                 .collect(),
         };
-        self.answer(recorded.mark, None, answers);
+        let ledger = &self.link.ledger;
+        let version = recorded.is_ahead.then(|| ledger.unwritten()).flatten();
+        self.answer(recorded.mark, version, answers);
     }
 
     /// Handles a batch whose reply is one answer instead of a result for each call.
