@@ -126,10 +126,10 @@ mod tests {
                     assert_eq!(option.get_env(), None, "{name}: consent by environment");
                     continue;
                 }
-                // They choose what one run shows or writes.
+                // They choose what one run reads, shows or writes.
                 let of_one_run = [
                     "at", "folder", "from", "to", "since", "until", "lines", "param", "topic",
-                    "service", "node",
+                    "service", "node", "uri",
                 ];
                 if of_one_run.contains(&name.as_str()) && option.get_env().is_none() {
                     assert!(!serves, "{name}");
