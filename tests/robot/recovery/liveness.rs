@@ -38,8 +38,9 @@ fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
         "the dead nodes must stay registered"
     );
     assert_eq!(status()["unreachable"], serde_json::json!([]));
-    let shown = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(0);
+    let shown = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(1);
     for part in [
+        "NODES DIED, since 2",
         "2 dead but registered: /listener since 2",
         ", /talker since 2",
         "; 1 not checked: /lost since 2",
