@@ -204,7 +204,7 @@ impl NodesTrouble {
             let nodes = &self.unregistered;
             all.push((
                 format!(
-                    "{} died, and rosrescue unregistered them: {}.",
+                    "{} died, now unregistered: {}.",
                     count(nodes),
                     listed(nodes)
                 ),
@@ -552,7 +552,7 @@ mod tests {
             "{line}"
         );
         for part in [
-            "1 node died, and rosrescue unregistered them: /lidar",
+            "1 node died, now unregistered: /lidar",
             "1 node does not answer: /gps",
             "Other nodes keep working",
             "the disk is full",

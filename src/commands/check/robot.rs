@@ -29,7 +29,7 @@ pub(super) fn findings(status: &Status) -> Vec<Finding> {
         let names = nodes.unregistered_nodes.iter().map(ToString::to_string);
         let names: Vec<_> = names.collect();
         let what = format!(
-            "{} died, and rosrescue unregistered them: {}",
+            "{} died, now unregistered: {}",
             counted(names.len(), "node"),
             some(&names)
         );

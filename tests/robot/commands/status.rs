@@ -58,7 +58,7 @@ fn nodes_that_died_come_before_everything_else() {
         State::try_read(&robot.client()).is_ok_and(|state| !state.knows("/dead"))
     });
     let after = status();
-    let said = "1 node died, and rosrescue unregistered them: /dead since 2";
+    let said = "1 node died, now unregistered: /dead since 2";
     assert!(after.stdout.starts_with("NODES DIED, since "), "{after:?}");
     assert!(after.stdout.contains(said), "{after:?}");
     let _again = robot.node(Library::Rospy, "talker", &["__name:=dead"]);

@@ -51,7 +51,8 @@ fn rescues_before_a_death_of_rosrescue_are_still_reported(mode: Mode) {
     let run = |robot: &Robot, words: &[&str]| {
         Tool::rosrescue(&robot.scratch, robot.port(), words).ended(0)
     };
-    let status = run(&robot, &["status"]);
+    // The dead node is a reason to look.
+    let status = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(1);
     assert!(status.contains(", died 2 times, guarded by"), "{status}");
     assert!(status.contains("rescues     3, the last:\n3  "), "{status}");
     let get = crate::support::page(&robot.client(), "/metrics");
