@@ -2,7 +2,11 @@
 
 mod computers;
 
-use std::{collections::BTreeMap, net::IpAddr, time::Instant};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    net::IpAddr,
+    time::Instant,
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -263,9 +267,16 @@ fn count(nodes: &[IllNode]) -> String {
     }
 }
 
-/// The names of nodes, each with the time since when it has been ill.
+/// The names of nodes, each with the time since when it has been ill. A time that is the same for all stands once.
 fn listed(nodes: &[IllNode]) -> String {
-    some(&nodes.iter().map(ToString::to_string).collect::<Vec<_>>())
+    let times: BTreeSet<_> = nodes.iter().map(|it| clock::wall_text(it.since)).collect();
+    match times.first().filter(|_| times.len() == 1) {
+        Some(time) => {
+            let names: Vec<_> = nodes.iter().map(|it| it.node.clone()).collect();
+            format!("{} since {time}", some(&names))
+        }
+        None => some(&nodes.iter().map(ToString::to_string).collect::<Vec<_>>()),
+    }
 }
 
 /// Derives the condition from the situation and the facts.
@@ -548,7 +559,9 @@ mod tests {
         assert!(all.since < 1e9 + 1.0, "{all:?}");
         let line = all.line();
         assert!(
-            line.starts_with("NODES DIED: 2 nodes died without unregistering: /base since 2001-"),
+            line.starts_with(
+                "NODES DIED: 2 nodes died without unregistering: /base, /arm since 2001-"
+            ),
             "{line}"
         );
         for part in [
