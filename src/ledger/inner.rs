@@ -107,7 +107,12 @@ impl Inner {
             Some(calls) => {
                 for (api, subject, call) in calls {
                     let port = port_of(&api);
-                    self.order.notify(now, port, subject, call);
+                    match standing_in {
+                        // A living master may still have older notifications to send, among them those of the write
+                        // that made this one redundant. `Order` tells a state only after them.
+                        Some(false) => self.order.tell_state(port, subject),
+                        _ => self.order.notify(now, port, subject, call),
+                    }
                     outbox_changed.notify_one();
                 }
             }

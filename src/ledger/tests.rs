@@ -1,10 +1,11 @@
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use super::activity::NOTICE_MEMORY;
 use super::answers::UNCHANGED_PENDING_MAX;
 use super::*;
 use crate::{
     checkpoint::{format, store::StoreError},
+    order::NextNotification,
     xmlrpc::{Call, Value},
 };
 
@@ -219,6 +220,37 @@ fn an_unregistration_without_effect_is_left_to_the_master() {
     assert!(ledger.answer_if_unchanged(now, &delete).is_none());
     let watches = Request::multicall([watch.clone(), watch]);
     assert!(ledger.answer_if_unchanged(now, &watches).is_some());
+}
+
+/// A write that the master has just answered changes nothing when the mirror answers it once more, because its answer
+/// waited for the disk. The master may still have to send an older value.
+#[test]
+fn a_write_that_changes_nothing_tells_nodes_nothing_before_the_master_has() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let set = |value: i32| {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/w"), "/a".into(), value.into()],
+        )
+    };
+    let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    for write in [&watch, &set(1), &set(2)] {
+        let reply = ledger.with_mirror(|mirror| answered(write, &mut mirror.clone()));
+        ledger.record_here(now, 0, &[(write, &reply)]).unwrap();
+    }
+    assert!(ledger.answer_if_unchanged(now, &set(2)).is_some());
+    let next = |at| {
+        ledger.with_order(|order, mirror| {
+            order.repeat(at);
+            order.next(at, "http://n:1", mirror)
+        })
+    };
+    assert_eq!(next(now), NextNotification::Idle);
+    assert!(matches!(
+        next(now + Duration::from_secs(1)),
+        NextNotification::Send { .. }
+    ));
 }
 
 /// Loggers repeat parameter subscriptions all the time, so these use no memory and do not outdate a prepared injection.
