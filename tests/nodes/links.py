@@ -17,6 +17,7 @@ import os
 import sys
 import threading
 import time
+import traceback
 
 import rospy
 import rospy.impl.masterslave
@@ -102,6 +103,8 @@ def main():
         if os.fork() == 0:
             try:
                 run(folder, name, ends)
+            except BaseException:  # pylint: disable=broad-except
+                traceback.print_exc()
             finally:
                 os._exit(1)
     say("loaded")

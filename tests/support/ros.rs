@@ -231,10 +231,12 @@ fn compile(folder: &Path) {
         );
         fs::rename(half, node).unwrap();
     }
-    // roslaunch finds a node by its package, which is this folder.
+    // roslaunch finds a node by its package, which is this folder. Nodes of another test process may read this file now.
     let package = fs::read_to_string(Path::new(NODES).join("package.xml")).unwrap();
     let package = package.replace("rosrescue_nodes", "rosrescue_cpp_nodes");
-    fs::write(folder.join("package.xml"), package).unwrap();
+    let half = folder.join("package.xml.half");
+    fs::write(&half, package).unwrap();
+    fs::rename(half, folder.join("package.xml")).unwrap();
 }
 
 fn roscpp_flags() -> Vec<String> {
