@@ -133,6 +133,8 @@ pub(crate) struct Start {
     pub(crate) went_back: Vec<String>,
     /// The time until the last node had registered.
     pub(crate) time: Duration,
+    /// The output of rosrescue, if links are missing or wrong.
+    pub(crate) log: String,
 }
 
 impl Start {
@@ -149,9 +151,10 @@ impl Start {
         ] {
             assert!(
                 found.is_empty(),
-                "{what}: {}\n{}",
+                "{what}: {}\n{}\n{}",
                 found.len(),
-                found.join("\n")
+                found.join("\n"),
+                self.log
             );
         }
     }
@@ -365,6 +368,10 @@ pub(crate) fn start(place: Place, plan: &Plan, seed: u64) -> Start {
     if wants.len() != plan.links {
         wrong.push(format!("the state has {} links:\n{state}", wants.len()));
     }
+    let log = match wants == has {
+        true => String::new(),
+        false => stage.log(),
+    };
     let first = nodes
         .iter()
         .map(|node| node.begin)
@@ -384,6 +391,7 @@ pub(crate) fn start(place: Place, plan: &Plan, seed: u64) -> Start {
         overtaken: traces.older("answer"),
         went_back: traces.older("update"),
         time: Duration::from_secs_f64(last - first),
+        log,
     }
 }
 

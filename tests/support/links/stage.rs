@@ -109,6 +109,16 @@ impl Stage {
         }
     }
 
+    /// The output of each rosrescue.
+    pub(super) fn log(&self) -> String {
+        match self {
+            Self::Bare(..) => String::new(),
+            Self::Robot(robot, _) => robot.rescue.log(),
+            Self::Kills(rescue, ..) => rescue.log(),
+            Self::Follower(computers, ..) => computers.iter().map(|it| it.log()).collect(),
+        }
+    }
+
     /// The port that nodes use.
     pub(super) fn port(&self) -> u16 {
         match self {
