@@ -7,7 +7,7 @@ use rustix::process::Signal;
 use crate::chance::Chance;
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, TAKEOVER, TTL, victim};
-use crate::support::{Library, PATIENCE, eventually, holds, params};
+use crate::support::{Control, Library, PATIENCE, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
 use crate::{rounds, turn};
 
@@ -40,7 +40,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
         await_param(&fleet, &contested, 1);
         traffic.await_writes(&[0, 1, 2]);
         sleep(chance.time(Duration::from_secs(1)));
-        let (mark, begin) = (fleet.mark(), Instant::now());
+        let (mark, begin, control) = (fleet.mark(), Instant::now(), Control::start());
         fleet.network.cut_cable(cut);
         let next = fleet.await_leader_of(&rest);
         let led = begin.elapsed();
@@ -78,7 +78,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
         // TCP takes a while to resume after a cable was mended. A read waits for the next leader if the follower's
         // mirror lacks the last record that the dead leader announced. The members of etcd learn from etcd's leader
         // that a record is committed, and that leader may have been cut off too.
-        let limit = TTL + TAKEOVER;
+        let limit = control.allows(TTL + TAKEOVER);
         assert!(
             led < limit && write < limit && read < limit,
             "longest read {read:?}, write {write:?}"

@@ -1,5 +1,6 @@
 //! Tests with three simulated computers, each with an etcd, a rosrescue and nodes: network namespaces on one switch.
-//! Computers are killed and cut off. Two tests run at once, because each keeps a processor busy. They need root.
+//! Computers are killed and cut off. Two tests run at once for each core, because each needs a third of a core and waits
+//! most of the time. They need root.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,10 +9,8 @@
     reason = "a test"
 )]
 
-use std::sync::{
-    Mutex, MutexGuard, PoisonError,
-    atomic::{AtomicUsize, Ordering},
-};
+use std::sync::{Condvar, Mutex, PoisonError};
+use std::thread;
 
 #[path = "../support/mod.rs"]
 mod support;
@@ -50,13 +49,28 @@ mod starts;
 /// Tests of the simulated computers themselves.
 mod wiring;
 
-/// Waits for one of two turns, which the tests take alternately. A test does this first, so that its turn ends after
-/// everything that it started has ended.
-fn turn() -> MutexGuard<'static, ()> {
-    static TESTS: AtomicUsize = AtomicUsize::new(0);
-    static TURNS: [Mutex<()>; 2] = [const { Mutex::new(()) }; 2];
-    let turn = &TURNS[TESTS.fetch_add(1, Ordering::Relaxed) % TURNS.len()];
-    turn.lock().unwrap_or_else(PoisonError::into_inner)
+/// Number of tests that run now.
+static RUNNING: Mutex<usize> = Mutex::new(0);
+static ENDED: Condvar = Condvar::new();
+
+/// The turn of a test. It ends on drop.
+struct Turn;
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        *RUNNING.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        ENDED.notify_one();
+    }
+}
+
+/// Waits until another test may run. A test does this first, so that its turn ends after everything that it started has
+/// ended.
+fn turn() -> Turn {
+    let most = 2 * thread::available_parallelism().map_or(1, usize::from);
+    let running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
+    let running = ENDED.wait_while(running, |running| *running >= most);
+    *running.unwrap_or_else(PoisonError::into_inner) += 1;
+    Turn
 }
 
 /// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.
