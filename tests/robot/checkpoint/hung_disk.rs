@@ -2,7 +2,7 @@
 //! wait for a limited time, and recording resumes when the disk answers.
 
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::support::{
     Client, FailingDisk, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, Trouble, eventually,
@@ -26,21 +26,21 @@ fn assert_reads_go_on<T: Send + 'static>(
     client: &Client,
     write: impl FnOnce() -> T + Send + 'static,
 ) -> T {
-    let begun = Instant::now();
     let write = thread::spawn(write);
     let mut rounds = 0;
-    loop {
-        let over = write.is_finished();
-        within(SOON, "a parameter", || client.param("/before").unwrap());
-        within(SOON, "the state", || State::read(client));
-        within(SOON, "the status", || status(client));
-        rounds += 1;
-        if over {
-            break;
+    within(LATE, "a write", || {
+        loop {
+            let over = write.is_finished();
+            within(SOON, "a parameter", || client.param("/before").unwrap());
+            within(SOON, "the state", || State::read(client));
+            within(SOON, "the status", || status(client));
+            rounds += 1;
+            if over {
+                break;
+            }
         }
-    }
-    let taken = begun.elapsed();
-    assert!(taken < LATE && rounds > 3, "{rounds} rounds in {taken:?}");
+    });
+    assert!(rounds > 1, "no read is answered during the write");
     write.join().unwrap()
 }
 

@@ -14,6 +14,7 @@ use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
 const PROGRAM: &str = "http10_rosmaster.py";
+const START_LIMIT: Duration = Duration::from_secs(5);
 
 in_both_modes!(
     a_healthy_http_1_0_master_is_left_alone,
@@ -59,14 +60,19 @@ fn assert_exact(client: &Client, bare: &Client) {
     assert_eq!(client.param("/unreadable"), Some(Value::Int(5)));
 }
 
-/// `core` gives a master 30 s to become usable.
+/// `core` gives a master a while to become usable.
 fn a_healthy_http_1_0_master_is_left_alone(mode: Mode) {
-    let robot = Robot::start_under(mode, PROGRAM, &[]);
+    let limit = format!("{}", START_LIMIT.as_secs());
+    let options = match mode {
+        Mode::Core => vec!["--start-limit", &limit],
+        Mode::Proxy => Vec::new(),
+    };
+    let robot = Robot::start_under_with(mode, PROGRAM, &[], &options);
     let pid = robot.master_pid();
     assert_exact(&robot.client(), &robot.bare());
     let mut number = 0;
     assert!(
-        holds(Duration::from_secs(40), || {
+        holds(2 * START_LIMIT, || {
             number += 1;
             robot.client().set_param("/number", number);
             let kept = robot.client().param("/number") == Some(Value::Int(number));
