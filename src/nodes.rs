@@ -38,7 +38,11 @@ use self::{
 use crate::{
     gate::{self, State},
     health::{Repeats, Unreachable, port_of},
-    ledger::{Ledger, activity::NotifyingChange},
+    ledger::{
+        Ledger,
+        activity::NotifyingChange,
+        owed::{Queued, Telling},
+    },
     limit::rarely,
     order::Subject,
     resolver,
@@ -50,10 +54,6 @@ use crate::{
 /// How long the master must be away before rosrescue sends the notifications that the master may not have sent. Most
 /// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
-
-/// Delay before a restarted rosrescue that adopts a living master sends the notifications that the dead rosrescue may not
-/// have sent. By then the master has sent its own, unless it has a long backlog.
-const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
 /// Maximum number of nodes that are remembered because they do not answer `paramUpdate`.
 const MUTE_MOST: usize = 1024;
@@ -272,7 +272,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
                 let again = nodes.ledger.with_order(|order, _| order.master_is_away(now));
                 (owed_at, owed_told) = (again.map(Into::into), again.is_none());
                 if owed_told {
-                    notify_owed(&nodes, now);
+                    notify_owed(&nodes, now, Telling::Now);
                 }
             }
             () = wait::until(next) => ask_unreachable(&nodes),
@@ -308,74 +308,26 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<NotifyingChange>) {
     }
 }
 
-/// Takes the topics and parameters whose notifications may not have been sent by the master that was lost at `outage`.
+/// Sends the notifications that may not have been sent by the master that was lost at `outage`. Returns their topics.
 /// Also begins to shut down nodes whose names other nodes have taken, if that master may have died before it asked them
 /// to.
-fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
-    let owed = nodes
-        .ledger
-        .with_activity(|_, activity| activity.take_owed(outage));
-    for displaced in owed.displaced {
+pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant, telling: Telling) -> Vec<String> {
+    let Queued { topics, displaced } = nodes.ledger.queue_owed(Instant::now(), outage, telling);
+    for displaced in displaced {
         notifications::shut_down(nodes, displaced);
     }
-    (owed.topics, owed.params)
-}
-
-/// Sends the notifications that may not have been sent by the master that was lost at `outage`. Returns their topics.
-pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
-    let (mut topics, params) = take_owed(nodes, outage);
-    topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
-    for (api, key) in params {
-        notifications::tell(nodes, &api, Subject::Param(key.to_string()));
-    }
+    notifications::send_waiting(nodes);
     topics
 }
 
-/// Sends, after [`ADOPTED_AFTER`], the notifications that an earlier rosrescue may not have sent before it died.
-/// Returns their topics.
-///
-/// Nodes get the present state last, because the master lives and may still be sending older notifications.
-pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
-    let (mut topics, params) = take_owed(nodes, outage);
-    let at = Instant::now() + ADOPTED_AFTER;
-    nodes.ledger.with_order(|order, mirror| {
-        topics.retain(|topic| {
-            let subscribers = mirror.subscribers_of(topic);
-            for api in &subscribers {
-                order.tell_state_at(at, port_of(api), Subject::Topic(topic.clone()));
-            }
-            !subscribers.is_empty()
-        });
-        for (api, key) in params {
-            order.tell_state_at(at, port_of(&api), Subject::Param(key.to_string()));
-        }
-    });
-    topics
-}
-
-/// Tells all subscribers the state: an earlier rosrescue of this session has ended, and may have owed them notifications.
-/// They are told again after [`ADOPTED_AFTER`], because a slow node may read an older notification of that rosrescue
-/// later than this one. Also begins to shut down nodes whose names other nodes have taken.
+/// Tells all subscribers the state: an earlier rosrescue of this session has ended, and may have owed them
+/// notifications. Also begins to shut down nodes whose names other nodes have taken.
 pub(crate) fn notify_after_restart(nodes: &Arc<Nodes>) {
     let now = Instant::now();
     nodes
         .ledger
         .with_activity(|mirror, activity| activity.notice_all(mirror, now));
-    let (topics, params) = take_owed(nodes, now);
-    let again = now + ADOPTED_AFTER;
-    nodes.ledger.with_order(|order, mirror| {
-        let topics = topics.into_iter().flat_map(|topic| {
-            let subscribers = mirror.subscribers_of(&topic).into_iter();
-            subscribers.map(move |api| (api, Subject::Topic(topic.clone())))
-        });
-        let params = params.into_iter();
-        let params = params.map(|(api, key)| (api, Subject::Param(key.to_string())));
-        for (api, subject) in topics.chain(params) {
-            order.tell_state(port_of(&api), subject.clone());
-            order.tell_state_at(again, port_of(&api), subject);
-        }
-    });
-    notifications::send_waiting(nodes);
+    notify_owed(nodes, now, Telling::Twice);
 }
 
 fn tell(nodes: &Arc<Nodes>, change: NotifyingChange) {

@@ -28,6 +28,7 @@ use crate::{
         judge_refusal, port_of,
     },
     ledger::activity::LastCalls,
+    ledger::owed::Telling,
     master::{self, CALLER_ID, Kind, Method, Request, question},
     replay::Token,
     resolver,
@@ -68,19 +69,20 @@ pub(crate) async fn after_recovery(
     let incarnation = nodes.ledger.incarnation();
     // Queued calls come first, because they are newer than a node's answers.
     barrier(&nodes).await;
-    let mut notified = match outcome {
+    let telling = match outcome {
         // This master notifies nodes itself, but the previous rosrescue may have died while it
         // stood in for another master.
-        RecoveryOutcome::Adopted => super::notify_later(&nodes, outage),
+        RecoveryOutcome::Adopted => Telling::Later,
+        // The master may send outdated notifications now.
         RecoveryOutcome::Reconciled => {
-            // The master may send outdated notifications now.
             nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
-            super::notify_owed(&nodes, outage)
+            Telling::Now
         }
-        _ => super::notify_owed(&nodes, outage),
+        _ => Telling::Now,
     };
+    let mut notified = super::notify_owed(&nodes, outage, telling);
     notified.sort();
     let visits = begin_visits(&nodes);
     drop(waiting);

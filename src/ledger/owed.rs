@@ -1,0 +1,64 @@
+//! The notifications that a lost master may not have sent.
+
+use std::time::{Duration, Instant};
+
+use super::{Ledger, activity::Owed};
+use crate::{health::port_of, master::Displaced, order::Subject};
+
+/// How long a master that lives may still send old notifications after it has answered again, if nothing is known of its
+/// backlog.
+pub(crate) const BACKLOG: Duration = Duration::from_secs(1);
+
+/// When nodes get the notifications that they may lack.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Telling {
+    /// Now. The master that may not have sent them is dead.
+    Now,
+    /// Now, and once more after [`BACKLOG`]. The master that may not have sent them lives, or an earlier rosrescue was
+    /// sending some, so nodes may read older notifications after these.
+    Twice,
+    /// After [`BACKLOG`]. A living master is probably sending them.
+    Later,
+}
+
+/// The notifications that have been queued.
+#[derive(Debug, Default)]
+pub(crate) struct Queued {
+    /// The topics of which subscribers are notified.
+    pub(crate) topics: Vec<String>,
+    /// Nodes that must shut down, because the lost master may have died before it asked them to.
+    pub(crate) displaced: Vec<Displaced>,
+}
+
+impl Ledger {
+    /// Queues the state of each topic and parameter whose notifications may not have been sent by the master that was
+    /// lost at `outage`.
+    pub(crate) fn queue_owed(&self, now: Instant, outage: Instant, telling: Telling) -> Queued {
+        let Owed {
+            mut topics,
+            params,
+            displaced,
+        } = self.with_activity(|_, activity| activity.take_owed(outage));
+        self.with_order(|order, mirror| {
+            let mut tell = |api: &str, subject: Subject| {
+                if telling != Telling::Later {
+                    order.tell_state(port_of(api), subject.clone());
+                }
+                if telling != Telling::Now {
+                    order.tell_state_at(now + BACKLOG, port_of(api), subject);
+                }
+            };
+            topics.retain(|topic| {
+                let subscribers = mirror.subscribers_of(topic);
+                for api in &subscribers {
+                    tell(api, Subject::Topic(topic.clone()));
+                }
+                !subscribers.is_empty()
+            });
+            for (api, key) in params {
+                tell(&api, Subject::Param(key.to_string()));
+            }
+        });
+        Queued { topics, displaced }
+    }
+}
