@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::{sync::Notify, task::JoinHandle};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
@@ -77,7 +77,6 @@ enum News {
 pub(crate) struct Driver {
     examiner: Examiner,
     write_queue: WriteQueue,
-    slow: Arc<Notify>,
     nodes: Arc<Nodes>,
     board: Arc<Board>,
     lifecycle: Lifecycle,
@@ -105,12 +104,10 @@ pub(crate) struct Driver {
 }
 
 impl Driver {
-    /// Creates a driver that examines masters with `examiner` and starts them with `process`. `slow` signals that the
-    /// master takes too long to answer a call.
+    /// Creates a driver that examines masters with `examiner` and starts them with `process`.
     pub(crate) fn new(
         examiner: Examiner,
         write_queue: WriteQueue,
-        slow: Arc<Notify>,
         nodes: Arc<Nodes>,
         board: Arc<Board>,
         process: Option<MasterProcess>,
@@ -125,7 +122,6 @@ impl Driver {
             outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
             examiner,
             write_queue,
-            slow,
             nodes,
             board,
             process,
@@ -303,7 +299,7 @@ impl Driver {
                 () = self.write_queue.lost() => return Input::BatchLost,
                 () = self.write_queue.late_answered() => return Input::LateAnswered,
                 () = self.write_queue.late() => return Input::Late,
-                () = self.slow.notified() => return Input::Slow,
+                () = self.write_queue.slow() => return Input::Slow,
                 () = wait::until(self.probe_deadline) => {
                     let late = self.probe_deadline.take().map(|at| at.elapsed());
                     self.timers_late += late.unwrap_or_default();

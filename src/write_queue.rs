@@ -3,9 +3,11 @@
 //! mirror answers the queued writes in the same order.
 
 pub(crate) mod batch;
+mod dispatcher;
 mod drain;
 mod evict;
 mod merge;
+pub(crate) mod mutant;
 mod outdated;
 pub(crate) mod parts;
 mod resync;
@@ -18,7 +20,10 @@ use tokio::{
     time::Instant,
 };
 
-use self::batch::{CallAnswer, Item, Precondition};
+use self::{
+    batch::{CallAnswer, Item, Precondition},
+    dispatcher::Dispatcher,
+};
 pub(crate) use self::{drain::Drain, evict::MoveJudge};
 use crate::{
     checkpoint::format::Origin,
@@ -108,6 +113,16 @@ impl WriteQueue {
         self.signals.has_answered.notified().await;
     }
 
+    /// Notes that the master takes too long to answer a read.
+    pub(crate) fn report_slow(&self) {
+        self.signals.slow.notify_one();
+    }
+
+    /// Waits until the master takes too long to answer a call.
+    pub(crate) async fn slow(&self) {
+        self.signals.slow.notified().await;
+    }
+
     /// Sets how long writes wait for the master.
     pub(crate) fn set_patience(&self, patience: Patience) {
         self.signals.patience.send_replace(patience);
@@ -122,6 +137,8 @@ struct Signals {
     lost: Notify,
     is_late: Notify,
     has_answered: Notify,
+    /// Signals that the master takes too long to answer a call.
+    slow: Notify,
 }
 
 /// Creates a write queue and its worker. `resync_interval` is the pause between two comparisons of master and mirror;
@@ -138,22 +155,20 @@ pub(crate) fn write_queue(
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
     let signals = Arc::new(Signals {
-        patience: watch::Sender::new(patience),
+        patience: watch::Sender::new(patience.clone()),
         lost: Notify::new(),
         is_late: Notify::new(),
         has_answered: Notify::new(),
+        slow: Notify::new(),
     });
     let (tell_sent, sent) = watch::channel(None);
-    let link = Link {
-        ledger,
-        upstream,
-        judge,
-    };
+    let dispatcher = Dispatcher::new(ledger.clone(), judge, stats, patience);
+    let link = Link { ledger, upstream };
     let drain = Drain::new(
+        dispatcher,
         rx,
         link,
         gate,
-        stats,
         resync_interval,
         signals.clone(),
         tell_sent,
@@ -171,7 +186,6 @@ pub(crate) fn write_queue(
 struct Link {
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
-    judge: Arc<dyn MoveJudge>,
 }
 
 #[cfg(test)]

@@ -6,10 +6,7 @@ use std::{
     time::Duration,
 };
 
-use tokio::{
-    sync::Notify,
-    task::{JoinError, JoinHandle},
-};
+use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
@@ -32,7 +29,6 @@ pub(super) struct Context {
     pub(super) gate_tx: gate::Tx,
     pub(super) gate: gate::Rx,
     pub(super) write_queue: WriteQueue,
-    pub(super) slow: Arc<Notify>,
     pub(super) nodes: Arc<Nodes>,
     pub(super) served: Served,
     pub(super) board: Arc<Board>,
@@ -61,7 +57,6 @@ impl Context {
                 stats: self.stats,
             },
             self.write_queue.clone(),
-            Arc::clone(&self.slow),
             self.nodes.clone(),
             self.board.clone(),
             process,

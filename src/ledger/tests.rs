@@ -405,7 +405,7 @@ async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     // A node repeats a write after the previous leader had recorded it and died before the answer.
     let (_, mark) = ledger.stand_in(Instant::now(), &publish).unwrap();
     let safe = ledger.durable(ledger.to_await(mark).unwrap());
-    let safe = tokio::time::timeout(std::time::Duration::from_secs(5), safe).await;
+    let safe = tokio::time::timeout(Duration::from_secs(5), safe).await;
     assert_eq!(safe, Ok(true), "it waits for a record that nobody makes");
 }
 

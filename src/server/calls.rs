@@ -9,10 +9,7 @@ use std::{
 
 use bytes::Bytes;
 use thiserror::Error;
-use tokio::{
-    sync::{Mutex, Notify},
-    time::Sleep,
-};
+use tokio::{sync::Mutex, time::Sleep};
 
 use super::{
     admission,
@@ -98,8 +95,6 @@ pub struct Calls {
     /// Connections for reads.
     pub pool: Arc<Pool>,
     pub write_queue: WriteQueue,
-    /// Signals that the master takes too long to answer a call.
-    pub slow: Arc<Notify>,
     pub stats: &'static Stats,
     /// rosrescue's own address. It replaces the master's in replies.
     pub uri: String,
@@ -329,7 +324,7 @@ impl Calls {
                 .await
                 .is_err()
             {
-                self.slow.notify_one();
+                self.write_queue.report_slow();
                 return Delivery::of_read_now(&self.ledger, read?);
             }
         }
@@ -372,7 +367,7 @@ impl Calls {
                     let reply = match tokio::time::timeout_at(patience, &mut forwarding).await {
                         Ok(reply) => reply,
                         Err(_) => {
-                            self.slow.notify_one();
+                            self.write_queue.report_slow();
                             if let Some(reply) = self.stand_in(known_now).await {
                                 // The read continues, because its end shows that the master answers again.
                                 let pool = self.pool.clone();
@@ -494,47 +489,26 @@ impl Calls {
         call: Option<Arc<Request>>,
         incoming: Incoming,
     ) -> Result<AnswerAndDelivery, Unanswered> {
-        if self.gate.state() == State::Injecting
-            && let Some((reply, delivery)) = self.answer_if_unchanged(call.as_deref()).await
-        {
-            return Ok((CallAnswer::Made(reply), delivery));
-        }
-        let (mut item, mut answered) = Item::new(Some((head, body)), call.clone());
+        let is_answerable = call.as_deref().is_some_and(Request::is_answerable);
+        let (mut item, answered) = Item::new(Some((head, body)), call);
         (item.source, item.origin) = (incoming.source, incoming.origin);
+        item.patience = Some(self.patience().into_std());
         self.write_queue.submit(item).await;
-        let call = call.as_deref();
         let mut gate = self.gate.clone();
-        let mut held = std::pin::pin!(async {
-            let answerable = call.is_some_and(Request::is_answerable);
+        let held = async {
             loop {
                 gate.shut_for(self.hold).await;
                 // An injection ends by itself. If it fails, the mirror answers.
-                if !answerable || gate.state() != State::Injecting {
+                if !is_answerable || gate.state() != State::Injecting {
                     return;
                 }
             }
-        });
-        let mut patience = std::pin::pin!(tokio::time::sleep_until(self.patience()));
-        let mut patient = true;
-        loop {
-            tokio::select! {
-                answer = &mut answered => return answer.map_err(|_| Closed(UNANSWERED).into()),
-                () = &mut held => {
-                    self.stats.calls_unanswered.count();
-                    return Err(Closed(NOT_IN_TIME).into());
-                }
-                () = &mut patience, if patient => {
-                    if !self.gate.is_open() {
-                        // The gate may open later, and the master behind it may hang.
-                        patience.as_mut().reset(tokio::time::Instant::now() + PATIENCE);
-                        continue;
-                    }
-                    patient = false;
-                    self.slow.notify_one();
-                    if let Some((reply, delivery)) = self.answer_if_unchanged(call).await {
-                        return Ok((CallAnswer::Made(reply), delivery));
-                    }
-                }
+        };
+        tokio::select! {
+            answer = answered => answer.map_err(|_| Closed(UNANSWERED).into()),
+            () = held => {
+                self.stats.calls_unanswered.count();
+                Err(Closed(NOT_IN_TIME).into())
             }
         }
     }
@@ -547,22 +521,5 @@ impl Calls {
             return now;
         }
         self.write_queue.unanswered_since().unwrap_or(now) + PATIENCE
-    }
-
-    /// The mirror's answer to a write that changes nothing. `None` if it changes something.
-    async fn answer_if_unchanged(
-        &self,
-        call: Option<&Request>,
-    ) -> Option<(Reply, Option<Delivery>)> {
-        let call = call.filter(|call| call.is_answerable())?;
-        let (reply, mark, delivery) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
-        // The write that made this one redundant may not be recorded yet.
-        if let Some(mark) = self.ledger.to_await(mark)
-            && !self.ledger.durable(mark).await
-        {
-            return None;
-        }
-        self.stats.calls_without_master.count();
-        Some((reply, delivery))
     }
 }

@@ -40,7 +40,8 @@ pub(crate) struct Item {
     pub raw: Option<(Head, Bytes)>,
     /// The call. `None` if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
-    answer: oneshot::Sender<AnswerAndDelivery>,
+    /// Where the answer goes. `None` once the call has been answered while its batch is still in flight.
+    caller: Option<Caller>,
     /// The topics, parameters and node names that the call concerns, for the order in which nodes hear of them.
     concern: Concern,
     /// Tracks the answer on its way to the caller. Set once the call is on its way to the master, or the mirror has
@@ -55,6 +56,29 @@ pub(crate) struct Item {
     pub origin: Origin,
     /// Set for the writes of a computer that was cut off.
     pub(super) merge: Option<Merge>,
+    /// When the mirror answers the call if it changes nothing and the master has not answered. `None` if the mirror has
+    /// been asked already.
+    pub patience: Option<Instant>,
+    /// Set for a call that unregisters dead nodes before another one.
+    pub(super) evicted: Option<Evicted>,
+}
+
+/// Dead nodes that a call unregisters.
+#[derive(Debug)]
+pub(super) struct Evicted {
+    pub(super) nodes: Vec<String>,
+    /// The node that takes their names.
+    pub(super) by: String,
+}
+
+/// Somebody who waits for the answer to a call.
+#[derive(Debug)]
+pub(super) struct Caller(oneshot::Sender<AnswerAndDelivery>);
+
+impl Caller {
+    pub(super) fn reply(self, answer: CallAnswer, delivery: Option<Delivery>) {
+        let _ = self.0.send((answer, delivery));
+    }
 }
 
 /// An answer, and the handle to drop when the caller has the answer.
@@ -90,13 +114,15 @@ impl Item {
             concern: Concern::of(call.as_deref()),
             raw,
             call,
-            answer,
+            caller: Some(Caller(answer)),
             delivery: None,
             condition: None,
             way_made: false,
             source: Source::Here,
             origin: Origin::Rosrescue,
             merge: None,
+            patience: None,
+            evicted: None,
         };
         (item, answered)
     }
@@ -125,12 +151,34 @@ impl Item {
     }
 
     pub(super) fn reply(self, answer: CallAnswer) {
-        let _ = self.answer.send((answer, self.delivery));
+        self.log_eviction(&answer);
+        if let Some(caller) = self.caller {
+            caller.reply(answer, self.delivery);
+        }
+    }
+
+    /// Takes the caller, who gets an answer before the master's.
+    pub(super) fn take_caller(&mut self) -> Option<Caller> {
+        self.caller.take()
     }
 
     /// Whether the answer is no longer awaited: the call is answered, or its client has disconnected.
     pub(super) fn is_dropped(&self) -> bool {
-        self.answer.is_closed()
+        let caller = self.caller.as_ref();
+        self.evicted.is_none() && caller.is_none_or(|caller| caller.0.is_closed())
+    }
+
+    /// Logs the nodes that the call has unregistered, if it is an eviction and `answer` answers it.
+    pub(super) fn log_eviction(&self, answer: &CallAnswer) {
+        if let Some(Evicted { nodes, by }) = &self.evicted
+            && matches!(answer, CallAnswer::Raw(_) | CallAnswer::Made(_))
+        {
+            tracing::info!(
+                ?nodes,
+                by,
+                "unregistered dead nodes: their names belong to other nodes now"
+            );
+        }
     }
 
     /// Whether the call must stay behind all calls that were queued before it. A call that cannot be decoded may change

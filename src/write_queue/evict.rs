@@ -7,7 +7,7 @@
 
 use std::sync::Arc;
 
-use super::batch::{CallAnswer, Item};
+use super::batch::{Evicted, Item};
 use crate::{
     health::Eviction,
     ledger::Ledger,
@@ -37,19 +37,10 @@ impl MoveJudge for () {}
 
 /// The call that unregisters the nodes of `eviction`. `by` is the node that takes their port or name.
 pub(super) fn unregistration(eviction: Eviction, by: String) -> Item {
-    let (item, answered) = Item::new(None, Some(Arc::new(eviction.call)));
-    crate::task::spawn(async move {
-        if let Ok((CallAnswer::Raw(_) | CallAnswer::Made(_), _)) = answered.await {
-            say(&eviction.nodes, &by);
-        }
+    let (mut item, _) = Item::new(None, Some(Arc::new(eviction.call)));
+    item.evicted = Some(Evicted {
+        nodes: eviction.nodes,
+        by,
     });
     item
-}
-
-fn say(nodes: &[String], by: &str) {
-    tracing::info!(
-        ?nodes,
-        by,
-        "unregistered dead nodes: their names belong to other nodes now"
-    );
 }

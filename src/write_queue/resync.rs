@@ -1,9 +1,7 @@
 //! Schedules *inspections*, which read the master's whole state to compare it with the mirror. Pure: the time is an
 //! argument.
 
-use std::time::Duration;
-
-use tokio::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Pause after an inspection that failed.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);

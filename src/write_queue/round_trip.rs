@@ -23,6 +23,7 @@ pub(super) struct RoundTripResult {
     pub(super) result: Result<Received, RoundTripError>,
 }
 
+#[derive(Debug)]
 pub(super) enum Received {
     Reply(RawReply),
     /// The master's state.
@@ -43,12 +44,31 @@ pub(super) enum RoundTripError {
 }
 
 impl RoundTripError {
-    /// Whether the master may have run the request.
-    pub(super) fn may_have_run(&self) -> bool {
-        let is_unsent =
-            |error: &CallError| matches!(error, CallError::NotSent(_) | CallError::NotConnected(_));
-        matches!(self, Self::Call(error) if !is_unsent(error))
+    /// What the error means for the calls of the request.
+    pub(super) fn failure(&self) -> Failure {
+        match self {
+            Self::Connect(_) => Failure::NotConnected,
+            Self::Call(CallError::NotSent(_) | CallError::NotConnected(_)) => Failure::NotSent,
+            Self::Call(_) => Failure::MayHaveRun,
+            Self::Look(InspectError::NotAMaster(_)) => Failure::Unreadable,
+            Self::Look(_) => Failure::NotRead,
+        }
     }
+}
+
+/// What a failed request means.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Failure {
+    /// There is no connection to the right master.
+    NotConnected,
+    /// The master has not got the calls.
+    NotSent,
+    /// The master may have run the calls.
+    MayHaveRun,
+    /// The master's state could not be read.
+    NotRead,
+    /// The master lives, but its state cannot be read.
+    Unreadable,
 }
 
 /// Sends `request`, or without one reads the master's state. The future owns the connection, so dropping the future

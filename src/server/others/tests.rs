@@ -93,7 +93,6 @@ impl Computer {
             last_large: Default::default(),
             compared: Default::default(),
             write_queue,
-            slow: Arc::default(),
             stats,
             uri: OWN.to_owned(),
             hold: second,

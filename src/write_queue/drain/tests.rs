@@ -6,18 +6,23 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 
 use super::*;
-use crate::master::Method;
 use crate::{
     checkpoint::format::Session,
     cli::SyncPolicy,
-    gate::gate,
+    gate::{State, gate},
     health::port_of,
+    ledger::Ledger,
     lifecycle::Patience,
+    master::{Master, Method, Request},
     order::{NextNotification as Notification, REPEAT_AFTER, Subject},
     upstream::sentinel::Sentinel,
     upstream::{Head, test_master, verify::Verification},
-    write_queue::{WriteQueue, batch::AnswerAndDelivery, write_queue},
-    xmlrpc::{Value, encode_reply},
+    write_queue::{
+        WriteQueue,
+        batch::{AnswerAndDelivery, CallAnswer},
+        write_queue,
+    },
+    xmlrpc::{Reply, Value, encode_reply},
 };
 
 const SUBSCRIBER: &str = "http://a:1/";

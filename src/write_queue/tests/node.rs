@@ -10,6 +10,9 @@ use crate::{
     xmlrpc::{Call, Reply, Struct, Value},
 };
 
+/// When each parameter was first and last set to each value.
+pub(super) type Values = HashMap<(String, Option<i32>), (u64, u64)>;
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Library {
     Rospy,
@@ -43,9 +46,9 @@ pub(super) struct Node {
     subscribing: Option<String>,
     /// Notifications that wait for the mutex of roscpp.
     blocked: Vec<Call>,
-    /// For each parameter, when the value that arrived last was set.
+    /// For each parameter, when the value that arrived last was first set.
     arrived: BTreeMap<String, u64>,
-    gone_back: Vec<String>,
+    pub(super) gone_back: Vec<String>,
 }
 
 impl Node {
@@ -106,14 +109,14 @@ impl Node {
     }
 
     /// A notification arrives. `values` tells when each parameter had each value.
-    pub(super) fn arrives(&mut self, call: &Call, values: &HashMap<(String, Option<i32>), u64>) {
+    pub(super) fn arrives(&mut self, call: &Call, values: &Values) {
         let [_, subject, value] = call.params.as_slice() else {
             return;
         };
         let key = text(subject);
-        if let Some(time) = values.get(&(key.clone(), value.as_int())) {
-            let before = self.arrived.insert(key, *time);
-            if before.is_some_and(|before| before > *time) {
+        if let Some((first, last)) = values.get(&(key.clone(), value.as_int())) {
+            let before = self.arrived.insert(key, *first);
+            if before.is_some_and(|before| before > *last) {
                 let mistake = format!("{}: {subject:?} goes back to {value:?}", self.name);
                 self.gone_back.push(mistake);
             }
@@ -133,6 +136,22 @@ impl Node {
             }
             Thread::Main(call, reply) => self.answered(&call, &reply),
         }
+    }
+
+    /// The node's registrations that `state` lacks.
+    pub(super) fn lost_registrations(&self, state: &Master) -> Vec<String> {
+        let mut lost = Vec::new();
+        for topic in &self.published {
+            if !state.publishers_of(topic).contains(&self.api) {
+                lost.push(format!("{} does not publish {topic}", self.name));
+            }
+        }
+        for topic in self.topics.keys() {
+            if !state.subscribers_of(topic).contains(&self.api) {
+                lost.push(format!("{} does not subscribe to {topic}", self.name));
+            }
+        }
+        lost
     }
 
     fn notified(&mut self, call: &Call) {
@@ -193,7 +212,7 @@ impl Node {
 
     /// The node's beliefs that contradict `state`.
     pub(super) fn mistakes(&self, state: &Master) -> Vec<String> {
-        let mut mistakes = self.gone_back.clone();
+        let mut mistakes = Vec::new();
         for (topic, list) in &self.topics {
             let truth = state.publishers_of(topic);
             if *list != truth {

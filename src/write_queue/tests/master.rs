@@ -1,0 +1,169 @@
+//! A simulated rosmaster: it runs calls in order, and its notifier threads are sometimes late.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use super::*;
+use crate::master::Notice;
+
+/// A process of the master.
+pub(super) struct Process {
+    pub(super) state: Master,
+    /// The number in the token that rosrescue has set. `None` in a new master.
+    pub(super) incarnation: Option<u64>,
+    /// When it begins to listen.
+    pub(super) listens: u64,
+    /// Until when it does nothing.
+    pub(super) stopped: u64,
+    /// Requests that it has got and not run.
+    pub(super) running: u64,
+    /// Notifications by port. The first one is on its way until the node has taken it.
+    notices: BTreeMap<String, VecDeque<Notice>>,
+}
+
+impl Process {
+    pub(super) fn new(listens: u64) -> Self {
+        Self {
+            state: Master::default(),
+            incarnation: None,
+            listens,
+            stopped: 0,
+            running: 0,
+            notices: BTreeMap::new(),
+        }
+    }
+}
+
+impl World {
+    pub(super) fn stop_master(&mut self, time: u64) {
+        let until = self.now + time;
+        if let Some(master) = &mut self.master {
+            master.stopped = master.stopped.max(until);
+        }
+        self.print(|| format!("the master stops for {time} µs"));
+    }
+
+    /// The master runs a request, as soon as it goes on.
+    pub(super) fn master_gets(&mut self, life: u64, number: u64, body: Bytes) {
+        if !self.is_master(life) {
+            return;
+        }
+        let now = self.now;
+        let Some(master) = &mut self.master else {
+            return;
+        };
+        if now < master.stopped {
+            let time = master.stopped - now;
+            return self.after(time, Event::MasterGets(life, number, body));
+        }
+        master.running -= 1;
+        let received = match body.is_empty() {
+            true => Received::Held(Box::new(master.state.clone())),
+            false => {
+                let call = Request::from(xmlrpc::decode_call(&body).unwrap());
+                let reply = self.run(&call);
+                Received::Reply(RawReply {
+                    keeps_alive: true,
+                    status: StatusCode::OK,
+                    reason: None,
+                    headers: HeaderMap::new(),
+                    body: xmlrpc::encode_reply(&reply).into(),
+                })
+            }
+        };
+        let time = 50 + self.dice.below(1_000);
+        self.after(time, Event::Replied(number, received));
+    }
+
+    /// Lets the master run a call and notify nodes.
+    pub(super) fn run(&mut self, call: &Request) -> Reply {
+        self.print(|| format!("the master runs {call:?}"));
+        for call in call.calls() {
+            // The mirror has run the other ones already.
+            if self.waiting.iter().any(|waiting| waiting.call == *call) {
+                self.note_value(call);
+            }
+        }
+        let master = self.master.as_mut().unwrap();
+        let applied = master.state.apply(call);
+        let mut begun = Vec::new();
+        for notice in applied.notices {
+            let port = port_of(notice.to()).to_owned();
+            let queue = master.notices.entry(port.clone()).or_default();
+            queue.push_back(notice);
+            if queue.len() == 1 {
+                begun.push(port);
+            }
+        }
+        for port in begun {
+            let lead = 300 + self.dice.below(500);
+            let late = self.dice.one_in(10).then(|| self.dice.below(5_000));
+            let time = lead + late.unwrap_or(0);
+            self.after(time, Event::MasterNotifies(self.life, port));
+        }
+        applied.reply
+    }
+
+    pub(super) fn master_notifies(&mut self, port: String) {
+        let (now, life) = (self.now, self.life);
+        let master = self.master.as_ref().unwrap();
+        if now < master.stopped {
+            let time = master.stopped - now + self.scheduled();
+            return self.after(time, Event::MasterNotifies(life, port));
+        }
+        let call = master.notices[&port].front().unwrap().call();
+        self.print(|| format!("the master tells {port} {:?}", call.params));
+        let time = self.tell(&call, &port, 0);
+        self.after(time + 50, Event::TakenFromMaster(life, port));
+    }
+
+    pub(super) fn taken_from_master(&mut self, port: String) {
+        let life = self.life;
+        let queue = self
+            .master
+            .as_mut()
+            .unwrap()
+            .notices
+            .get_mut(&port)
+            .unwrap();
+        queue.pop_front();
+        if !queue.is_empty() {
+            let time = 100 + self.scheduled();
+            self.after(time, Event::MasterNotifies(life, port));
+        }
+    }
+
+    pub(super) fn dies(&mut self) {
+        if self.master.take().is_none() {
+            return;
+        }
+        self.print(|| "the master dies".to_owned());
+        let life = self.life;
+        let (ended, exited) = (self.dice.below(3_000), self.dice.below(6_000));
+        self.after(
+            ended,
+            Event::Recovery(recovery::Event::ConnectionEnds(life)),
+        );
+        self.after(exited, Event::Recovery(recovery::Event::Exits(life)));
+        self.break_request();
+    }
+
+    /// The connection of the request in flight ends. Its answer may have been sent before.
+    pub(super) fn break_request(&mut self) {
+        if let Some(number) = self.in_flight {
+            let time = self.dice.below(3_000);
+            self.after(time, Event::Broken(number, Failure::MayHaveRun));
+        }
+    }
+
+    pub(super) fn breaks(&mut self) {
+        if self.master.is_none() {
+            return;
+        }
+        self.print(|| "all connections to the master break".to_owned());
+        self.may_go_back = true;
+        let time = self.dice.below(3_000);
+        let event = recovery::Event::ConnectionEnds(self.life);
+        self.after(time, Event::Recovery(event));
+        self.break_request();
+    }
+}
