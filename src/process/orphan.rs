@@ -55,8 +55,12 @@ impl Rosmaster {
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
     /// rosmasters. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
+        self.claim(self.pid_file.last(), port)
+    }
+
+    /// See [`Self::claim_orphan`]. `last` is what the PID file says.
+    fn claim(&self, last: Last, port: Option<u16>) -> Option<Orphan> {
         let owner = &self.owner;
-        let last = self.pid_file.last();
         let all = match last {
             Last::Running { pid, .. } if is_in_our_network(pid) => vec![pid],
             Last::Running { .. } | Last::Ended => Vec::new(),
@@ -242,18 +246,16 @@ mod tests {
             rosout: false,
         };
         let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
-        let mut ended = Command::new("sleep").arg("60").spawn().unwrap();
-        rosmaster.pid_file.record(ended.id(), 1);
-        ended.kill().unwrap();
-        ended.wait().unwrap();
-        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
+        assert_eq!(rosmaster.claim(Last::Ended, Some(1)), None);
         assert!(Stat::of(orphan).is_some_and(Stat::is_alive), "not found");
 
-        rosmaster.pid_file.record(orphan, 1);
+        let last = Last::Running {
+            pid: orphan,
+            port: 1,
+        };
         let starting = Some(Orphan::Starting(orphan));
-        assert_eq!(rosmaster.claim_orphan(Some(1)), starting);
-        rosmaster.pid_file.remove();
-        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
+        assert_eq!(rosmaster.claim(last, Some(1)), starting);
+        assert_eq!(rosmaster.claim(Last::Unknown, Some(1)), None);
         while Stat::of(orphan).is_some_and(Stat::is_alive) {
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -271,6 +273,10 @@ mod tests {
             .unwrap();
         let own = std::process::id();
         let pid = starting.id();
+        // The kernel shows the command line a moment after the program has begun.
+        while !is_told(pid, port) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
         let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), is_told);
         assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
         assert_eq!(choose(port, &[pid]), None, "its port is taken");

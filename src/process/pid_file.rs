@@ -108,18 +108,18 @@ mod tests {
     fn a_process_is_found_as_long_as_it_runs() {
         let folder = tempfile::tempdir().unwrap();
         let file = PidFile::beside(&folder.path().join("checkpoint"), "sleep");
-        assert_eq!(file.last(), Last::Unknown, "there is no file");
+        assert_eq!(file.read(), Last::Unknown, "there is no file");
         let mut child = std::process::Command::new("sleep")
             .arg("60")
             .spawn()
             .unwrap();
         let pid = child.id();
         file.record(pid, 7);
-        assert_eq!(file.last(), Last::Running { pid, port: 7 });
+        assert_eq!(file.read(), Last::Running { pid, port: 7 });
         let whole = fs::read_to_string(&file.0).unwrap();
         let after = |text: String| {
             fs::write(&file.0, text).unwrap();
-            file.last()
+            file.read()
         };
         for half in ["", &whole[..whole.len() - 1], &whole[..3]] {
             assert_eq!(after(half.to_owned()), Last::Unknown, "{half}");
@@ -130,8 +130,8 @@ mod tests {
         assert_eq!(after(whole), Last::Running { pid, port: 7 });
         child.kill().unwrap();
         child.wait().unwrap();
-        assert_eq!(file.last(), Last::Ended);
+        assert_eq!(file.read(), Last::Ended);
         file.remove();
-        assert_eq!(file.last(), Last::Unknown);
+        assert_eq!(file.read(), Last::Unknown);
     }
 }
