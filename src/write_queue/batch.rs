@@ -71,7 +71,7 @@ pub(super) struct Evicted {
     pub(super) by: String,
 }
 
-/// Somebody who waits for the answer to a call.
+/// A task that waits for the answer to a call.
 #[derive(Debug)]
 pub(super) struct Caller(oneshot::Sender<AnswerAndDelivery>);
 
