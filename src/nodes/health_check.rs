@@ -74,13 +74,13 @@ pub(crate) async fn after_recovery(
         // stood in for another master.
         RecoveryOutcome::Adopted => Telling::Later,
         // The master may send outdated notifications now.
-        RecoveryOutcome::Reconciled => {
+        RecoveryOutcome::Reconciled | RecoveryOutcome::Resumed => {
             nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
-            Telling::Now
+            Telling::Twice
         }
-        _ => Telling::Now,
+        RecoveryOutcome::Begun | RecoveryOutcome::Injected => Telling::Now,
     };
     let mut notified = super::notify_owed(&nodes, outage, telling);
     notified.sort();

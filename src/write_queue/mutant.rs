@@ -4,8 +4,10 @@
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mutant {
     /// Nothing waits for answers or notifications under way, as before decision 31.
+    #[cfg(test)]
     NoOrder,
     /// No state is told again.
+    #[cfg(test)]
     NoRepeats,
     /// A batch whose answer was lost is sent again before it is known whether its master lives.
     SendsAfterLoss,
@@ -13,7 +15,9 @@ pub(crate) enum Mutant {
     KeepsConnection,
     /// It is forgotten about what a late master notifies nodes once it goes on.
     ForgetsLateNews,
-    /// What the mirror answered while the master was away counts as told to nodes.
+    /// A living master that was silent is not expected to send old notifications.
+    TellsOnce,
+    /// What a lost master may not have told nodes is forgotten.
     OwesNothing,
 }
 

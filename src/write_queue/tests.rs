@@ -678,6 +678,7 @@ fn each_rule_is_needed() {
         Mutant::SendsAfterLoss,
         Mutant::KeepsConnection,
         Mutant::ForgetsLateNews,
+        Mutant::TellsOnce,
         Mutant::OwesNothing,
     ] {
         let found = mistake(Some(mutant), 0, 20_000);
