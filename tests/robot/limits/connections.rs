@@ -4,7 +4,7 @@
 use std::fs;
 use std::process::Command;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, Mode, PATIENCE, Process, Rescue, Robot, Scratch, Setup, Wire, behind, encode_call,
@@ -37,9 +37,10 @@ fn ticks(process: &Process) -> u64 {
 /// Panics if the process uses more than a fifth of a core during `span`.
 #[track_caller]
 fn assert_calm(process: &Process, span: Duration) {
-    let before = ticks(process);
+    let (start, before) = (Instant::now(), ticks(process));
     thread::sleep(span);
     let used = Duration::from_millis(10 * (ticks(process) - before));
+    let span = start.elapsed();
     assert!(used < span / 5, "{used:?} of the processor within {span:?}");
 }
 

@@ -77,26 +77,32 @@ impl Drop for Host {
     }
 }
 
-/// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the number of connections
-/// before that, and for each of `windows` the number within that many seconds after the recovery.
+/// A number of connections, and the time in which they were made.
+type Connections = (usize, Duration);
+
+/// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the connections before that,
+/// and for each of `windows` those within that many seconds after the recovery, or within more on a busy computer.
 fn connections<const N: usize>(
     robot: &mut Robot,
     host: &Host,
     count: usize,
     windows: [u64; N],
-) -> (usize, [usize; N]) {
+) -> (Connections, [Connections; N]) {
+    let since = |start: Instant, seconds| {
+        thread::sleep(Duration::from_secs(seconds).saturating_sub(start.elapsed()));
+        let count = host.since(start);
+        (count, start.elapsed())
+    };
     let start = Instant::now();
     host.register(&robot.client(), count);
-    thread::sleep(Duration::from_secs(5).saturating_sub(start.elapsed()));
-    let before = host.since(start);
+    let before = since(start, 5);
     robot.crash_master();
     let start = Instant::now();
-    let after = windows.map(|seconds| {
-        thread::sleep(Duration::from_secs(seconds).saturating_sub(start.elapsed()));
-        host.since(start)
-    });
+    let after = windows.map(|seconds| since(start, seconds));
     let ports = host.ports.len();
-    println!("{count} names at {ports} ports: {before} connections, {after:?} after {windows:?} s");
+    println!(
+        "{count} names at {ports} ports: {before:?} connections, {after:?} after {windows:?} s"
+    );
     (before, after)
 }
 
@@ -104,11 +110,11 @@ fn connections<const N: usize>(
 fn names_at_one_port_share_a_visit() {
     let mut robot = Robot::start(Mode::Core);
     let host = Host::with_ports(1);
-    let (before, after) = connections(&mut robot, &host, 2000, [2, 12]);
+    let ((before, _), [(soon, _), (later, _)]) = connections(&mut robot, &host, 2000, [2, 12]);
     // One question for names that register together, one visit after the recovery, and further ones after 1,
     // 3 and 7 s.
     assert!(before <= 20, "{before}");
-    assert!(after[0] <= 4 && after[1] <= 10, "{after:?}");
+    assert!(soon <= 4 && later <= 10, "{soon}, {later}");
     let unreachable = names(&robot.status().unwrap()["unreachable"]).len();
     assert_eq!(unreachable, 2000);
     // One refused connection counts for all names.
@@ -124,7 +130,8 @@ fn names_at_one_port_share_a_visit() {
 fn all_ports_of_a_host_share_one_rate_limit() {
     let mut robot = Robot::start(Mode::Core);
     let host = Host::with_ports(1200);
-    let (before, after) = connections(&mut robot, &host, 1200, [2]);
-    assert!(before <= 900, "{before}");
-    assert!(after[0] <= 700, "{after:?}");
+    let (before, [after]) = connections(&mut robot, &host, 1200, [2]);
+    let most = |time: Duration| 400.0 + 100.0 * time.as_secs_f64();
+    assert!(before.0 as f64 <= most(before.1), "{before:?}");
+    assert!(after.0 as f64 <= most(after.1) + 100.0, "{after:?}");
 }
