@@ -192,6 +192,21 @@ impl Machine {
         Some(self.leadership?.sent? + ttl - ttl / MARGIN)
     }
 
+    /// Whether request `number` has a condition, and the keys in `view` meet it, as far as they show.
+    pub fn expects(&self, number: u64, view: &View) -> bool {
+        let flight = self.flight.as_ref();
+        match flight
+            .filter(|flight| flight.number == number)
+            .map(|of| &of.op)
+        {
+            Some(Op::Claim { guard, .. } | Op::Beat { guard, .. }) => {
+                let shown = view.guard();
+                guard.seq > 0 && (shown == *guard)
+            }
+            Some(Op::Read) | None => false,
+        }
+    }
+
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
@@ -360,7 +375,8 @@ impl Machine {
     /// Whether this computer's claim begins a new journal: there is none, or nobody can continue it.
     fn begins_journal(&self) -> bool {
         let guard = self.view.guard();
-        self.left == Some(guard) || [0, self.unreadable].contains(&guard.origin)
+        let is_left = self.left == Some(guard) || self.view.is_torn();
+        is_left || [0, self.unreadable].contains(&guard.origin)
     }
 
     /// The last record to read. What is left of a lost journal is not read.

@@ -72,6 +72,11 @@ struct Journal {
 }
 
 impl Journal {
+    /// Whether no leader has written its state yet. Then the journal says nothing, not even that the state is empty.
+    fn is_empty(&self) -> bool {
+        self.progress.seq == 0
+    }
+
     /// Applies `records` to the journal's state. They follow the last record that was applied.
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
@@ -173,7 +178,7 @@ impl Member {
                 self.reading.load_by(now);
             }
             Input::Answer { number, answer } => {
-                let answer = self.doubt_answer(now, answer);
+                let answer = self.doubt_answer(now, number, answer);
                 self.tell_machine(machine::Input::Answer { number, answer });
             }
             Input::Watched {

@@ -169,7 +169,7 @@ impl Sharing {
 
     /// Decides what happens to `calls`, which a computer answered while it was cut off, in the state `mirror`. That
     /// computer sends them under the name `merge`, and has taken the others' changes up to record `seq` into account.
-    /// `None` if the changes after that record are no longer known.
+    /// `None` if the changes after that record are no longer known, or the record is of a journal that etcd has lost.
     pub fn judge(
         &self,
         mirror: &Master,
@@ -179,6 +179,7 @@ impl Sharing {
     ) -> Option<Vec<Verdict>> {
         let changes = match Mutant::JudgesOnce.lives() {
             true => Changes::default(),
+            false if seq > self.last => return None,
             false => self.recent.since(seq, merge)?,
         };
         let verdicts = calls.iter().map(|call| {

@@ -12,7 +12,6 @@ use std::{
 
 use super::{Action, Heard, Holds, Member, News};
 use crate::cluster::{
-    journal::Progress,
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
     standing::Place,
@@ -44,6 +43,8 @@ pub(super) struct DataLoss {
     pub(super) times: u64,
     /// The origin of a journal that this computer could not read from its beginning.
     unreadable: u64,
+    /// The keys of a journal whose last entry is gone. A snapshot may still hold its record.
+    without_end: Option<RevisionGuard>,
 }
 
 impl DataLoss {
@@ -53,11 +54,6 @@ impl DataLoss {
 
     pub(super) fn since(&self) -> Option<Instant> {
         self.present.map(|loss| loss.since)
-    }
-
-    /// Whether the new journal, read up to `progress`, still lacks the state that its first leader writes first.
-    pub(super) fn waits_for(&self, progress: Progress) -> bool {
-        self.present.is_some() && progress.seq == 0
     }
 
     /// Whether `view` shows nothing but what is left of the lost journal.
@@ -75,10 +71,21 @@ impl DataLoss {
 
 impl Member {
     /// Returns `answer`, or silence if it contradicts what etcd showed before. Then etcd is read again.
-    pub(super) fn doubt_answer(&mut self, now: Instant, answer: EtcdAnswer) -> EtcdAnswer {
+    pub(super) fn doubt_answer(
+        &mut self,
+        now: Instant,
+        number: u64,
+        answer: EtcdAnswer,
+    ) -> EtcdAnswer {
         let EtcdAnswer::Is(view) = &answer else {
             return answer;
         };
+        if self.machine.expects(number, view) && !trusts() {
+            // The transaction failed although these keys are as it expects, so the journal's last entry is gone.
+            self.data_loss.without_end = Some(view.guard());
+            self.reading.load_by(now);
+            return EtcdAnswer::Silence;
+        }
         if view.revision < self.view().revision {
             // Either the answer is late, which is harmless, or etcd has lost its data.
             self.reading.load_by(now);
@@ -127,11 +134,14 @@ impl Member {
         };
         let floor = before.revision.max(known);
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
-        if self.data_loss.present.is_some() {
+        let is_without_end = self.data_loss.without_end == Some(view.guard());
+        if let Some(loss) = self.data_loss.present {
+            let is_lost_again = view.is_torn() && loss.left != view.guard() || is_without_end;
             // No other computer can repair a journal that this one is to continue.
-            return older || !is_readable && self.machine.role() == Role::CatchingUp;
+            let is_unreadable = !is_readable && self.machine.role() == Role::CatchingUp;
+            return older || is_lost_again && !trusts() || is_unreadable;
         }
-        let torn = view.is_torn() || view.term() < known || !is_readable;
+        let torn = view.is_torn() || view.term() < known || !is_readable || is_without_end;
         let torn = torn && !trusts();
         older || torn || self.contradicts(view, before)
     }
@@ -150,6 +160,8 @@ impl Member {
         };
         let holds = self.data_loss.holds().unwrap_or(holds);
         self.tell(News::EtcdLost);
+        // The ledger keeps its state, if no leader has written its own to the journal yet.
+        self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
         // A leader holds the most, as long as no other computer can lead.
         let leads = self.told.role == Role::Leading && self.machine.is_sole(now);
         let wait = if leads {
@@ -163,8 +175,10 @@ impl Member {
         let left = view.guard();
         self.drive(now, machine::Input::Lost { view, until });
         self.machine.hold_claims(until);
+        self.data_loss.without_end = None;
         self.data_loss.times += 1;
         let epoch = self.data_loss.times;
+        self.restart_merge(now);
         let journal = std::mem::take(&mut self.journal);
         if std::mem::take(&mut self.reading.loaded) {
             // Before the new journal has the state, it holds nothing.

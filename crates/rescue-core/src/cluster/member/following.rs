@@ -182,13 +182,13 @@ impl Member {
         self.drive(now, machine::Input::View(view));
     }
 
-    /// Gives up this computer's own state if another computer leads, or if the journal has more. After etcd has lost its
-    /// data, the other computer's state must be in the journal first.
+    /// Gives up this computer's own state if another computer leads and its state is in the journal, or if the journal
+    /// has more.
     fn yield_own_state(&mut self) {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
         let leads = other.is_some_and(|leader| !self.was_self(leader));
-        let leads = leads && !self.data_loss.waits_for(self.journal.progress);
+        let leads = leads && !self.journal.is_empty();
         // A request of this computer's earlier process may reach the journal after the first read.
         let has_more =
             !self.is_whole(self.journal.progress.seq) && self.data_loss.since().is_none();
@@ -284,7 +284,9 @@ impl Member {
             let leader = read.view.leader.as_ref();
             let whole = self.is_whole(read.view.seq());
             let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
-            self.journal.own_wins = own || self.data_loss.since().is_some();
+            // This computer may have begun the journal before this read.
+            let is_empty = read.view.seq() == 0 && !self.records();
+            self.journal.own_wins = own || is_empty || self.data_loss.since().is_some();
             // etcd is not new, so its keys may just have been deleted. Computers that hold the state say so now.
             if leader.is_none() && read.view.revision > 1 {
                 self.machine.hold_claims(now + self.settings().ttl);
@@ -318,9 +320,9 @@ impl Member {
                 Err(_) => is_new_state = false,
             }
         }
-        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. After a
-        // loss, what is left of the old journal says nothing of what others have changed.
-        if first && !self.data_loss.waits_for(self.journal.progress) {
+        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
+        // without a state says nothing of what others have changed.
+        if first && !self.journal.is_empty() {
             self.cut_off.note_difference(None, &self.journal.state);
         }
         if is_new_state {

@@ -140,10 +140,18 @@ impl Member {
                 if *until <= now {
                     match ask.take() {
                         Some(ask) => self.ask(now, ask),
+                        None if to.is_none() => *until = now + MERGE_AGAIN,
                         None => self.judge_again(now),
                     }
                 }
             }
+        }
+    }
+
+    /// Decides again which of the remaining writes to send, because the journal that they were judged by is lost.
+    pub(super) fn restart_merge(&mut self, now: Instant) {
+        if !matches!(self.merging.step, Step::Idle) {
+            self.merging.step = Step::Pause(now + MERGE_AGAIN, None);
         }
     }
 
