@@ -43,6 +43,7 @@ fn plan(seed: u64) -> Plan {
             _ => WhenAlone::Serve,
         },
         faults: true,
+        data_loss: !(seed / 16).is_multiple_of(2),
         twins: false,
         traced: std::env::var_os("ROSRESCUE_SEED").is_some() && schedules() == 1,
         ttl: match (seed / 8).is_multiple_of(2) {
@@ -54,7 +55,19 @@ fn plan(seed: u64) -> Plan {
 
 /// Plays the schedule of `seed`.
 fn play(seed: u64) -> World {
-    let mut world = World::new(plan(seed));
+    played(plan(seed))
+}
+
+/// Plays the schedule of `seed` in which etcd keeps its data.
+fn play_without_data_loss(seed: u64) -> World {
+    played(Plan {
+        data_loss: false,
+        ..plan(seed)
+    })
+}
+
+fn played(plan: Plan) -> World {
+    let mut world = World::new(plan);
     world.run(Duration::from_secs(12));
     world.heal();
     world.run(Duration::from_secs(15));
@@ -120,6 +133,20 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
     for seed in [
         305, 4465, 9952, 307_176, 421_276, 543_877, 3_442_837, 31_282_791, 40_407_378, 40_768_111,
     ] {
+        play_without_data_loss(seed).check();
+    }
+}
+
+/// The first such schedules broke promises in 25 of 2,500.
+///
+/// 57: etcd lost data again before a new journal had its leader's state, and the leader gave up its own.
+/// 118 and 1300: a merge sent a request that was judged by a lost journal, so outdated values replaced newer ones.
+/// 152 and 413: a computer led, and then read a journal that its leader had begun and not written. It took it for empty.
+/// 183: only the journal's last entry was gone. No transaction succeeded, and no computer noticed why.
+/// 1402: a computer began a journal before it had read etcd, and then took its own journal for an empty state.
+#[test]
+fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
+    for seed in [57, 118, 152, 183, 413, 1300, 1402] {
         play(seed).check();
     }
 }
@@ -296,6 +323,21 @@ fn keys_that_are_deleted_in_a_living_etcd_come_back_and_no_write_is_lost() {
     assert!(noticed > 0);
 }
 
+/// Each transaction requires the last entry, so without it none succeeds.
+#[test]
+fn a_journal_without_its_last_entry_is_replaced() {
+    for seed in first()..first() + schedules().min(100) {
+        let mut world = calm(seed);
+        world.run(Duration::from_secs(2));
+        world.delete_last_entry(seed % 3 > 0);
+        world.run(Duration::from_secs(10));
+        world.heal();
+        world.run(Duration::from_secs(15));
+        assert!(world.counts.etcds_lost > 0, "seed {seed}");
+        world.check();
+    }
+}
+
 /// A schedule in which an older copy of etcd is restored under living computers. If they are `alone`, etcd is away long
 /// enough for all to be cut off, and the nodes of one computer write.
 fn older_copy(seed: u64, alone: bool) -> World {
@@ -438,8 +480,8 @@ fn broken(seed: u64, mutant: Mutant, lives: bool) -> Option<String> {
         }
         Mutant::OwnDiskWins => dark(seed).verdict(),
         Mutant::IgnoresNamesake => twins(seed).verdict(),
-        Mutant::WaitsForEver => succession(play(seed)),
-        _ => play(seed).verdict(),
+        Mutant::WaitsForEver => succession(play_without_data_loss(seed)),
+        _ => play_without_data_loss(seed).verdict(),
     };
     Mutant::put(None);
     verdict.err()

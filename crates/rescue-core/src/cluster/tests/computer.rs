@@ -104,6 +104,10 @@ pub(super) struct Computer {
     pub(super) hangs_until: u64,
     /// The computer has not hung since this time.
     pub(super) undisturbed_since: u64,
+    /// The computer may not have been able to do its part when etcd lost data before this time.
+    pub(super) disturbed_until: u64,
+    /// Whether this process started while etcd had an older copy, which looks like any journal, and no new one has begun.
+    pub(super) unaware: bool,
     /// By how much the computer's clock is too fast, in millionths.
     drift: i64,
     clock: Instant,
@@ -175,6 +179,8 @@ impl Computer {
             life: 0,
             hangs_until: 0,
             undisturbed_since: 0,
+            disturbed_until: 0,
+            unaware: false,
             drift,
             clock: Instant::now() + Duration::from_secs(1),
             wake: 0,

@@ -25,6 +25,7 @@ pub(super) struct Sent {
     pub(super) op: Op,
     pub(super) entry: Option<Put>,
     pub(super) parts: Vec<Put>,
+    pub(super) sent_at: u64,
     /// When the sender gives up.
     pub(super) until: u64,
 }
@@ -76,6 +77,16 @@ pub(super) struct Etcd {
     pub(super) now: u64,
     /// Whether all data was lost once.
     pub(super) lost: bool,
+    /// When etcd began to answer after it had lost data last.
+    pub(super) lost_at: u64,
+    /// Whether no new journal has begun since.
+    pub(super) is_lost: bool,
+    /// When an older copy was restored last.
+    pub(super) replaced_at: u64,
+    /// Whether an older copy was restored, and no computer has led with it yet or begun a new journal.
+    pub(super) is_old: bool,
+    /// The places in the log where a new journal began, or an older one went on, and whether its leader did.
+    pub(super) beginnings: Vec<(usize, bool)>,
 }
 
 impl Etcd {
@@ -98,6 +109,11 @@ impl Etcd {
             writers: Vec::new(),
             now: 0,
             lost: false,
+            lost_at: 0,
+            is_lost: false,
+            replaced_at: 0,
+            is_old: false,
+            beginnings: Vec::new(),
         }
     }
 
@@ -152,10 +168,15 @@ impl Etcd {
             log: std::mem::take(&mut self.log),
             terms: std::mem::take(&mut self.terms),
             writers: std::mem::take(&mut self.writers),
+            beginnings: std::mem::take(&mut self.beginnings),
             now: self.now,
             lost: true,
             ..Self::new()
         };
+    }
+
+    pub(super) fn is_saved(&self) -> bool {
+        self.saved.is_some()
     }
 
     /// Makes a backup.
@@ -188,6 +209,7 @@ impl Etcd {
         (self.view, self.entries, self.snapshot) = (view, entries, snapshot);
         (self.state, self.values) = (state, values);
         self.view.revision = revision;
+        self.is_old = true;
     }
 
     /// Deletes all keys, or those that `deletes` names.
@@ -273,6 +295,9 @@ impl Etcd {
                     assert_eq!(*seq, self.seq(), "a claim knows the journal's end");
                 }
                 self.claims.push(sent.from);
+                if std::mem::take(&mut self.is_old) && !*begins {
+                    self.goes_on(false);
+                }
                 let of = sent.settings.clone();
                 self.view.leader = Some(Leader {
                     term: revision,
@@ -291,6 +316,10 @@ impl Etcd {
                 settled,
                 ..
             } => {
+                if std::mem::take(&mut self.is_old) {
+                    // The leader of the copy has hung since before it was made, and goes on.
+                    self.goes_on(true);
+                }
                 let mut seq = self.seq();
                 if let Some(put) = &sent.entry {
                     seq = self.add(put);
@@ -339,7 +368,13 @@ impl Etcd {
             }
         };
         match &held {
-            Held::State(state) => self.state = (**state).clone(),
+            Held::State(state) => {
+                if self.entries.is_empty() && self.snapshot.is_none() {
+                    self.beginnings.push((self.log.len(), false));
+                    self.is_lost = false;
+                }
+                self.state = (**state).clone();
+            }
             Held::Records(records) => {
                 let next = self.view.seq() + 1;
                 assert_eq!(records[0].seq, next, "the journal has no gap");
@@ -351,13 +386,32 @@ impl Etcd {
                 }
             }
         }
-        self.log.push((self.now, held.clone()));
-        self.terms.push(self.view.guard().leader);
-        self.writers.push(*self.claims.last().unwrap());
+        self.log(held.clone());
         let revision = self.view.revision;
         self.puts.push((revision, seq, held.clone(), bytes));
         self.entries.insert(seq, (held, bytes));
         seq
+    }
+
+    /// Notes that an older journal goes on. `is_resumed` says whether its leader does, which cannot know of the loss.
+    fn goes_on(&mut self, is_resumed: bool) {
+        self.beginnings.push((self.log.len(), is_resumed));
+        self.is_lost = false;
+        self.log(Held::State(Box::new(self.state.clone())));
+    }
+
+    fn log(&mut self, held: Held) {
+        self.log.push((self.now, held));
+        self.terms.push(self.view.guard().leader);
+        self.writers.push(*self.claims.last().unwrap());
+    }
+
+    /// Deletes the journal's last entry, and nothing else.
+    pub(super) fn delete_last_entry(&mut self) {
+        self.view.revision += 1;
+        let (seq, revision) = (self.seq(), self.view.revision);
+        assert!(self.entries.remove(&seq).is_some());
+        self.deletes.push((revision, seq));
     }
 
     /// Replaces the journal by a snapshot. The last entry stays.

@@ -119,7 +119,19 @@ pub(super) struct History {
     died: Vec<(usize, u64)>,
     /// When a computer did not read each change of the others, because it started or got a whole state.
     skipped: Vec<(usize, u64)>,
+    /// The journals that began after etcd had lost data.
+    pub(super) beginnings: Vec<Beginning>,
     pub(super) broken: Option<String>,
+}
+
+/// A new journal that began after etcd had lost data.
+#[derive(Debug)]
+pub(super) struct Beginning {
+    /// The place of its first state in the log.
+    pub(super) place: usize,
+    /// The values that the mirror of each computer had. `None` for a computer that could not say so in time, because it
+    /// did not run or did not reach etcd.
+    pub(super) knew: Vec<Option<[Option<i32>; KEYS]>>,
 }
 
 impl History {
@@ -352,7 +364,10 @@ impl History {
                 let merge = self.merge_of(last, places);
                 merge.is_some_and(|merge| self.changes_were_hidden(last, merge, places, etcd))
             });
+            let mut in_journal = places.of[number].iter();
+            let lost = in_journal.any(|at| self.is_lost_with_etcd(key, *at, places, etcd));
             let excused = match alone {
+                _ if lost => true,
                 true => excused || unseen && recorded,
                 false => may_be_lost || unseen,
             };
@@ -372,6 +387,23 @@ impl History {
             }
         }
         Ok(())
+    }
+
+    /// Whether the write of `key` at this place of the log was lost with etcd's data, as no computer knew it or a later
+    /// one that could say so when a new journal began.
+    fn is_lost_with_etcd(&self, key: usize, place: usize, places: &Places, etcd: &Etcd) -> bool {
+        self.beginnings.iter().any(|beginning| {
+            let start = beginning.place * 1000;
+            if place >= start {
+                return false;
+            }
+            let is_older = |value: Option<i32>| {
+                let last = places.last_before(self, key, value, start);
+                last.is_none_or(|last| last < place)
+            };
+            let knew = beginning.knew.iter().flatten();
+            is_older(etcd.value_at(key, start + 1)) && knew.clone().all(|knew| is_older(knew[key]))
+        })
     }
 
     /// Whether a computer compared two states between `since` and `moment`, because it had not read each change of the
@@ -437,6 +469,8 @@ impl History {
                 }
                 let first = places.changed[of].first();
                 let first = first.filter(|at| etcd.writers[*at / 1000] != call.computer);
+                let is_lost = |at: &usize| self.is_lost_with_etcd(other.key, *at, places, etcd);
+                let first = first.filter(|at| !is_lost(at));
                 if first.is_some_and(|at| *at >= cut * 1000 && *at < merged) {
                     return Err(format!("{call:?} has replaced {other:?} of others"));
                 }
@@ -590,7 +624,11 @@ impl History {
                     .died
                     .iter()
                     .any(|(of, at)| *of == computer && between(at));
-                if floor.since < read.began && last < floor.place && !died {
+                if floor.since < read.began
+                    && last < floor.place
+                    && !died
+                    && !self.is_lost_with_etcd(key, floor.place, places, etcd)
+                {
                     let Floor { place, why, .. } = floor;
                     return Err(format!("{read:?} is older than {why}: {last} < {place}"));
                 }
@@ -647,6 +685,20 @@ impl Places {
             }
         }
         Self { of, changed }
+    }
+
+    /// The last place before `end` of any write of this value.
+    fn last_before(
+        &self,
+        history: &History,
+        key: usize,
+        value: Option<i32>,
+        end: usize,
+    ) -> Option<usize> {
+        let calls = history.calls.iter().enumerate();
+        let calls = calls.filter(|(_, call)| call.key == key && Some(call.value) == value);
+        let places = calls.flat_map(|(call, _)| &self.of[call]);
+        places.filter(|at| **at < end).max().copied()
     }
 
     /// The first and the last place of any write of this value. `None` if the log has no such write.

@@ -10,7 +10,7 @@ use std::{
 use super::{
     computer::{Asker, Computer, Unanswered, uri},
     etcd::{Etcd, Sent},
-    history::{History, KEYS, Read, Shows, key, subscriptions, value_of},
+    history::{Beginning, History, KEYS, Read, Shows, key, subscriptions, value_of},
 };
 use crate::{
     cluster::{
@@ -346,6 +346,11 @@ impl World {
             let answer = EtcdAnswer::Silence;
             Event::Input(at, life, Input::Answer { number, answer })
         };
+        // A connection that was open when etcd was replaced is closed.
+        let is_outdated = !awaited && sent.sent_at < self.etcd.replaced_at;
+        if is_outdated {
+            return;
+        }
         if !self.network.reaches_etcd(at) {
             if awaited && self.now < sent.until {
                 // The client asks another endpoint.
@@ -360,7 +365,11 @@ impl World {
             self.etcd.put(sent.parts.clone());
         }
         self.etcd.now = self.now;
+        let begun = self.etcd.beginnings.len();
         let answer = self.etcd.run(&sent);
+        if self.etcd.beginnings.len() > begun {
+            self.note_beginning();
+        }
         if *self.etcd.view() != before {
             self.show_watches();
         }
@@ -371,12 +380,33 @@ impl World {
             // The answer is lost. Sometimes the sender is not told.
             if !self.dice.one_in(10) {
                 self.after(50 * MS, silence(number));
+            } else {
+                self.disturbs(at, ANSWER_LIMIT.as_micros() as u64 + 1000 * MS);
             }
             return;
         }
         let delay = self.delay() + self.network.etcd_slow(self.now);
         let answer = Input::Answer { number, answer };
         self.after(delay, Event::Input(at, life, answer));
+    }
+
+    /// Notes what the computers held when a new journal began.
+    fn note_beginning(&mut self) {
+        let (place, is_resumed) = self.etcd.beginnings[self.etcd.beginnings.len() - 1];
+        let lost_at = self.etcd.lost_at;
+        let patience = 3 * self.plan.ttl.as_micros() as u64 + 1000 * MS;
+        let knew = self.computers.iter().map(|computer| {
+            let until = computer.disturbed_until;
+            let could_tell = until <= lost_at || until + patience <= self.now;
+            let values = [0, 1, 2, 3].map(|key| value_of(&computer.ledger.mirror, key));
+            (computer.up && could_tell && !is_resumed).then_some(values)
+        });
+        let beginning = Beginning {
+            place,
+            knew: knew.collect(),
+        };
+        self.trace(|| format!("a new journal begins: {beginning:?}"));
+        self.history.beginnings.push(beginning);
     }
 
     /// Has each watch show the present state.
@@ -481,6 +511,8 @@ impl World {
             }
             let computer = &mut self.computers[at];
             computer.followed = computer.member.place();
+            let follows = computer.member.view().origin == self.etcd.view().origin;
+            computer.unaware &= self.etcd.is_old || !follows || computer.member.seq() == 0;
             computer.write_disk();
             if inputs.is_empty()
                 && let Some(sharing) = &mut computer.ledger.sharing
@@ -520,6 +552,7 @@ impl World {
                     op,
                     entry,
                     parts,
+                    sent_at: self.now,
                     until: self.now + ANSWER_LIMIT.as_micros() as u64,
                 };
                 self.send(Box::new(sent));
@@ -703,13 +736,16 @@ impl World {
 
     fn send(&mut self, sent: Box<Sent>) {
         let well = self.etcd.log.is_empty() || self.network.healed_for(self.now, 0);
+        let wait = ANSWER_LIMIT.as_micros() as u64 + 1000 * MS;
         if self.plan.faults && !well && self.dice.one_in(400) {
+            self.disturbs(sent.from, wait);
             // The request is lost, and its sender gets no error.
             return;
         }
         if self.plan.faults && self.dice.one_in(40) {
             // The request arrives late, or twice.
             let late = self.dice.below(3000) * MS;
+            self.disturbs(sent.from, late);
             self.after(late, Event::Request(sent.clone(), false));
             if self.dice.one_in(2) {
                 let (number, answer) = (sent.number, EtcdAnswer::Silence);

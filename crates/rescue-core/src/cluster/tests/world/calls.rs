@@ -113,7 +113,7 @@ impl World {
                         .breaks("a leader answers what no journal holds");
                 }
                 // A leader of the etcd that was lost may not know of the loss yet.
-                if term <= self.etcd.view().revision {
+                if term <= self.etcd.view().revision && !self.etcd.is_lost {
                     self.term = self.term.max(term);
                 }
             }
@@ -296,7 +296,12 @@ impl World {
         );
         if may {
             let value = self.value(at, key);
-            let shows = if alone { Shows::Alone } else { self.shows(at) };
+            let uncounted = alone || self.computers[at].unaware;
+            let shows = if uncounted {
+                Shows::Alone
+            } else {
+                self.shows(at)
+            };
             self.read_done(read, value, shows);
         } else if self.now < self.history.reads[read].began + 8_000 * MS {
             self.after(POLL, Event::Late(at, life, read));

@@ -14,6 +14,8 @@ pub(in super::super) struct Plan {
     pub(in super::super) commit: Commit,
     pub(in super::super) alone: WhenAlone,
     pub(in super::super) faults: bool,
+    /// Whether etcd loses data, too: keys are deleted, or an older copy is restored.
+    pub(in super::super) data_loss: bool,
     /// Whether two computers have the same name.
     pub(in super::super) twins: bool,
     pub(in super::super) ttl: Duration,
@@ -31,6 +33,9 @@ pub(in super::super) struct Counts {
     pub(in super::super) reported: u64,
     /// How often a computer noticed that etcd had lost its data.
     pub(in super::super) etcds_lost: u64,
+    /// How often etcd's keys were deleted, and how often an older copy was restored.
+    pub(in super::super) deleted: u64,
+    pub(in super::super) restored: u64,
     /// The longest time that a call waited on a computer that did not hang, with `--alone serve`.
     pub(in super::super) waited: Duration,
 }
@@ -44,6 +49,8 @@ impl Counts {
         self.merged += other.merged;
         self.reported += other.reported;
         self.etcds_lost += other.etcds_lost;
+        self.deleted += other.deleted;
+        self.restored += other.restored;
         self.waited = self.waited.max(other.waited);
     }
 }
@@ -149,7 +156,9 @@ impl World {
         let leader = self.leaders().first().copied();
         let at = leader.filter(|_| self.dice.one_in(2)).unwrap_or(at);
         let other = (at + 1 + self.dice.below(COMPUTERS as u64 - 1) as usize) % COMPUTERS;
-        let fault = match self.dice.below(14) {
+        // Without data loss, a seed keeps its schedule.
+        let kinds = if self.plan.data_loss { 16 } else { 14 };
+        let fault = match self.dice.below(kinds) {
             0 | 1 => Fault::Kill(at),
             2 => Fault::CutFromEtcd(at),
             3 => Fault::CutPair(at, other),
@@ -160,18 +169,19 @@ impl World {
                 let computer = &mut self.computers[at];
                 computer.hangs_until = computer.hangs_until.max(self.now + time);
                 computer.undisturbed_since = computer.hangs_until;
+                self.disturbs(at, time);
                 self.trace(|| format!("{at} hangs for {} ms", time / MS));
                 return;
             }
             7 => {
                 self.network.slow_until = self.now + self.dice.below(4000) * MS;
                 self.network.slow_by = self.dice.below(2200) * MS;
-                return;
+                return self.disturb_all(self.network.slow_until + self.network.slow_by);
             }
             8 => {
                 self.network.etcd_slow_until = self.now + self.dice.below(6000) * MS;
                 self.network.etcd_slow_by = self.dice.below(4000) * MS;
-                return;
+                return self.disturb_all(self.network.etcd_slow_until + self.network.etcd_slow_by);
             }
             9 => Fault::PowerCut(at),
             10 => match self.dice.one_in(3) {
@@ -183,7 +193,12 @@ impl World {
                 return;
             }
             12 => Fault::CutOneWay(other, at),
-            _ => return self.hand_over(at),
+            13 => return self.hand_over(at),
+            14 => {
+                let all = self.dice.one_in(2);
+                return self.delete_keys(all);
+            }
+            _ => return self.save_or_restore_etcd(),
         };
         self.trace(|| format!("{fault:?}"));
         let time = (20 + self.dice.below(4000)) * MS;
@@ -197,7 +212,42 @@ impl World {
             Fault::AllPowerCut => (0..COMPUTERS).for_each(|at| self.cut_power(at)),
             _ => self.network.cut(fault, 1),
         }
+        match fault {
+            Fault::Kill(at) | Fault::PowerCut(at) | Fault::CutFromEtcd(at) | Fault::CutOff(at) => {
+                self.disturbs(at, time);
+            }
+            Fault::AllPowerCut => self.disturb_all(self.now + time),
+            Fault::CutPair(..) | Fault::CutOneWay(..) | Fault::EtcdAway => {}
+        }
         self.after(time, Event::End(fault));
+    }
+
+    /// Notes that a computer cannot do its part when etcd loses data: it does not run, or does not reach etcd.
+    pub(super) fn disturbs(&mut self, at: usize, time: u64) {
+        let disturbed = &mut self.computers[at].disturbed_until;
+        *disturbed = (*disturbed).max(self.now + time);
+    }
+
+    fn disturb_all(&mut self, until: u64) {
+        (0..COMPUTERS).for_each(|at| self.disturbs(at, until - self.now));
+    }
+
+    /// Makes a backup of etcd, or restores one. Then etcd is away for a while, sometimes so long that computers are
+    /// cut off.
+    fn save_or_restore_etcd(&mut self) {
+        // Before a new journal has begun, an older one counts as the new one of another computer.
+        let is_lost = self.etcd.is_lost && self.now < self.etcd.lost_at + 5000 * MS;
+        if is_lost {
+            return;
+        }
+        if !self.etcd.is_saved() || self.dice.one_in(3) {
+            return self.etcd.save();
+        }
+        let most = if self.dice.one_in(2) { 500 } else { 6000 };
+        let time = Duration::from_millis(20 + self.dice.below(most));
+        let is_bumped = self.dice.one_in(2);
+        self.trace(|| format!("an older copy of etcd is restored in {time:?}"));
+        self.restore_etcd(time, is_bumped);
     }
 
     fn cut_power(&mut self, at: usize) {
@@ -253,6 +303,10 @@ impl World {
     pub(in super::super) fn restore_etcd(&mut self, time: Duration, is_bumped: bool) {
         self.strike(Fault::EtcdAway, time.as_micros() as u64);
         self.etcd.restore(is_bumped);
+        self.etcd.lost_at = self.now + time.as_micros() as u64;
+        self.etcd.is_lost = true;
+        self.etcd.replaced_at = self.now;
+        self.counts.restored += 1;
         self.term = 0;
     }
 
@@ -260,6 +314,20 @@ impl World {
     pub(in super::super) fn delete_keys(&mut self, all: bool) {
         let dice = &mut self.dice;
         self.etcd.delete(|_| all || dice.one_in(3));
+        self.etcd.lost_at = self.now;
+        self.etcd.is_lost = true;
+        self.counts.deleted += 1;
+        self.trace(|| format!("keys of etcd are deleted, all: {all}"));
+        self.show_watches();
+    }
+
+    /// Deletes the journal's last entry. `is_in_snapshot` says whether a snapshot holds its records.
+    pub(in super::super) fn delete_last_entry(&mut self, is_in_snapshot: bool) {
+        if is_in_snapshot {
+            self.etcd.compact();
+        }
+        self.etcd.delete_last_entry();
+        self.etcd.lost_at = self.now;
         self.show_watches();
     }
 
@@ -290,6 +358,7 @@ impl World {
             let plan = self.plan.clone();
             self.history.skips(at, self.now);
             self.computers[at].start(at, &plan);
+            self.computers[at].unaware = self.etcd.is_old;
             self.input(at, Input::Begin);
         }
     }
