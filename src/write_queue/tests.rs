@@ -39,7 +39,7 @@ use crate::{
     gate::State,
     health::port_of,
     ledger::{Ledger, delivery::Delivery},
-    lifecycle::{self, Patience},
+    lifecycle::{self, Patience, Supervision},
     master::{Kind, Master, Request},
     order::NextNotification,
     status::stats::Stats,
@@ -60,7 +60,7 @@ const OWED_AFTER: u64 = 50_000;
 const QUIET_AFTER: u64 = 15_000_000;
 /// The longest time in which a write is answered, in microseconds. A master that is stopped is examined only after it
 /// has gone on, and is found to hang only after some probes.
-const ANSWERED_WITHIN: u64 = 3_000_000;
+const ANSWERED_WITHIN: u64 = 6_000_000;
 
 #[derive(Debug)]
 enum Event {
@@ -150,8 +150,9 @@ struct World {
     /// When each parameter was first and last set to each value.
     values: node::Values,
     caught_up: u64,
-    /// Whether the connections to a living master broke. It may be stopped, and notify nodes of what it knows after
-    /// the mirror has told them newer news. Nobody can see that, so values may go back before the last one comes.
+    /// Whether the connections to a living master broke, or a master was taken for hung. It may go on and notify nodes of
+    /// what it knows after the mirror has told them newer news. Nobody can see that, so values may go back before the
+    /// last one comes.
     may_go_back: bool,
     broken: Vec<String>,
     prints: bool,
@@ -170,6 +171,10 @@ impl World {
         let nodes = (0..NODES).map(|number| Node::new(number, library(&mut dice)));
         let nodes = nodes.collect();
         let patience = Patience::new(Duration::from_micros(PATIENCE));
+        let supervision = match dice.one_in(2) {
+            true => Supervision::Ours,
+            false => Supervision::Theirs,
+        };
         let mut world = Self {
             dice,
             start: Instant::now(),
@@ -180,7 +185,7 @@ impl World {
             next_tick: None,
             dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, patience),
             ledger,
-            recovery: Recovery::new(),
+            recovery: Recovery::new(supervision),
             gate: State::Unknown,
             gate_changed: false,
             waiting: Vec::new(),
@@ -206,6 +211,9 @@ impl World {
             left: false,
             restored: false,
         });
+        if supervision == Supervision::Theirs {
+            world.start_master();
+        }
         for node in 0..world.nodes.len() {
             world.call(node);
         }
@@ -359,9 +367,10 @@ impl World {
         master.running += 1;
         if self.dice.one_in(12) {
             // The master is stopped, or busy.
-            let time = match self.dice.one_in(4) {
-                true => self.dice.below(10 * PATIENCE),
-                false => self.dice.below(2 * PATIENCE),
+            let time = match self.dice.below(8) {
+                0 => self.dice.below(40 * PATIENCE),
+                1 => self.dice.below(10 * PATIENCE),
+                _ => self.dice.below(2 * PATIENCE),
             };
             self.stop_master(time);
         }

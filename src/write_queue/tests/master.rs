@@ -143,7 +143,13 @@ impl World {
             ended,
             Event::Recovery(recovery::Event::ConnectionEnds(life)),
         );
-        self.after(exited, Event::Recovery(recovery::Event::Exits(life)));
+        match self.recovery.supervision {
+            Supervision::Ours => self.after(exited, Event::Recovery(recovery::Event::Exits(life))),
+            Supervision::Theirs => {
+                let outage = 1_000 + self.dice.below(150_000);
+                self.after(outage, Event::Recovery(recovery::Event::Started));
+            }
+        }
         self.break_request();
     }
 

@@ -9,6 +9,8 @@ use crate::{
 
 /// How long a probe may take, in microseconds.
 const PROBE_TIMEOUT: u64 = 200_000;
+/// How long a master may be silent while it is examined, in microseconds.
+const SILENT_MOST: u64 = 3 * PROBE_TIMEOUT;
 const PROBING: Probing = Probing {
     interval: Duration::from_secs(1),
     count: 3,
@@ -23,12 +25,16 @@ pub(super) enum Event {
     ConnectionEnds(u64),
     /// The process of the master with this number has ended.
     Exits(u64),
+    /// Another program has started a master.
+    Started,
     /// A connection attempt has ended.
     Connects(u64),
     /// The master has been read.
     Inspects(u64),
     /// The master has got its state.
     Injects(u64),
+    /// The master has been silent for too long while it was examined.
+    Silent(u64),
     /// The late master has got the writes that it missed.
     CatchesUp(u64),
     ProbeAnswered(u64),
@@ -41,6 +47,7 @@ pub(super) enum Event {
 
 /// The recovery's part of the world.
 pub(super) struct Recovery {
+    pub(super) supervision: Supervision,
     lifecycle: Lifecycle,
     /// The last step that began. An earlier one has been dropped.
     step: u64,
@@ -60,9 +67,10 @@ pub(super) struct Recovery {
 }
 
 impl Recovery {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(supervision: Supervision) -> Self {
         Self {
-            lifecycle: Lifecycle::new(Supervision::Ours, PROBING),
+            supervision,
+            lifecycle: Lifecycle::new(supervision, PROBING),
             step: 0,
             is_busy: false,
             connected: None,
@@ -84,7 +92,10 @@ impl World {
     /// Passes `input` to the lifecycle and carries out what follows.
     pub(super) fn recover(&mut self, input: Input) {
         self.print(|| format!("recovery: {input:?}"));
-        if matches!(input, Input::ConnectionLost | Input::Exited) {
+        if matches!(
+            input,
+            Input::ConnectionLost | Input::Exited | Input::Unreachable
+        ) {
             if self.gate == State::Injecting {
                 let now = self.instant();
                 self.recovery.lifecycle.on(now, Input::Answered);
@@ -141,6 +152,7 @@ impl World {
                 self.keep_shut();
                 if cause == Cause::Hung {
                     self.disconnect();
+                    self.may_go_back = true;
                 }
             }
             Action::StandIn => self.set_gate(State::Late),
@@ -169,9 +181,7 @@ impl World {
                 self.set_gate(State::Open { incarnation });
             }
             Action::Spawn => {
-                self.life += 1;
-                let listens = self.now + 1_000 + self.dice.below(60_000);
-                self.master = Some(Process::new(listens));
+                self.start_master();
                 self.recover(Input::Spawned);
             }
             Action::Kill => {
@@ -229,6 +239,7 @@ impl World {
             Event::Exits(life) if self.life == life && self.master.is_none() => {
                 self.recover(Input::Exited);
             }
+            Event::Started => self.start_master(),
             Event::Connects(step) if is_step(self, step) => {
                 self.recovery.is_busy = false;
                 let master = self.master.as_ref();
@@ -242,6 +253,10 @@ impl World {
             Event::Inspects(step) if is_step(self, step) => self.inspects(),
             Event::Injects(step) if is_step(self, step) && self.master.is_some() => {
                 self.injects();
+            }
+            Event::Silent(step) if is_step(self, step) => {
+                self.recovery.is_busy = false;
+                self.recover(Input::Unreachable);
             }
             Event::CatchesUp(step) if is_step(self, step) && self.master.is_some() => {
                 self.recovery.is_busy = false;
@@ -317,7 +332,7 @@ impl World {
             (Some(false), _) => KnownMaster::InjectedIfPresent,
         };
         if wait > 0 {
-            return self.begin(wait + 100, Event::Inspects);
+            return self.wait_silently(wait, Event::Inspects);
         }
         let serves = known == KnownMaster::ServedIfPresent && bears == Bears::Present;
         if serves && self.ledger.resume() {
@@ -366,7 +381,7 @@ impl World {
     fn injects(&mut self) {
         let wait = self.awake_in();
         if wait > 0 {
-            return self.begin(wait + 100, Event::Injects);
+            return self.wait_silently(wait, Event::Injects);
         }
         self.recovery.is_busy = false;
         let incarnation = self.ledger.incarnation();
@@ -377,6 +392,20 @@ impl World {
         master.incarnation = Some(incarnation);
         self.ledger.delivered();
         self.is_examined(self.recovery.is_new);
+    }
+
+    /// Waits for a master that does nothing for `time`, or gives up.
+    fn wait_silently(&mut self, time: u64, then: impl FnOnce(u64) -> Event) {
+        match time < SILENT_MOST {
+            true => self.begin(time + 100, then),
+            false => self.begin(SILENT_MOST, Event::Silent),
+        }
+    }
+
+    pub(super) fn start_master(&mut self) {
+        self.life += 1;
+        let listens = self.now + 1_000 + self.dice.below(60_000);
+        self.master = Some(Process::new(listens));
     }
 
     fn is_examined(&mut self, new: bool) {
