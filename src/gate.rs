@@ -6,8 +6,6 @@
 //! [`State::Open`]. A start with a checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does
 //! not lead, `app::cluster` sets [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].
 
-use std::time::Duration;
-
 use tokio::{sync::watch, time::Instant};
 
 /// The state of the gate: it says which side answers calls.
@@ -128,27 +126,10 @@ impl Rx {
             self.changed().await;
         }
     }
-
-    /// Waits until no calls have passed to the master for an uninterrupted `time`, counted from now at the earliest.
-    /// Never returns while calls pass. Cancel safe, but cancelling restarts the count.
-    pub async fn shut_for(&mut self, time: Duration) {
-        loop {
-            self.wait_for(|state| !state.is_open()).await;
-            let deadline = Instant::now() + time;
-            tokio::select! {
-                // On a busy computer both branches may be ready.
-                biased;
-                _ = self.wait_for(State::is_open) => {}
-                () = tokio::time::sleep_until(deadline) => return,
-            }
-        }
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::task::{Context, Waker};
-
     use super::*;
 
     #[tokio::test]
@@ -163,34 +144,5 @@ mod tests {
         tx.set(State::Injecting);
         rx.changed().await;
         assert_eq!(rx.look_changed(), (State::Injecting, false));
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn the_count_restarts_after_an_opening() {
-        let (tx, mut rx) = gate();
-        let start = Instant::now();
-        let opener = async {
-            tokio::time::sleep(Duration::from_secs(7)).await;
-            tx.set(State::Open { incarnation: 1 });
-            tokio::time::sleep(Duration::from_secs(60)).await;
-            tx.set(State::StandingIn);
-            tokio::time::sleep(Duration::from_secs(1)).await;
-            tx.set(State::Injecting);
-        };
-        tokio::join!(opener, rx.shut_for(Duration::from_secs(8)));
-        assert_eq!(start.elapsed(), Duration::from_secs(7 + 60 + 8));
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn a_gate_that_opens_in_time_is_not_taken_for_one_that_stays_shut() {
-        for _ in 0..50 {
-            let (tx, mut rx) = gate();
-            let mut shut = std::pin::pin!(rx.shut_for(Duration::from_secs(1)));
-            let mut context = Context::from_waker(Waker::noop());
-            assert!(shut.as_mut().poll(&mut context).is_pending());
-            tokio::time::advance(Duration::from_secs(2)).await;
-            tx.set(State::Open { incarnation: 1 });
-            assert!(shut.as_mut().poll(&mut context).is_pending());
-        }
     }
 }

@@ -8,6 +8,7 @@ pub(crate) mod calls;
 pub(crate) mod clients;
 pub(crate) mod compare;
 pub(crate) mod deadlines;
+pub(crate) mod hold;
 pub(crate) mod hosts;
 pub(crate) mod idle;
 pub mod listener;

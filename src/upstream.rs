@@ -94,6 +94,8 @@ pub struct Head {
     pub encoding: Option<HeaderValue>,
     /// Address of the caller, if a follower forwards the call. See [`peer::CALLER_HEADER`].
     pub caller: Option<IpAddr>,
+    /// How long the call may still wait for a master, if a follower forwards it. See [`peer::HOLD_HEADER`].
+    pub hold: Option<Duration>,
 }
 
 impl Head {
@@ -115,6 +117,7 @@ impl Default for Head {
             path: "/".to_owned(),
             encoding: None,
             caller: None,
+            hold: None,
         }
     }
 }

@@ -2,19 +2,19 @@
 
 use std::{
     net::{IpAddr, Ipv4Addr, SocketAddr},
-    pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use bytes::Bytes;
 use thiserror::Error;
-use tokio::{sync::Mutex, time::Sleep};
+use tokio::sync::Mutex;
 
 use super::{
     admission,
     body::SMALL,
     compare::Comparisons,
+    hold::Hold,
     others::Others,
     replies::{
         HttpReply, delivered, encoded, forwarded, made, no_shutdown, refused_by_rosmaster, xml,
@@ -160,7 +160,10 @@ impl Calls {
             None => {
                 let own = IpAddr::V4(Ipv4Addr::LOCALHOST);
                 let incoming = Incoming::of(Source::Here, peer.ip(), own);
-                Ok(self.answer_here(head, body, call, incoming).await?)
+                let mut hold = Hold::new(self.hold);
+                Ok(self
+                    .answer_here(head, body, call, incoming, &mut hold)
+                    .await?)
             }
             Some(others) => others.answer(self, peer, head, body, call).await,
         }
@@ -174,6 +177,7 @@ impl Calls {
         body: Bytes,
         call: Option<Request>,
         incoming: Incoming,
+        hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         let call = match self.understood(&head, &body, call) {
             Ok(call) => call,
@@ -190,10 +194,10 @@ impl Calls {
                 Ok(self.identity(call)?)
             }
             (_, Kind::Read | Kind::Identity | Kind::Unknown) => {
-                self.read(head, body, call.as_ref()).await
+                self.read(head, body, call.as_ref(), hold).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-                self.write(head, body, call, incoming).await
+                self.write(head, body, call, incoming, hold).await
             }
         }
     }
@@ -301,12 +305,12 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<&Request>,
+        hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         let known = call.filter(|call| call.is_answerable() && head.may_be_for_rpc());
         let mut gate = self.gate.clone();
-        let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
         let delivery = self.begin_read(call).await;
-        let reply = self.read_in_order(head, body, call, known, &mut gate, hold.as_mut());
+        let reply = self.read_in_order(head, body, call, known, &mut gate, hold);
         Ok(delivered(reply.await?, delivery))
     }
 
@@ -339,7 +343,7 @@ impl Calls {
         call: Option<&Request>,
         known: Option<&Request>,
         gate: &mut gate::Rx,
-        mut hold: Pin<&mut Sleep>,
+        hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         loop {
             match gate.look() {
@@ -401,7 +405,7 @@ impl Calls {
             }
             tokio::select! {
                 () = gate.changed() => {}
-                () = hold.as_mut() => {
+                () = hold.spent() => {
                     self.stats.calls_unanswered.count();
                     return Err(Closed(NOT_IN_TIME).into());
                 }
@@ -416,13 +420,14 @@ impl Calls {
         body: Bytes,
         mut call: Option<Request>,
         incoming: Incoming,
+        hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         if let Some(parts) = Parts::of(&mut call, body.len()) {
             drop(body);
-            return self.write_parts(&head, parts, incoming).await;
+            return self.write_parts(&head, parts, incoming, hold).await;
         }
         let call = call.map(Arc::new);
-        let (answer, delivery) = self.queue(head, body, call.clone(), incoming).await?;
+        let (answer, delivery) = self.queue(head, body, call.clone(), incoming, hold).await?;
         self.http(call.as_deref(), answer, delivery)
     }
 
@@ -433,6 +438,7 @@ impl Calls {
         head: &Head,
         parts: Parts,
         incoming: Incoming,
+        hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         let mut whole = ListWriter::answer();
         for part in parts {
@@ -446,6 +452,7 @@ impl Calls {
                     body.into(),
                     Some(part.clone()),
                     incoming.clone(),
+                    hold,
                 )
                 .await?;
             let reply = match &answer {
@@ -488,6 +495,7 @@ impl Calls {
         body: Bytes,
         call: Option<Arc<Request>>,
         incoming: Incoming,
+        hold: &mut Hold,
     ) -> Result<AnswerAndDelivery, Unanswered> {
         let is_answerable = call.as_deref().is_some_and(Request::is_answerable);
         let (mut item, answered) = Item::new(Some((head, body)), call);
@@ -497,11 +505,12 @@ impl Calls {
         let mut gate = self.gate.clone();
         let held = async {
             loop {
-                gate.shut_for(self.hold).await;
+                hold.spent_while_shut(&mut gate).await;
                 // An injection ends by itself. If it fails, the mirror answers.
                 if !is_answerable || gate.state() != State::Injecting {
                     return;
                 }
+                gate.changed().await;
             }
         };
         tokio::select! {

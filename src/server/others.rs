@@ -23,6 +23,7 @@ use self::control::Control;
 pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
+    hold::Hold,
     listener,
     replies::{HttpReply, UntilWritten, forwarded, no_such_page, text, xml},
 };
@@ -240,7 +241,9 @@ impl Others {
         standing: &mut watch::Receiver<Standing>,
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
-        let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
+        let limit = call.head.hold.filter(|_| asked_term.is_some());
+        let limit = limit.map_or(self.hold, |left| left.min(self.hold));
+        let mut hold = Hold::new(limit);
         // A leader that has not answered may have run this call. If the call removes something, the next leader then
         // finds nothing to remove, and this is the answer.
         let mut removed: Option<Reply> = None;
@@ -273,7 +276,7 @@ impl Others {
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
                         // be cut off, and may become the next leader.
                         _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
-                        answered = calls.answer_here(head, body, request, incoming) => answered,
+                        answered = calls.answer_here(head, body, request, incoming, &mut hold) => answered,
                     };
                     match answered {
                         Err(Unanswered::Elsewhere) => None,
@@ -303,10 +306,13 @@ impl Others {
                             .as_ref()
                             .and_then(|call| self.forwarded.begin(call));
                     }
+                    // If the leader answers, its master has worked on the call, or its own clock counts.
+                    let asked = Instant::now();
                     tokio::select! {
-                        answered = call.forward(&leader, term) => match answered {
+                        answered = call.forward(&leader, term, hold.left()) => match answered {
                             Ok(reply) => return Ok(instead(reply, removed)),
                             Err(may_have_run) => {
+                                hold.count(asked.elapsed());
                                 removed = removed.or_else(|| removes.filter(|_| may_have_run));
                                 Some(Instant::now() + RETRY_PAUSE)
                             }
@@ -314,6 +320,7 @@ impl Others {
                         // When the leader changes, the old leader's answer never comes or no longer counts. A computer
                         // that is alone answers reads itself.
                         _ = standing.changed() => {
+                            hold.count(asked.elapsed());
                             removed = removed.or(removes);
                             continue;
                         }
@@ -340,7 +347,7 @@ impl Others {
                 Some(reply) = call.by_mirror_when_fresh(), if by_mirror => return Ok(reply),
                 changed = standing.changed() => changed.map_err(|_| Closed("rosrescue is stopping"))?,
                 () = retry => {}
-                () = &mut hold => {
+                () = hold.spent() => {
                     call.calls.stats.calls_unanswered.count();
                     return Err(Closed(NOT_IN_TIME));
                 }
@@ -382,10 +389,11 @@ impl Call<'_> {
         reply
     }
 
-    fn head_for_leader(&self) -> Head {
+    fn head_for_leader(&self, hold: Duration) -> Head {
         let is_here = self.from.is_loopback();
         Head {
             caller: (!is_here).then_some(self.from),
+            hold: Some(hold),
             ..self.head.clone()
         }
     }
@@ -395,12 +403,17 @@ impl Call<'_> {
     /// # Errors
     ///
     /// If neither can answer now. The error is whether the leader may have run the call.
-    async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Result<HttpReply, bool> {
+    async fn forward(
+        &self,
+        leader: &Arc<Peer>,
+        term: u64,
+        hold: Duration,
+    ) -> Result<HttpReply, bool> {
         if self.kind == Kind::Read || self.is_subscribed() {
-            return self.forward_read(leader, term).await.ok_or(true);
+            return self.forward_read(leader, term, hold).await.ok_or(true);
         }
         match leader
-            .forward(term, &self.head_for_leader(), &self.body)
+            .forward(term, &self.head_for_leader(hold), &self.body)
             .await
         {
             Ok(raw) => Ok(self.pass_on(leader, term, raw)),
@@ -412,7 +425,12 @@ impl Call<'_> {
     }
 
     /// The answer to a call that changes nothing. `None` if neither the leader nor the mirror can answer now.
-    async fn forward_read(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
+    async fn forward_read(
+        &self,
+        leader: &Arc<Peer>,
+        term: u64,
+        hold: Duration,
+    ) -> Option<HttpReply> {
         if leader.is_late()
             && let Some(reply) = self.by_mirror().await
         {
@@ -421,7 +439,11 @@ impl Call<'_> {
         // The request continues after the mirror has answered, because the leader's next answer in time shows that it
         // is back.
         let mut asked = {
-            let (leader, head, body) = (leader.clone(), self.head_for_leader(), self.body.clone());
+            let (leader, head, body) = (
+                leader.clone(),
+                self.head_for_leader(hold),
+                self.body.clone(),
+            );
             crate::task::spawn(async move { leader.forward(term, &head, &body).await })
         };
         let reply: Result<RawReply, PeerError> =

@@ -3,7 +3,7 @@
 use std::{
     net::SocketAddr,
     sync::{Arc, PoisonError},
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
@@ -27,7 +27,10 @@ use super::{
 use crate::{
     limit::rarely,
     master::{self, Kind, Master},
-    upstream::{Head, INSTANCE_HEADER, open_requests, peer::CALLER_HEADER},
+    upstream::{
+        Head, INSTANCE_HEADER, open_requests,
+        peer::{CALLER_HEADER, HOLD_HEADER},
+    },
     xmlrpc::{Python, Reply},
 };
 
@@ -110,9 +113,12 @@ async fn post(
     }
     let python = server.calls.ledger.with_mirror(Master::python);
     let caller = request.headers().get(CALLER_HEADER);
+    let hold = request.headers().get(HOLD_HEADER);
+    let hold = hold.and_then(|hold| hold.to_str().ok()?.parse().ok());
     let head = Head {
         path: request.uri().to_string(),
         caller: caller.and_then(|caller| caller.to_str().ok()?.parse().ok()),
+        hold: hold.map(Duration::from_millis),
         encoding: request
             .headers()
             .get(CONTENT_ENCODING)

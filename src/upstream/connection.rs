@@ -23,7 +23,9 @@ use tokio::{net::TcpStream, time::timeout};
 
 use super::{
     CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer,
-    open_requests::OpenRequest, peer::CALLER_HEADER, python,
+    open_requests::OpenRequest,
+    peer::{CALLER_HEADER, HOLD_HEADER},
+    python,
 };
 use crate::{
     ros_env::MasterUri,
@@ -196,6 +198,9 @@ impl Connection {
         }
         if let Some(caller) = head.caller {
             request = request.header(CALLER_HEADER, caller.to_string());
+        }
+        if let Some(hold) = head.hold {
+            request = request.header(HOLD_HEADER, hold.as_millis().to_string());
         }
         let request = request
             .body(Full::new(body))

@@ -46,6 +46,10 @@ pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 /// forwards the call. Earlier versions never send it, and ignore it.
 pub(crate) const CALLER_HEADER: &str = "x-rosrescue-caller";
 
+/// Header of a forwarded call: how long it may still wait for a master, in milliseconds. One clock counts on both
+/// computers.
+pub(crate) const HOLD_HEADER: &str = "x-rosrescue-hold";
+
 /// Why another computer did not answer.
 #[derive(Debug, Error)]
 #[error("{why}")]

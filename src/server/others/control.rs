@@ -111,7 +111,7 @@ impl Others {
             let leader = self.peers.at(&uri);
             // The request is sent only once, because after a failure the next leader would hand over too.
             let silent = || handed_over(Err("the leader does not answer".to_owned()));
-            let answered = call.forward(&leader, term).await;
+            let answered = call.forward(&leader, term, self.hold).await;
             return Ok(answered.unwrap_or_else(|_| silent()));
         }
         let (tell, told) = oneshot::channel();
