@@ -9,6 +9,7 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 
 use rosrescue::xmlrpc::{self, Reply, Value};
+use socket2::SockRef;
 
 use super::params;
 use super::patience::eventually_some;
@@ -369,8 +370,8 @@ pub(crate) fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String,
 /// A listener with one thread per connection. All connections are closed when it is dropped.
 #[derive(Debug)]
 struct Server {
-    address: Ipv4Addr,
     port: u16,
+    listener: TcpListener,
     done: Arc<AtomicBool>,
     open: Arc<Mutex<Vec<TcpStream>>>,
     thread: Option<thread::JoinHandle<()>>,
@@ -393,16 +394,17 @@ impl Server {
             TcpListener::bind((address, port)).ok()
         });
         let port = listener.local_addr().unwrap().port();
+        let kept = listener.try_clone().unwrap();
         let done = Arc::new(AtomicBool::new(false));
         let open = Arc::new(Mutex::new(Vec::new()));
         let serve = Arc::new(serve);
         let (stop, connections) = (Arc::clone(&done), Arc::clone(&open));
         let thread = thread::spawn(move || {
-            for stream in listener.incoming().flatten() {
+            for stream in listener.incoming() {
                 if stop.load(Ordering::SeqCst) {
                     break;
                 }
-                let Ok(other) = stream.try_clone() else {
+                let Ok((stream, other)) = stream.and_then(|it| Ok((it.try_clone()?, it))) else {
                     continue;
                 };
                 let _ = stream.set_nodelay(true);
@@ -422,8 +424,8 @@ impl Server {
             }
         });
         Self {
-            address,
             port,
+            listener: kept,
             done,
             open,
             thread: Some(thread),
@@ -434,7 +436,8 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.done.store(true, Ordering::SeqCst);
-        let _ = TcpStream::connect((self.address, self.port));
+        // This ends the wait for connections even if the computer has lost the address.
+        let _ = SockRef::from(&self.listener).shutdown(Shutdown::Both);
         // From here on the port refuses connections.
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
