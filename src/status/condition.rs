@@ -182,13 +182,22 @@ impl NodesTrouble {
         let dead = self.dead.iter().chain(&self.unregistered);
         let since = |nodes: &mut dyn Iterator<Item = f64>| nodes.min_by(f64::total_cmp);
         let dead = since(&mut dead.map(|node| node.since));
-        let unreachable = since(&mut self.unreachable.iter().map(|node| node.since));
+        let unreachable = since(&mut self.unexplained().map(|node| node.since));
         let lost = self.lost_addresses.iter().map(|lost| lost.since);
         let misaddressed = self.misaddressed.iter().map(|node| node.since);
         let wrong = since(&mut lost.chain(misaddressed));
         dead.map(|since| (ConditionName::NodesDead, since))
             .or_else(|| unreachable.map(|since| (ConditionName::NodesUnreachable, since)))
             .or_else(|| wrong.map(|since| (ConditionName::WrongAddresses, since)))
+    }
+
+    /// Nodes that do not answer although this computer has their addresses.
+    fn unexplained(&self) -> impl Iterator<Item = &IllNode> {
+        let is_explained = |ill: &IllNode| {
+            let mut lost = self.lost_addresses.iter();
+            lost.any(|lost| lost.nodes.contains(&ill.node))
+        };
+        self.unreachable.iter().filter(move |it| !is_explained(it))
     }
 
     /// What nodes notice and what to do about each trouble, the worst first.
@@ -215,8 +224,9 @@ impl NodesTrouble {
                 "restart these nodes, if the robot needs them.".to_owned(),
             ));
         }
-        if !self.unreachable.is_empty() {
-            let nodes = &self.unreachable;
+        let unexplained: Vec<_> = self.unexplained().cloned().collect();
+        if !unexplained.is_empty() {
+            let nodes = &unexplained;
             let verb = if nodes.len() == 1 { "does" } else { "do" };
             all.push((
                 format!("{} {verb} not answer: {}.", count(nodes), listed(nodes)),
@@ -606,6 +616,30 @@ mod tests {
             assert!(condition.text.contains(part), "{condition:?}");
         }
         assert!(condition.action.unwrap().contains("export ROS_IP=10.0.0.9"));
+    }
+
+    #[test]
+    fn a_lost_address_explains_why_a_node_does_not_answer() {
+        let facts = Facts::new(Mode::Core);
+        let silent = |names: &[&str]| NodesTrouble {
+            unreachable: names.iter().map(|name| ill(name, 5.0)).collect(),
+            lost_addresses: vec![LostAddress {
+                address: [10, 0, 0, 9].into(),
+                nodes: vec!["/here".to_owned()],
+                since: 4.0,
+            }],
+            ..NodesTrouble::default()
+        };
+        let explained = with_nodes(silent(&["/here"]), OPEN, None, &facts);
+        assert_eq!(explained.name, ConditionName::WrongAddresses);
+        assert!(!explained.text.contains("not answer"), "{explained:?}");
+        assert!(explained.action.unwrap().contains("10.0.0.9"));
+        let other = with_nodes(silent(&["/here", "/gps"]), OPEN, None, &facts);
+        assert_eq!(other.name, ConditionName::NodesUnreachable);
+        assert!(
+            other.text.contains("1 node does not answer: /gps"),
+            "{other:?}"
+        );
     }
 
     #[test]
