@@ -14,6 +14,7 @@ pub(crate) mod history;
 mod inner;
 pub(crate) mod journal;
 pub(crate) mod late;
+pub(crate) mod mutant;
 pub(crate) mod owed;
 mod pending;
 mod shared;

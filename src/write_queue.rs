@@ -7,7 +7,6 @@ mod dispatcher;
 mod drain;
 mod evict;
 mod merge;
-pub(crate) mod mutant;
 mod outdated;
 pub(crate) mod parts;
 mod resync;

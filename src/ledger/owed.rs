@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::{Ledger, activity::Owed};
-use crate::{health::port_of, master::Displaced, order::Subject, write_queue::mutant::Mutant};
+use crate::{health::port_of, ledger::mutant::Mutant, master::Displaced, order::Subject};
 
 /// How long a master that lives may still send old notifications after it has answered again, if nothing is known of its
 /// backlog.

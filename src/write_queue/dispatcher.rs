@@ -14,14 +14,13 @@ use super::{
     MoveJudge,
     batch::{self, Batch, CallAnswer, Caller, Item},
     evict, merge,
-    mutant::Mutant,
     outdated::is_outdated,
     resync::ResyncSchedule,
     round_trip::{Failure, Received},
 };
 use crate::{
     gate::State,
-    ledger::{Ledger, Mark, delivery::Delivery},
+    ledger::{Ledger, Mark, delivery::Delivery, mutant::Mutant},
     lifecycle::Patience,
     limit::rarely,
     master::{Effect, Master, Request, Write},

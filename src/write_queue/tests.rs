@@ -28,7 +28,6 @@ use self::{
 use super::{
     batch::{AnswerAndDelivery, CallAnswer, Item},
     dispatcher::{Action, Dispatcher, Input, Report, View},
-    mutant::Mutant,
     round_trip::{Failure, Received},
 };
 use crate::{
@@ -38,7 +37,7 @@ use crate::{
     dice::Dice,
     gate::State,
     health::port_of,
-    ledger::{Ledger, delivery::Delivery},
+    ledger::{Ledger, delivery::Delivery, mutant::Mutant},
     lifecycle::{self, Patience, Supervision},
     master::{Kind, Master, Request},
     order::NextNotification,

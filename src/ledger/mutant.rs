@@ -1,4 +1,5 @@
-//! Rules of the write queue that a test leaves out, one at a time. The simulation must notice.
+//! Rules of the write queue and of notifications that a test leaves out, one at a time. The simulation
+//! (`write_queue/tests.rs`) must notice.
 
 /// A rule that is left out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
