@@ -210,7 +210,7 @@ impl Replica {
         checkpoint: &Checkpoint,
     ) -> Result<Option<usize>, ReplicaError> {
         let seq = checkpoint.seq;
-        let encoded = format::encode_shared(checkpoint).map_err(JournalError::Encode)?;
+        let encoded = format::encode_checkpoint(checkpoint, 1).map_err(JournalError::Encode)?;
         let (mut puts, manifest) = journal::snapshot(&self.keys, seq, &encoded.bytes);
         // The manifest comes last, because it declares the snapshot complete.
         puts.push(manifest);

@@ -160,8 +160,8 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
     let loaded = store::read(path).map_err(|error| {
         CommandFailure::Usage(match error {
             OpenError::NotACheckpoint { .. } => format!("`{shown}` is not a rosrescue checkpoint"),
-            OpenError::NewerVersion { version, .. } => format!(
-                "`{shown}` has checkpoint format {version} of a newer rosrescue: use that one"
+            OpenError::OtherVersion { version, .. } => format!(
+                "`{shown}` has checkpoint format {version} of another version of rosrescue: use that one"
             ),
             other => other.without_advice(),
         })

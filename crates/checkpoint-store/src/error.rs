@@ -24,12 +24,12 @@ pub enum OpenError {
     /// The file is not a checkpoint.
     #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
     NotACheckpoint { path: PathBuf },
-    /// A newer rosrescue wrote the file.
+    /// A rosrescue with another checkpoint format wrote the file.
     #[error(
-        "`{}` was written in checkpoint format {version} by a newer rosrescue; use that version, or move the file away",
+        "`{}` was written in checkpoint format {version} by another version of rosrescue; use that version, or move the file away",
         path.display()
     )]
-    NewerVersion { path: PathBuf, version: u32 },
+    OtherVersion { path: PathBuf, version: u32 },
     /// The operating system reported an error.
     #[error(
         "cannot {doing} `{}`: {source}; make it readable and writable for this user or choose another file with --checkpoint",

@@ -118,9 +118,9 @@ fn load_present(
     let path = &names.path;
     let present = match (format::scan(bytes), previous) {
         (Ok(present), _) => present,
-        (Err(FormatError::NewerVersion { version }), _) => {
+        (Err(FormatError::OtherVersion { version }), _) => {
             let path = path.clone();
-            return Err(OpenError::NewerVersion { path, version });
+            return Err(OpenError::OtherVersion { path, version });
         }
         // A valid previous generation shows that the damaged file was a checkpoint as well.
         (Err(FormatError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),

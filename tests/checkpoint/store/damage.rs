@@ -176,14 +176,14 @@ fn files_that_a_crash_left_unfinished_are_removed() {
 }
 
 #[test]
-fn a_file_of_a_newer_format_is_refused_and_left_alone() {
+fn a_file_of_another_format_is_refused_and_left_alone() {
     let (_folder, path) = place();
     let line = "# rosrescue checkpoint v9 header=";
     let text = format!("{line}{:08x}\nnew: true\n", crc32c::crc32c(line.as_bytes()));
     fs::write(&path, &text).unwrap();
     let error = Store::open(&path).err().unwrap();
     assert!(
-        matches!(error, OpenError::NewerVersion { version: 9, .. }),
+        matches!(error, OpenError::OtherVersion { version: 9, .. }),
         "{error}"
     );
     assert_eq!(fs::read_to_string(&path).unwrap(), text);

@@ -38,7 +38,7 @@ for name in sys.stdin.read().split():
     journal = document['journal']
     assert journal[0]['pending'] is True
     assert (journal[0]['t'], journal[0]['from']) == (1764115200123, 'rosrescue')
-    print(show(document['parameters']), show(document['pending'][0]['params'][2]), show(journal[0]['setParam'][2]))
+    print(show(document['parameters']), show(document['pending'][0]['setParam'][2]), show(journal[0]['setParam'][2]))
 "#;
 
 fn hex(bytes: &[u8]) -> String {

@@ -184,7 +184,10 @@ fn bad_input_gets_one_clear_sentence_and_status_2() {
         (folder.to_str().unwrap(), "is a folder"),
         (&other, "is not a rosrescue checkpoint"),
         (&empty, "is damaged"),
-        (&newer, "has checkpoint format 3 of a newer rosrescue"),
+        (
+            &newer,
+            "has checkpoint format 3 of another version of rosrescue",
+        ),
         (&damaged, "is damaged"),
     ] {
         for command in [

@@ -54,15 +54,14 @@ pub struct Session {
     /// Number of the record up to which all pending writes have reached the master. Pending writes in a snapshot count
     /// as if they had the number of the snapshot's last record.
     pub delivered: u64,
-    /// The port that nodes use. 0 if an earlier version wrote the session.
+    /// The port that nodes use.
     pub port: u16,
     /// With several computers: the last term in which this computer led. 0 if it never led.
     pub term: u64,
     /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
     /// that follows in this file has the next number. Too low if the true number is unknown.
     pub cluster_seq: u64,
-    /// Wall clock time at which this was written, in milliseconds since 1970. 0 if an earlier version wrote it. It is a
-    /// label, like [`Label::at`].
+    /// Wall clock time at which this was written, in milliseconds since 1970. It is a label, like [`Label::at`].
     pub at: u64,
 }
 
@@ -70,8 +69,7 @@ pub struct Session {
 /// the clock may jump.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Label {
-    /// Wall clock time in milliseconds since 1970. 0 if it is unknown, as in records of earlier versions. Without a
-    /// time, no origin is recorded.
+    /// Wall clock time in milliseconds since 1970. 0 if it is unknown. Without a time, no origin is recorded.
     pub at: u64,
     pub origin: Origin,
 }
@@ -79,7 +77,7 @@ pub struct Label {
 /// Who made a recorded call.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Origin {
-    /// An earlier version made the record.
+    /// The caller is unknown: the call stands for a change that was noticed in the master.
     #[default]
     Unknown,
     /// rosrescue itself, for example its health check.
@@ -189,9 +187,9 @@ pub enum FormatError {
     /// No part of the file belongs to a checkpoint.
     #[error("not a rosrescue checkpoint")]
     NotACheckpoint,
-    /// A newer rosrescue wrote the file, which is undamaged.
-    #[error("written in checkpoint format {version}; this rosrescue knows up to {known}", known = FORMAT_VERSION)]
-    NewerVersion {
+    /// A rosrescue with another format wrote the file, which is undamaged.
+    #[error("written in checkpoint format {version}; this rosrescue reads format {known}", known = FORMAT_VERSION)]
+    OtherVersion {
         /// The format version in its first line.
         version: u32,
     },
@@ -262,19 +260,7 @@ pub struct Decoded {
 /// [`EncodeError::TooDeep`] for a parameter that is nested deeper than [`DEPTH_MAX`].
 pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Encoded, EncodeError> {
     let body = document::write_snapshot(checkpoint)?;
-    let (version, seq) = (FORMAT_VERSION, checkpoint.seq);
-    Ok(frame::frame_snapshot(&body, version, seq, generation))
-}
-
-/// Like [`encode_checkpoint`], for the other computers of a robot. Uses format 1, which all versions read: the
-/// computers may have different versions during an upgrade.
-///
-/// # Errors
-///
-/// The error of [`encode_checkpoint`].
-pub fn encode_shared(checkpoint: &Checkpoint) -> Result<Encoded, EncodeError> {
-    let body = document::write_snapshot(checkpoint)?;
-    Ok(frame::frame_snapshot(&body, 1, checkpoint.seq, 1))
+    Ok(frame::frame_snapshot(&body, checkpoint.seq, generation))
 }
 
 /// Encodes `record` as a line for a file with this `stamp`, including the line feed.

@@ -20,8 +20,8 @@ use crate::{
 pub struct Moment {
     /// Number of the last record in the state.
     pub seq: u64,
-    /// Wall clock time of that record, or of the snapshot without a later one, in milliseconds since 1970. 0 if an
-    /// earlier version wrote it.
+    /// Wall clock time of that record, or of the snapshot without a later one, in milliseconds since 1970. 0 if it
+    /// is unknown.
     pub at: u64,
     /// Number of the last record in the snapshot from which the state was rebuilt.
     pub snapshot_seq: u64,
@@ -111,7 +111,7 @@ pub fn moment(text: &[u8], time: u64) -> Result<Option<Moment>, String> {
 pub struct Entry {
     /// Number of the record, or of the last record before a change that has none.
     pub seq: u64,
-    /// Wall clock time in milliseconds since 1970. 0 if an earlier version recorded the change.
+    /// Wall clock time in milliseconds since 1970. 0 if it is unknown.
     pub at: u64,
     /// The name under which the call was made. `None` if the change is not a call.
     pub caller: Option<String>,

@@ -208,7 +208,7 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
         snapshot,
         ..Checkpoint::default()
     };
-    let encoded = format::encode_shared(&checkpoint)?;
+    let encoded = format::encode_checkpoint(&checkpoint, 1)?;
     Ok(journal::state(keys, change.seq(), &encoded.bytes))
 }
 

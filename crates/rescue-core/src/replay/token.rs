@@ -85,8 +85,7 @@ impl Token {
     }
 
     /// The token that a master has. `number` says whether [`Self::lookup`] found the number, and `session` is the
-    /// address that [`Self::lookup_session`] returned. An address without a number was left by an earlier version of
-    /// rosrescue, so the token is not a later one.
+    /// address that [`Self::lookup_session`] returned. An address without a number is not that of a later token.
     pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
         let later = session
             .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())

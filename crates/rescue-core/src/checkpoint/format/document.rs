@@ -73,7 +73,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         out.extend_from_slice(b"pending:\n");
         for call in pending {
             out.extend_from_slice(b"- {");
-            write_call(out, call, Form::Long)?;
+            write_call(out, call)?;
             out.extend_from_slice(b"}\n");
         }
     }
@@ -145,17 +145,9 @@ fn names(out: &mut Vec<u8>, ids: &[String]) {
     out.push(b'\n');
 }
 
-/// How a call is written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Form {
-    /// `call: "setParam", params: […]`, which all versions read.
-    Long,
-    /// `setParam: […]`, since format 2.
-    Short,
-}
-
-fn write_call(out: &mut Vec<u8>, call: &Call, form: Form) -> Result<(), EncodeError> {
-    if form == Form::Short && is_key(&call.method) {
+/// Writes `setParam: […]`, or `call: "x", params: […]` for a method whose name cannot be a key.
+fn write_call(out: &mut Vec<u8>, call: &Call) -> Result<(), EncodeError> {
+    if is_key(&call.method) {
         out.extend_from_slice(call.method.as_bytes());
         out.extend_from_slice(b": ");
     } else {
@@ -175,8 +167,8 @@ fn is_key(method: &str) -> bool {
         && letters.first().is_some_and(u8::is_ascii_lowercase)
 }
 
-/// Writes the end of a record: when it was made and by whom. A record of a caller on this computer has no more bytes
-/// than one in format 1, which had no label. For that, two of its commas have no blank behind them.
+/// Writes the end of a record: when it was made and by whom. To save bytes, two of a record's commas have no blank behind
+/// them.
 fn write_label(out: &mut Vec<u8>, label: Label) {
     if label.at == 0 {
         return;
@@ -254,7 +246,6 @@ pub(super) fn write_record(
     out: &mut Vec<u8>,
     seq: u64,
     entry: &RecordContent,
-    form: Form,
 ) -> Result<(), EncodeError> {
     out.extend_from_slice(b"- {seq: ");
     decimal(out, seq);
@@ -264,11 +255,8 @@ pub(super) fn write_record(
             pending,
             label,
         } => {
-            out.extend_from_slice(match form {
-                Form::Short => b",".as_slice(),
-                Form::Long => b", ",
-            });
-            write_call(out, call, form)?;
+            out.push(b',');
+            write_call(out, call)?;
             if *pending {
                 out.extend_from_slice(b", pending: true");
             }
@@ -329,7 +317,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         None => Vec::new(),
         Some(Value::Array(calls)) => calls
             .into_iter()
-            .map(|call| read_call(&mut structure(call).ok_or("`pending` has a malformed entry")?))
+            .map(|call| read_call(structure(call).ok_or("`pending` has a malformed entry")?))
             .collect::<Result<_, _>>()?,
         Some(_) => return Err("`pending` is not a list".to_owned()),
     };
@@ -393,32 +381,27 @@ pub(super) fn read_record(line: &str) -> Result<RecordContent, String> {
     }
     let pending = entry.get("pending") == Some(&Value::Bool(true));
     let label = read_label(&entry);
-    let call = match entry.contains_key("call") {
-        true => read_call(&mut entry)?,
-        false => read_short(entry)?,
-    };
     Ok(RecordContent::Call {
-        call,
+        call: read_call(entry)?,
         pending,
         label,
     })
 }
 
-/// Reads a call whose method is the key of its parameters.
-fn read_short(entry: Struct) -> Result<Call, String> {
+/// Reverses [`write_call`].
+fn read_call(mut entry: Struct) -> Result<Call, String> {
+    if entry.contains_key("call") {
+        let method = text(&mut entry, "call")?;
+        return match entry.shift_remove("params") {
+            Some(Value::Array(params)) => Ok(Call { method, params }),
+            _ => Err("`params` is not a list".to_owned()),
+        };
+    }
     let call = entry.into_iter().find_map(|(method, params)| match params {
         Value::Array(params) if is_key(&method) => Some(Call { method, params }),
         _ => None,
     });
     call.ok_or_else(|| "it has no call".to_owned())
-}
-
-fn read_call(members: &mut Struct) -> Result<Call, String> {
-    let method = text(members, "call")?;
-    match members.shift_remove("params") {
-        Some(Value::Array(params)) => Ok(Call { method, params }),
-        _ => Err("`params` is not a list".to_owned()),
-    }
 }
 
 fn read_session(mut session: Struct) -> Result<Session, String> {

@@ -1,9 +1,9 @@
 //! Adds and verifies check sums, and finds the undamaged parts of a damaged file.
 //!
 //! ```text
-//! # rosrescue checkpoint v1 generation=G seq=S snapshot=LENGTH crc32c=C header=H
+//! # rosrescue checkpoint v2 generation=G seq=S snapshot=LENGTH crc32c=C header=H
 //! ...LENGTH bytes, the last line of which is `journal:`...
-//! - {seq: 8, call: "setParam", params: [...]} #H R
+//! - {seq: 8,setParam: [...]} #H R
 //! ```
 //!
 //! S is the number of the last record in the snapshot. C is the check sum of the snapshot, H that of the
@@ -16,11 +16,10 @@ use std::ops::Range;
 
 use super::{
     Checkpoint, Damage, Decoded, EncodeError, Encoded, FormatError, Record, RecordContent,
-    SnapshotError,
-    document::{self, Form},
+    SnapshotError, document,
 };
 
-/// The version of the format that this program writes.
+/// The version of the format, the only one that this program reads and writes.
 pub const FORMAT_VERSION: u32 = 2;
 
 const MAGIC: &str = "# rosrescue checkpoint v";
@@ -40,14 +39,14 @@ const COUNT_MAX: u64 = u64::MAX / 2;
 pub struct Stamp(u32);
 
 /// Adds the first line to a snapshot.
-pub(super) fn frame_snapshot(snapshot: &[u8], version: u32, seq: u64, generation: u64) -> Encoded {
+pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
     let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
     // This cannot fail, because it writes to a vector.
     let _ = write!(
         bytes,
-        "{MAGIC}{version} generation={generation} seq={seq} snapshot={length} \
+        "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
          crc32c={crc:08x} header="
     );
     let stamp = Stamp(crc32c::crc32c(&bytes));
@@ -58,12 +57,8 @@ pub(super) fn frame_snapshot(snapshot: &[u8], version: u32, seq: u64, generation
 
 /// Appends the line of a record without its check sums.
 pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &RecordContent) -> Result<(), EncodeError> {
-    push(out, seq, entry, Form::Short)
-}
-
-fn push(out: &mut Vec<u8>, seq: u64, entry: &RecordContent, form: Form) -> Result<(), EncodeError> {
     let start = out.len();
-    let written = document::write_record(out, seq, entry, form);
+    let written = document::write_record(out, seq, entry);
     if written.is_err() {
         out.truncate(start);
     }
@@ -83,10 +78,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
 /// The stamp of records that are outside of any checkpoint file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends the line of a record that is outside of any checkpoint file. All versions read it.
+/// Appends the line of a record that is outside of any checkpoint file.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
-    push(out, record.seq, &record.entry, Form::Long)?;
+    push_body(out, record.seq, &record.entry)?;
     seal(out, start, NO_FILE);
     Ok(())
 }
@@ -237,8 +232,8 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, FormatError> {
         return Ok(None);
     };
     match version.parse() {
-        Ok(1..=FORMAT_VERSION) => {}
-        Ok(version) => return Err(FormatError::NewerVersion { version }),
+        Ok(FORMAT_VERSION) => {}
+        Ok(version) => return Err(FormatError::OtherVersion { version }),
         Err(_) => return Ok(None),
     }
     let field = |name: &str| {
@@ -484,7 +479,7 @@ fn time_at_end(body: &[u8]) -> Option<u64> {
         false => text,
     };
     let (before, digits) = text.rsplit_once(": ")?;
-    let is_time = [",t", " t", " at"].iter().any(|key| before.ends_with(key));
+    let is_time = [",t", " at"].iter().any(|key| before.ends_with(key));
     is_time.then(|| digits.parse().ok()).flatten()
 }
 
