@@ -34,17 +34,14 @@ use crate::{
         journal::{self, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
         member::{Action, Entry, Heard, Input, Member, PROBES, Read},
-        merge::{
-            Verdict,
-            wire::{self, Ask},
-        },
+        merge::wire::{self, Ask},
         replica::{LoadedState, Replica},
         standing::{Place, Standing},
     },
     gate::State,
     guardian::handover,
     limit::rarely,
-    master::{Master, Request},
+    master::Master,
     nodes::notifications,
     process::ProcessError,
     recovery::master_process::MasterProcess,
@@ -561,21 +558,10 @@ async fn merge(
     };
     let uri = MasterUri::parse(&uri).ok()?;
     let leader = peers.at(&uri);
-    let send = async |call: Request| {
-        let body = Bytes::from(xmlrpc::encode_call(&call.into()));
-        let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
-        xmlrpc::decode_reply(&raw.body).ok()
-    };
-    let reply = send(ask.to_request()).await?;
-    let count = ask.calls.len();
-    match wire::MergeAnswer::read(&reply, count) {
-        Some(answer) => Some(answer),
-        // The leader runs an earlier version, which does not know this method.
-        None => {
-            let reply = send(Request::multicall(ask.calls)).await;
-            reply.map(|reply| wire::MergeAnswer::of(&vec![Verdict::Runs; count], &reply))
-        }
-    }
+    let body = Bytes::from(xmlrpc::encode_call(&ask.to_request().into()));
+    let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
+    let reply = xmlrpc::decode_reply(&raw.body).ok()?;
+    wire::MergeAnswer::read(&reply, ask.calls.len())
 }
 
 /// Writes this computer's entry among the members to etcd.

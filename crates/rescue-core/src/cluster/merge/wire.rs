@@ -124,7 +124,7 @@ impl MergeAnswer {
         Reply::Value(vec![code.into(), text.into(), Value::Array(outcomes)].into())
     }
 
-    /// Reads the answer for `count` writes. `None` for anything else, such as the answer of an older version.
+    /// Reads the answer for `count` writes. `None` for anything else.
     pub fn read(reply: &Reply, count: usize) -> Option<Self> {
         let Reply::Value(Value::Array(answer)) = reply else {
             return None;
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn who_does_not_know_the_method_has_not_answered() {
+    fn a_fault_or_a_malformed_answer_is_no_answer() {
         let (code, text) = (1, "method is not supported".to_owned());
         assert_eq!(MergeAnswer::read(&Reply::Fault { code, text }, 1), None);
         let reply: Vec<Value> = vec![(-1).into(), "what?".into(), 0.into()];
