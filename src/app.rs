@@ -206,10 +206,7 @@ fn accept(
 fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
     tasks.spawn(boxed(nodes::liveness::watch(context.nodes.clone())));
     tasks.spawn(boxed(nodes::addresses::watch(context.nodes.clone())));
-    tasks.spawn(boxed(nodes::watch(
-        context.nodes.clone(),
-        config.reap.interval,
-    )));
+    tasks.spawn(boxed(nodes::watch(context.nodes.clone())));
     if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(boxed(bypass::watch(
             context.upstream.clone(),

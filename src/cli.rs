@@ -24,8 +24,8 @@ pub use self::{
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{
-        CommonArgs, CoreArgs, LogFormat, LoggingArgs, ProxyArgs, Reads, ReapArgs, ReapNodes,
-        RestoreChoice, SyncPolicy,
+        CommonArgs, CoreArgs, LogFormat, LoggingArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice,
+        SyncPolicy,
     },
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},

@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use crate::{
     checkpoint::session::RestorePolicy,
-    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, ReapArgs, ReapNodes, RestoreChoice, SyncPolicy},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice, SyncPolicy},
     health::Reap,
     hide::Hide,
     lifecycle::Probing,
@@ -31,9 +31,6 @@ pub(crate) const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
 /// Shortest allowed pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
-
-/// Pause between two health checks with `--reap all`.
-const REAP_INTERVAL: Duration = Duration::from_secs(30);
 
 /// A command line that parses but makes no sense. The exit status is 2.
 #[derive(Debug, Error, PartialEq)]
@@ -102,7 +99,7 @@ pub struct Config {
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
     /// Which dead nodes are unregistered between rescues.
-    pub reap: Reaping,
+    pub(crate) reap: Reap,
     /// Networks that may call. `None` allows all.
     pub allow: Vec<IpNet>,
     /// Networks that may change state. `None` allows all that may call.
@@ -308,7 +305,11 @@ impl Config {
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
             node_timeout: Duration::from_millis(args.node_timeout),
-            reap: Reaping::of(&args.reap)?,
+            reap: match args.reap {
+                ReapNodes::Report => Reap::Report,
+                ReapNodes::Local => Reap::Local,
+                ReapNodes::All => Reap::All,
+            },
             allow: args.allow.clone(),
             allow_write: args.allow_write.clone(),
             resync_interval: Some(seconds(
@@ -356,27 +357,6 @@ fn seconds(option: &'static str, given: f64, most: f64) -> Result<Duration, Usag
         return Err(error);
     }
     Duration::try_from_secs_f64(given).map_err(|_| error)
-}
-
-/// Which dead nodes are unregistered between rescues.
-#[derive(Clone, Copy, Debug)]
-pub struct Reaping {
-    pub(crate) nodes: Reap,
-    /// Pause between two health checks of all nodes. `None` disables them.
-    pub(crate) interval: Option<Duration>,
-}
-
-impl Reaping {
-    fn of(args: &ReapArgs) -> Result<Self, UsageError> {
-        let every = seconds("--reap-dead-nodes", args.reap_dead_nodes, 86_400.0)?;
-        let (nodes, interval) = match args.reap {
-            _ if !every.is_zero() => (Reap::All, Some(every)),
-            ReapNodes::Report => (Reap::Report, None),
-            ReapNodes::Local => (Reap::Local, None),
-            ReapNodes::All => (Reap::All, Some(REAP_INTERVAL)),
-        };
-        Ok(Self { nodes, interval })
-    }
 }
 
 #[cfg(test)]

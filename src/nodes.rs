@@ -55,6 +55,9 @@ use crate::{
 /// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
+/// Pause between two health checks with `--reap all`.
+const REAP_INTERVAL: Duration = Duration::from_secs(30);
+
 /// Maximum number of nodes that are remembered because they do not answer `paramUpdate`.
 const MUTE_MOST: usize = 1024;
 
@@ -240,9 +243,12 @@ impl Drop for CheckUnderWay {
 
 /// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again, identifies new nodes,
 /// and runs the regular health check.
-pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
-    let mut reaping = reap_interval
-        .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
+pub(crate) async fn watch(nodes: Arc<Nodes>) {
+    let first_check = tokio::time::Instant::now() + REAP_INTERVAL;
+    let mut reaping = nodes
+        .local
+        .is_regular_check_enabled()
+        .then(|| tokio::time::interval_at(first_check, REAP_INTERVAL));
     let mut repeats = Repeats::<NotifyingChange>::default();
     let mut gate = nodes.gate.clone();
     // When to send the notifications that the absent master may not have sent, and whether they were sent.

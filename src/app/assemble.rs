@@ -103,7 +103,7 @@ pub(super) async fn assemble(
         config.probe_timeout,
         config.probing.count,
     ));
-    let local = Arc::new(LocalNodes::new(config.reap.nodes, stats));
+    let local = Arc::new(LocalNodes::new(config.reap, stats));
     let (write_queue, drain) = write_queue::write_queue(
         ledger.clone(),
         upstream.clone(),

@@ -171,7 +171,6 @@ pub struct CommonArgs {
     /// Longest time for a node to answer a notification or a health check, in milliseconds
     #[arg(
         long,
-        alias = "census-timeout",
         env = "ROSRESCUE_NODE_TIMEOUT",
         value_name = "MS",
         default_value_t = 3000,
@@ -179,8 +178,9 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
-    #[command(flatten)]
-    pub reap: ReapArgs,
+    /// Which dead nodes to unregister between rescues
+    #[arg(long, env = "ROSRESCUE_REAP", value_name = "NODES", value_enum, default_value_t = ReapNodes::Report)]
+    pub reap: ReapNodes,
     /// Networks and addresses that may call, as in 10.0.0.0/24 or fd00::/64. This computer always may
     /// [default: all]
     #[arg(
@@ -285,30 +285,6 @@ fn network(text: &str) -> Result<IpNet, &'static str> {
     };
     let mapped = mapped.and_then(|(address, length)| IpNet::new(address.into(), length).ok());
     Ok(mapped.unwrap_or(net))
-}
-
-/// Options for dead nodes.
-#[derive(Args, Clone, Debug)]
-pub struct ReapArgs {
-    /// Which dead nodes to unregister between rescues
-    #[arg(
-        long,
-        env = "ROSRESCUE_REAP",
-        value_name = "NODES",
-        value_enum,
-        default_value_t = ReapNodes::Report
-    )]
-    pub reap: ReapNodes,
-    /// Like `--reap all`, with a health check of all nodes at this interval, in seconds. 0 leaves it to `--reap`
-    #[arg(
-        long,
-        env = "ROSRESCUE_REAP_DEAD_NODES",
-        value_name = "SECONDS",
-        default_value_t = 0.0,
-        hide = true
-    )]
-    #[arg(allow_negative_numbers = true)]
-    pub reap_dead_nodes: f64,
 }
 
 /// When a checkpoint is restored at the start.

@@ -101,6 +101,11 @@ impl LocalNodes {
         }
     }
 
+    /// Whether a regular health check unregisters dead nodes.
+    pub(super) fn is_regular_check_enabled(&self) -> bool {
+        self.reap == Reap::All
+    }
+
     fn lock(&self) -> MutexGuard<'_, Known> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }

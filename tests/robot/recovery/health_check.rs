@@ -222,8 +222,8 @@ fn an_unreachable_node_that_dies_is_unregistered() {
 
 /// No outage is needed for this.
 #[test]
-fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
-    let robot = Robot::start_with(Mode::Core, &["--reap-dead-nodes", "0.5"]);
+fn reap_all_unregisters_dead_nodes_and_is_off_by_default() {
+    let robot = Robot::start_with(Mode::Core, &["--reap", "all"]);
     let client = robot.client();
     let mut talker = robot.node(Library::Rospy, "talker", &[]);
     let listener = robot.node(Library::Roscpp, "listener", &[]);
@@ -235,7 +235,7 @@ fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
         now.is_ok_and(|now| now == with)
     }));
     talker.kill();
-    robot.await_state(&after, "after the standing health check");
+    robot.await_state(&after, "after the regular health check");
     eventually("the listener is notified", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });

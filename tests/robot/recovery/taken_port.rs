@@ -1,4 +1,4 @@
-//! Another node now has a dead node's port. `--reap-dead-nodes` unregisters the dead node before its name moves, so that
+//! Another node now has a dead node's port. `--reap all` unregisters the dead node before its name moves, so that
 //! the master cannot mistake the other one for it (ros_comm issue 2241).
 
 use std::time::Duration;
@@ -49,11 +49,6 @@ fn started_again(master: &Client) -> FakeNode {
     node
 }
 
-fn options() -> [&'static str; 2] {
-    // The regular health check would come much too late.
-    ["--reap-dead-nodes", "3600"]
-}
-
 #[test]
 fn a_bare_master_shuts_down_the_wrong_node() {
     let scratch = Scratch::new();
@@ -69,7 +64,7 @@ fn a_bare_master_shuts_down_the_wrong_node() {
 in_both_modes!(a_node_that_took_the_port_of_a_dead_node_is_not_shut_down);
 
 fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
-    let mut robot = Robot::start_with(mode, &options());
+    let mut robot = Robot::start_with(mode, &["--reap", "all"]);
     let client = robot.client();
     let [heir, watcher] = ["/heir", "/watcher"].map(FakeNode::start);
     watcher.subscribe(&client, "/topic", "std_msgs/String");
@@ -110,7 +105,7 @@ fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
 in_both_modes!(a_node_that_took_the_port_is_not_shut_down_during_an_outage_either);
 
 fn a_node_that_took_the_port_is_not_shut_down_during_an_outage_either(mode: Mode) {
-    let mut robot = Robot::start_under_with(mode, "waiting_rosmaster.py", &[], &options());
+    let mut robot = Robot::start_under_with(mode, "waiting_rosmaster.py", &[], &["--reap", "all"]);
     let client = robot.client();
     let heir = FakeNode::start("/heir");
     let port = dead_node(&client, &heir);
