@@ -13,13 +13,11 @@ use crate::{
     cli::HandoverArgs,
     cluster::machine::Role,
     printable::{Lines, Page, display_lines},
+    server::others::HANDOVER,
     status::computers::{Computers, LeaderStatus},
     xmlrpc::{Reply, Value},
 };
 
-/// rosrescue's own method that starts a handover. Its parameters are the caller's id and the computer that should lead;
-/// an empty text means any.
-const METHOD: &str = "rosrescue/handover";
 /// The caller id with which this command makes its call.
 const CALLER: &str = "/rosrescue_handover";
 /// Pause between two checks for the new leader.
@@ -158,7 +156,7 @@ async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<()
     let params = [CALLER, wanted.unwrap_or_default()].map(Value::from);
     let refused =
         |why: &str| CommandFailure::Failed(format!("the leader refused the handover: {why}"));
-    match running.call(METHOD, params.into(), limit).await? {
+    match running.call(HANDOVER, params.into(), limit).await? {
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(1), ..] => Ok(()),
             [_, why, ..] => Err(refused(why.as_str().unwrap_or("it gives no reason"))),

@@ -20,6 +20,7 @@ mod forwarded;
 mod members;
 
 use self::control::Control;
+pub(crate) use self::control::HANDOVER;
 pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},

@@ -19,8 +19,9 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// The method by which `rosrescue handover` asks the leader to give up leadership.
-pub(super) const HANDOVER: &str = "rosrescue/handover";
+/// The method by which `rosrescue handover` asks the leader to give up leadership. Its parameters are the caller's id and
+/// the computer that should lead; an empty text means any.
+pub(crate) const HANDOVER: &str = "rosrescue/handover";
 /// The method by which a follower tells the leader that it has passed an answer on to its caller.
 pub(super) const PASSED_ON: &str = "rosrescue/passedOn";
 
