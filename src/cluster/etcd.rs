@@ -192,7 +192,6 @@ struct LeaderValue {
     id: String,
     claim: u64,
     uri: String,
-    #[serde(default)]
     boot: String,
     version: String,
 }
@@ -203,14 +202,8 @@ struct AliveValue {
     beat: u64,
     seq: u64,
     released: Option<String>,
-    /// Whether it is decided that the journal's session continues. Versions without this field decide it when they
-    /// lead.
-    #[serde(default = "settled_before")]
+    /// Whether it is decided that the journal's session continues.
     settled: bool,
-}
-
-fn settled_before() -> bool {
-    true
 }
 
 fn write(put: &Put) -> TxnOp {

@@ -112,9 +112,7 @@ async fn missing(
 async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
     match wanted {
         For::Answered => status.ready,
-        For::Master => {
-            status.open || status.condition.apart_from_nodes() == ConditionName::Following
-        }
+        For::Master => status.open || status.condition.apart_from_nodes == ConditionName::Following,
         For::Protected => status.condition.is_protected(),
         For::Node(name) => {
             let params = ["/rosrescue_wait", name].map(Value::from);

@@ -26,8 +26,8 @@ pub(super) enum Last {
     Running { pid: u32, port: u16 },
     /// The process has ended.
     Ended,
-    /// There is no complete file: an earlier version wrote none, the disk was full or does not answer, or rosrescue was
-    /// killed while it started the process.
+    /// There is no complete file: the disk was full or does not answer, or rosrescue was killed while it started the
+    /// process.
     Unknown,
 }
 

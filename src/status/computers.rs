@@ -41,7 +41,6 @@ pub(crate) struct Computers {
     /// Number of writes that this computer answered while it was cut off and that were then lost.
     pub(crate) lost_writes: u64,
     /// How often this computer was cut off since its rosrescue started.
-    #[serde(default)]
     pub(crate) times_cut_off: u64,
 }
 

@@ -98,10 +98,8 @@ impl ConditionName {
 pub(crate) struct Condition {
     /// The worst condition that applies.
     pub(crate) name: ConditionName,
-    /// The worst condition that applies apart from the nodes: whether calls are answered and changes recorded. Missing
-    /// in the status of earlier versions.
-    #[serde(default)]
-    pub(crate) apart_from_nodes: Option<ConditionName>,
+    /// The worst condition that applies apart from the nodes: whether calls are answered and changes recorded.
+    pub(crate) apart_from_nodes: ConditionName,
     /// When the condition began, in seconds since 1970 by the wall clock.
     pub(crate) since: f64,
     /// What nodes notice now, in one or more sentences.
@@ -113,18 +111,13 @@ pub(crate) struct Condition {
 impl Condition {
     /// Whether no operator is needed.
     pub(crate) fn is_good(&self) -> bool {
-        self.is_protected() && self.name == self.apart_from_nodes() && self.action.is_none()
-    }
-
-    /// The worst condition apart from the nodes.
-    pub(crate) fn apart_from_nodes(&self) -> ConditionName {
-        self.apart_from_nodes.unwrap_or(self.name)
+        self.is_protected() && self.name == self.apart_from_nodes && self.action.is_none()
     }
 
     /// Whether changes are recorded and calls pass to a master, on this computer or on the leader.
     pub(crate) fn is_protected(&self) -> bool {
         matches!(
-            self.apart_from_nodes(),
+            self.apart_from_nodes,
             ConditionName::Protected | ConditionName::Following
         )
     }
@@ -377,7 +370,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let said: Vec<_> = said.into_iter().chain([text]).collect();
     Condition {
         name,
-        apart_from_nodes: Some(apart_from_nodes),
+        apart_from_nodes,
         since,
         text: said.join(" "),
         action: to_do.into_iter().next().or(action),
@@ -564,7 +557,7 @@ mod tests {
             &facts,
         );
         assert_eq!(all.name, ConditionName::NodesDead);
-        assert_eq!(all.apart_from_nodes(), ConditionName::Unprotected);
+        assert_eq!(all.apart_from_nodes, ConditionName::Unprotected);
         assert!(!all.is_good() && !all.is_protected());
         assert!(all.since < 1e9 + 1.0, "{all:?}");
         let line = all.line();

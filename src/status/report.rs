@@ -108,10 +108,8 @@ pub struct Report {
     /// The process id that the master reports.
     pub master_pid: i32,
     /// Whether it is the same process as before.
-    #[serde(default)]
     pub same_master: bool,
     /// HTTP version and Python version of the master, as text.
-    #[serde(default)]
     pub master_speaks: String,
     pub phases: Phases,
     /// Number of calls that the mirror answered during the outage.

@@ -64,29 +64,21 @@ pub(crate) struct NodesStatus {
     /// Nodes that do not answer but are not known to be dead.
     pub(crate) unreachable: Vec<String>,
     /// Registered nodes whose process has ended, or whose port refuses connections.
-    #[serde(default)]
     pub(crate) dead_nodes: Vec<String>,
     /// Nodes that have died, that rosrescue has unregistered in the last ten minutes, and that have not come back.
-    #[serde(default)]
     pub(crate) unregistered_nodes: Vec<IllNode>,
     /// Registered nodes that have not been checked, or not in the last two minutes.
-    #[serde(default)]
     pub(crate) unchecked_nodes: Vec<String>,
     /// Number of registered nodes that are alive, by the kernel's socket table or an answer.
-    #[serde(default)]
     pub(crate) alive_nodes: usize,
     /// All registered nodes that are not known to be alive, by name.
-    #[serde(default)]
     pub(crate) node_health: BTreeMap<String, NodeHealth>,
     /// Names that two programs take from each other.
-    #[serde(default)]
     pub(crate) feuds: Vec<Feud>,
     /// Addresses that this computer has lost, and at which nodes are registered.
-    #[serde(default)]
     pub(crate) lost_addresses: Vec<LostAddress>,
     /// Nodes of other computers that no computer but their own can reach, because they have registered under an address
     /// such as `localhost`.
-    #[serde(default)]
     pub(crate) misaddressed_nodes: Vec<Misaddressed>,
 }
 
@@ -165,22 +157,18 @@ pub(crate) struct Status {
     /// Process id of the present or last master. `None` if there was none.
     pub(crate) master_pid: Option<i32>,
     /// HTTP version and Python version of the present or last master.
-    #[serde(default)]
     pub(crate) master_speaks: Option<String>,
     /// Processes, users and computers that bypass rosrescue and talk directly to the master of
     /// `proxy`.
-    #[serde(default)]
     pub(crate) bypassing: Vec<String>,
     /// Whether the master of `proxy` runs on this computer and accepts connections from other
     /// computers.
-    #[serde(default)]
     pub(crate) master_is_open: bool,
     /// Whether calls pass to the master.
     pub(crate) open: bool,
     /// Whether calls are answered by the master or the mirror.
     pub(crate) ready: bool,
     /// Whether another computer has the master and calls go there.
-    #[serde(default)]
     pub(crate) elsewhere: bool,
     /// Since when the mirror has answered in the master's place. `None` if calls pass to a master.
     pub(crate) standing_in_since: Option<f64>,
@@ -191,7 +179,6 @@ pub(crate) struct Status {
     /// Number of masters that have died in this session.
     pub(crate) deaths: u64,
     /// Number of times rosrescue itself died and was restarted in this session.
-    #[serde(default)]
     pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
     /// Why the state is not recorded. `None` if it is recorded.
@@ -212,7 +199,6 @@ pub(crate) struct Status {
     pub(crate) rescues: u64,
     pub(crate) last_rescues: Vec<Report>,
     /// Outages in which nothing died, since this process started.
-    #[serde(default)]
     pub(crate) late_answers: LateAnswers,
     /// Calls per second between the last two requests for the status that were at least a second
     /// apart.
@@ -224,12 +210,11 @@ pub(crate) struct Status {
     /// Counters since this process started.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
     /// The robot's computers. `None` without `--cluster`.
-    #[serde(default)]
     pub(crate) cluster: Option<Computers>,
 }
 
 impl Status {
-    /// A counter's value; 0 if an older rosrescue does not report it.
+    /// A counter's value; 0 if the running rosrescue has no such counter.
     pub(crate) fn counter(&self, name: &str) -> u64 {
         let value = self.counters.get(name);
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)

@@ -43,7 +43,7 @@ pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
 pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
 /// Header of a forwarded call: the caller's address, for the journal. It is absent if the caller is on the computer that
-/// forwards the call. Earlier versions never send it, and ignore it.
+/// forwards the call.
 pub(crate) const CALLER_HEADER: &str = "x-rosrescue-caller";
 
 /// Header of a forwarded call: how long it may still wait for a master, in milliseconds. One clock counts on both

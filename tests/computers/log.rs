@@ -1,6 +1,6 @@
 use crate::computer::PORT;
 use crate::fleet::Fleet;
-use crate::support::{Client, encode_call, eventually, params, request};
+use crate::support::{Client, eventually};
 use crate::turn;
 
 /// The address from which `key` was set, according to the log of each computer.
@@ -25,20 +25,7 @@ fn the_log_of_every_computer_has_the_callers_address() {
     let [follower, caller] = [&fleet.computers[rest[0]], &fleet.computers[rest[1]]];
     caller.within(|| Client::at(&follower.address(), PORT).set_param("/far", 1));
     follower.set_param("/near", 1);
-    // A follower of an earlier version names no caller.
-    let leading = &fleet.computers[leader];
-    let status = leading.status().unwrap();
-    let term = status["cluster"]["leader"]["term"].as_u64().unwrap();
-    let body = encode_call("setParam", params!["/old", "/earlier", 1]);
-    let head = format!("POST /cluster/{term} HTTP/1.1");
-    let call = request(&head, &["Content-Type: text/xml"], &body);
-    let answer = caller.within(|| Client::at(&leading.address(), PORT).exchange(&call));
-    assert_eq!(answer.unwrap().code, 200);
-    for (key, from) in [
-        ("/far", caller.address()),
-        ("/near", follower.address()),
-        ("/earlier", caller.address()),
-    ] {
+    for (key, from) in [("/far", caller.address()), ("/near", follower.address())] {
         let wanted = vec![from; 3];
         eventually(&format!("the log of all has {key}"), || {
             origins(&fleet, key) == wanted

@@ -49,7 +49,7 @@ pub(super) enum Responder {
     Silent,
 }
 
-/// The fields of `/status.json` that the check needs, in any version.
+/// The fields of `/status.json` that the check needs.
 #[derive(Deserialize)]
 struct Page {
     version: String,
@@ -57,7 +57,6 @@ struct Page {
     unprotected: Option<String>,
     mode: String,
     master: String,
-    #[serde(default)]
     bypassing: Vec<String>,
 }
 

@@ -91,7 +91,7 @@ impl Story {
             "leader": {"name": leader, "uri": "http://pc-1:11311/", "version": "0", "term": term, "since": 1e9},
             "leaderless_since": leaderless, "seq": 9, "behind": 0, "uncommitted": 0, "etcd_trouble": null,
             "computers": [computer("pc-1"), computer("pc-2"), computer("pc-3")],
-            "takeovers": 0, "last_takeover": null, "lost_writes": 0,
+            "takeovers": 0, "last_takeover": null, "lost_writes": 0, "times_cut_off": 0,
         });
         status
     }

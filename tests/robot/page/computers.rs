@@ -76,7 +76,7 @@ fn several_computers_are_listed_and_one_that_is_cut_off_is_loud() {
         "leaderless_since": null, "seq": 9, "behind": 2, "uncommitted": 0, "etcd_trouble": null,
         "computers": [computer("pc-1", "leading", 0, false), computer("pc-2", "following", 2, false),
                       computer("<b>pc-3", "following", 5, true)],
-        "takeovers": 1, "lost_writes": 0,
+        "takeovers": 1, "lost_writes": 0, "times_cut_off": 0,
         "last_takeover": {"at": time, "seconds": 2.04, "from": "pc-3", "in_order": false},
     });
     let mut browser = Browser::start(&robot.scratch);

@@ -38,19 +38,15 @@ pub struct Said {
     pub role: String,
     pub seq: u64,
     /// See [`Settings::boot`].
-    #[serde(default)]
     pub boot: String,
     /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
-    #[serde(default)]
     pub holds: Option<Holds>,
     /// The origin of a journal that this computer could not read from its beginning, or 0. Its leader checks that.
-    #[serde(default)]
     pub unreadable: u64,
     /// Changes when this process stops notifying nodes, because it no longer leads or is no longer cut off, and with
     /// each start. The leader then notifies all nodes of the present state, because they may have heard an older one
     /// last. Empty until the leader has the writes that this computer answered while cut off: before, its nodes would
     /// lose the publishers that were started meanwhile.
-    #[serde(default)]
     pub notifies: String,
 }
 
