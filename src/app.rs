@@ -2,18 +2,18 @@
 
 use std::{io, sync::Arc, time::Duration};
 
+use checkpoint_store::OpenError;
+use rescue_core::lifecycle::Action;
 use thiserror::Error;
 use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
-    checkpoint::store::OpenError,
     cluster::etcd::EtcdError,
     config::{Config, MasterConfig},
     gate::State,
     guardian::handover::Sockets,
     ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
-    lifecycle::Action,
     nodes,
     process::{ProcessError, Rosmaster, bypass},
     recovery::{Driver, master_process::MasterProcess},

@@ -7,14 +7,13 @@ use std::{
 };
 
 use ipnet::IpNet;
+use rescue_core::{
+    checkpoint::session::RestorePolicy, health::Reap, hide::Hide, lifecycle::Probing,
+};
 use thiserror::Error;
 
 use crate::{
-    checkpoint::session::RestorePolicy,
     cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice, SyncPolicy},
-    health::Reap,
-    hide::Hide,
-    lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
 };
 

@@ -21,6 +21,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::{
+    health::{Repeats, Unreachable, port_of},
+    order::Subject,
+};
 use tokio::sync::Notify;
 use tracing::Instrument;
 
@@ -37,14 +41,12 @@ use self::{
 };
 use crate::{
     gate::{self, State},
-    health::{Repeats, Unreachable, port_of},
     ledger::{
         Ledger,
         activity::NotifyingChange,
         owed::{Queued, Telling},
     },
     limit::rarely,
-    order::Subject,
     resolver,
     status::{report::HealthCheck, stats::Stats},
     wait,

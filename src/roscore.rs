@@ -9,6 +9,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::replay::ROSOUT;
+use ros1_master::{
+    master::{self, CALLER_ID, Method, Request},
+    xmlrpc::{Reply, Value},
+};
 use tokio::task::block_in_place;
 use tokio_util::sync::CancellationToken;
 
@@ -17,11 +22,8 @@ use crate::{
     gate,
     ledger::Ledger,
     limit::{Pair, alarm, all_clear},
-    master::{self, CALLER_ID, Method, Request},
     process::{self, Rosout},
-    replay::ROSOUT,
     write_queue::WriteQueue,
-    xmlrpc::{Reply, Value},
 };
 
 /// Time limit for `rosversion`, which is a Python program.

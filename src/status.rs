@@ -18,10 +18,11 @@ use std::{
     time::Instant,
 };
 
+use rescue_core::cluster::machine::Role;
 use serde::{Deserialize, Serialize};
 
 use self::report::{DIED, HealthCheck, LateAnswers, Report, STARTED};
-use crate::{cluster::machine::Role, gate::State};
+use crate::gate::State;
 
 /// Number of recovery reports that are kept.
 const REPORTS: usize = 20;
@@ -276,10 +277,8 @@ impl Board {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{
-        lifecycle::Cause,
-        status::report::{Phases, RecoveryOutcome},
-    };
+    use crate::status::report::{Phases, RecoveryOutcome};
+    use rescue_core::lifecycle::Cause;
 
     fn report(cause: &str, outcome: RecoveryOutcome, master_pid: i32) -> Report {
         Report {

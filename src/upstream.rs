@@ -23,6 +23,8 @@ use hyper::{
     ext::ReasonPhrase,
     header::{HeaderValue, SERVER},
 };
+use rescue_core::lifecycle::OpenCalls;
+use ros1_master::xmlrpc::{self, Python, Reply};
 use socket2::{SockRef, TcpKeepalive};
 use thiserror::Error;
 use tokio::{net::TcpStream, sync::watch, time::timeout};
@@ -30,12 +32,7 @@ use tokio::{net::TcpStream, sync::watch, time::timeout};
 pub(crate) use self::connection::Connection;
 pub(crate) use self::verify::VerifyError;
 use self::{sentinel::Sentinel, verify::Verification};
-use crate::{
-    lifecycle::OpenCalls,
-    resolver,
-    ros_env::MasterUri,
-    xmlrpc::{self, Python, Reply},
-};
+use crate::{resolver, ros_env::MasterUri};
 
 /// Largest accepted reply of the master, in bytes. The XML of a parameter tree of 64 MiB is
 /// smaller.

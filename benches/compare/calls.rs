@@ -2,7 +2,7 @@
 
 use std::{io, time::Duration};
 
-use rosrescue::xmlrpc::{self, Struct, Value};
+use ros1_master::xmlrpc::{self, Struct, Value};
 use serde::{Serialize, Serializer};
 
 use crate::{

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use serde::Serialize;
 
 use crate::{

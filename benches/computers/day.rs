@@ -17,16 +17,18 @@ use std::{
 };
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
-use rosrescue::{
+use rescue_core::{
     checkpoint::format::{Checkpoint, Record, RecordContent},
     cluster::{
         journal::{self, Keys},
         machine::{EtcdAnswer, Op, Settings},
-        replica::Replica,
     },
+};
+use ros1_master::{
     master::{Master, Request},
     xmlrpc::{Call, Value},
 };
+use rosrescue::cluster::replica::Replica;
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 

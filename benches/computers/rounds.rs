@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::xmlrpc::{Reply, Value};
+use ros1_master::xmlrpc::{Reply, Value};
 use serde::Serialize;
 
 use crate::{

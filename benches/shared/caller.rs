@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::xmlrpc::{Reply, Value};
+use ros1_master::xmlrpc::{Reply, Value};
 
 use super::support::{Client, Wire, http_request};
 

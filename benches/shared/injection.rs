@@ -1,6 +1,6 @@
 //! Gives a state to an empty rosmaster in as few bytes and calls as possible.
 
-use rosrescue::xmlrpc::{self, Call};
+use ros1_master::xmlrpc::{self, Call};
 
 use super::support::{State, params};
 

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::xmlrpc::{self, Reply, Value};
+use ros1_master::xmlrpc::{self, Reply, Value};
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpStream,

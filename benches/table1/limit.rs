@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::xmlrpc::{self, Value};
+use ros1_master::xmlrpc::{self, Value};
 
 use crate::{
     robot::Robot,

@@ -8,10 +8,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rosrescue::{
-    clock,
-    xmlrpc::{Reply, Value},
-};
+use ros1_master::xmlrpc::{Reply, Value};
+use rosrescue::clock;
 use rustix::process::Signal;
 use serde_json::Value as Json;
 

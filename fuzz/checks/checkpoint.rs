@@ -5,11 +5,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use rosrescue::checkpoint::format::{self, Checkpoint, Label, Origin, Record, RecordContent};
-use rosrescue::checkpoint::session::{Rebuilt, rebuild};
-use rosrescue::checkpoint::store::{FileId, FileStatus, Loaded, Storage, Store};
-use rosrescue::master::Master;
-use rosrescue::xmlrpc::Call;
+use checkpoint_store::{FileId, FileStatus, Loaded, Storage, Store};
+use rescue_core::checkpoint::{
+    format::{self, Checkpoint, Label, Origin, Record, RecordContent},
+    session::{Rebuilt, rebuild},
+};
+use ros1_master::{master::Master, xmlrpc::Call};
 
 /// Separates the present file from its previous generation, which may follow it.
 const PREVIOUS: &[u8] = b"=== previous generation ===\n";

@@ -1,10 +1,12 @@
 //! Checks that must hold for any bytes that are received as XML-RPC.
 
-use rosrescue::master::{Master, Request};
-use rosrescue::replay;
-use rosrescue::xmlrpc::{
-    Call, Python, Reply, Value, decode_call, decode_call_for, decode_reply, encode_call,
-    encode_reply,
+use rescue_core::replay;
+use ros1_master::{
+    master::{Master, Request},
+    xmlrpc::{
+        Call, Python, Reply, Value, decode_call, decode_call_for, decode_reply, encode_call,
+        encode_reply,
+    },
 };
 
 /// Panics if decoding panics, or if a decoded document is not the same after it was encoded and decoded

@@ -5,18 +5,18 @@ use std::{
     time::{Duration, Instant},
 };
 
+use checkpoint_store::history;
+use rescue_core::lifecycle::{Patience, Supervision};
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::{context::Context, startup::Beginning};
 use crate::{
-    checkpoint::store::history,
     clock,
     config::{Config, MasterConfig},
     gate,
     guardian::handover,
     ledger::Ledger,
-    lifecycle::{Patience, Supervision},
     nodes::{Nodes, local::LocalNodes, served::Served},
     process::Rosmaster,
     recovery::report_file,

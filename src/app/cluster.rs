@@ -15,6 +15,20 @@ use std::{
 };
 
 use bytes::Bytes;
+use rescue_core::{
+    checkpoint::{
+        format::{Checkpoint, Origin},
+        session::{self, Decision, RestorePolicy, SessionEvidence},
+    },
+    cluster::{
+        journal::{self, Keys, Manifest, Put},
+        machine::{EtcdAnswer, Op, Settings, View},
+        member::{Action, Entry, Heard, Input, Member, PROBES, Read},
+        merge::wire::{self, Ask},
+        standing::{Place, Standing},
+    },
+};
+use ros1_master::{master::Master, xmlrpc};
 use tokio::{
     sync::{mpsc, oneshot, watch},
     task::JoinSet,
@@ -25,23 +39,13 @@ pub(super) use self::join::{ClusterSetup, join};
 use self::{facts::Known, kept::Kept, trouble::Trouble};
 use super::{RunError, context::MasterDuties, life};
 use crate::{
-    checkpoint::{
-        format::{Checkpoint, Origin},
-        session::{self, Decision, RestorePolicy, SessionEvidence},
-    },
     cluster::{
         etcd::{self, Etcd, KeyChange, Kv, Watch, WatchEnd},
-        journal::{self, Keys, Manifest, Put},
-        machine::{EtcdAnswer, Op, Settings, View},
-        member::{Action, Entry, Heard, Input, Member, PROBES, Read},
-        merge::wire::{self, Ask},
         replica::{LoadedState, Replica},
-        standing::{Place, Standing},
     },
     gate::State,
     guardian::handover,
     limit::rarely,
-    master::Master,
     nodes::notifications,
     process::ProcessError,
     recovery::master_process::MasterProcess,
@@ -52,7 +56,6 @@ use crate::{
     upstream::{Head, peer::Peers},
     wait,
     write_queue::WriteQueue,
-    xmlrpc,
 };
 
 /// Time limit of one request to etcd that is sent in the background.

@@ -6,13 +6,13 @@ use std::{
     time::Duration,
 };
 
+use rescue_core::lifecycle::{Action, Probing, Supervision};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     gate,
     ledger::{Ledger, history::Rescues},
-    lifecycle::{Action, Probing, Supervision},
     nodes::{Nodes, served::Served},
     process::{ProcessError, Rosmaster},
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},

@@ -6,11 +6,11 @@ use std::{
     time::Duration,
 };
 
+use rescue_core::health::{Reach, port_of};
+use ros1_master::master::{self, Master};
 use tokio::task::JoinSet;
 
 use crate::{
-    health::{Reach, port_of},
-    master::{self, Master},
     nodes::{
         client::{self, Reaction},
         origin,

@@ -5,20 +5,15 @@ use std::{
     time::Duration,
 };
 
-use super::{RunError, life};
-use crate::{
-    checkpoint::{
-        folder,
-        format::Session,
-        session::{self, Decision, Rebuilt, SessionEvidence},
-        store::{self, OpenError, Store, history},
-    },
-    clock,
-    config::Config,
-    guardian::handover,
-    master::{Displaced, Master, Request},
-    wait,
+use checkpoint_store::{OpenError, Store, folder, history};
+use rescue_core::checkpoint::{
+    format::Session,
+    session::{self, Decision, Rebuilt, SessionEvidence},
 };
+use ros1_master::master::{Displaced, Master, Request};
+
+use super::{RunError, life};
+use crate::{clock, config::Config, guardian::handover, wait};
 
 /// How long the disk may take to open the checkpoint. Calls wait during this time.
 const OPENING: Duration = Duration::from_secs(20);
@@ -51,7 +46,12 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             store.keep_log(own.log_bytes());
         }
         found.report(opened.is_ok());
-        opened.map_err(|error| (store::read(path).ok().flatten().map(Box::new), error))
+        opened.map_err(|error| {
+            (
+                checkpoint_store::read(path).ok().flatten().map(Box::new),
+                error,
+            )
+        })
     });
     let (mut store, loaded) = match opened.await {
         Some(Ok((store, loaded))) => (Some(store), loaded),

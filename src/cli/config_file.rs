@@ -5,6 +5,7 @@
 
 use std::{collections::BTreeSet, ffi::OsString, path::PathBuf};
 
+use checkpoint_store::regular_file::read_small;
 use clap::{
     Arg, ArgMatches, Command, Id,
     error::{ContextKind, ContextValue, ErrorKind},
@@ -12,8 +13,6 @@ use clap::{
 };
 use serde::Serialize;
 use toml::{Table, Value};
-
-use crate::regular_file::read_small;
 
 /// The option that names the file.
 const OPTION: &str = "config";

@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use rescue_core::hide::Hide;
 
 use super::{HideArgs, OutputArgs, TargetArgs, When};
-use crate::hide::Hide;
 
 /// Where the checkpoints are.
 #[derive(Args, Clone, Debug)]

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
+use rescue_core::hide::{self, Hide};
 
 use super::{
     ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, LogArgs, OptionValue,
     ParamsArgs, ReportArgs, RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
-use crate::hide::{self, Hide};
 
 /// The commands other than `core` and `proxy`.
 #[derive(Debug, Subcommand)]

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use rescue_core::checkpoint::format::{self, Checkpoint, Record};
 use thiserror::Error;
 
 use super::{
@@ -9,7 +10,6 @@ use super::{
     journal::{self, JournalError, Keys, Manifest, Progress, Put},
     machine::{EtcdAnswer, Op, Settings, View},
 };
-use crate::checkpoint::format::{self, Checkpoint, Record};
 
 /// How often a read starts over because etcd was compacted meanwhile.
 const ATTEMPTS: usize = 5;

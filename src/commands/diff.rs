@@ -2,11 +2,11 @@
 
 use std::fmt;
 
+use rescue_core::checkpoint::compare::{Described, compare};
 use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
 use crate::{
-    checkpoint::compare::{Described, compare},
     cli::DiffArgs,
     printable::{Lines, Page, display_lines, line},
 };

@@ -14,6 +14,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use checkpoint_store::history;
+use ros1_master::xmlrpc::Value;
 use tokio::{
     signal::unix::{SignalKind, signal},
     task::JoinHandle,
@@ -31,11 +33,9 @@ use self::{
 };
 use super::{CommandFailure, Exit, counted, print, running::Running};
 use crate::{
-    checkpoint::store::history,
     cli::{DrillArgs, Victim},
     process,
     status::summary::Status,
-    xmlrpc::Value,
 };
 
 const PREFIX: &str = history::DRILLS;

@@ -7,22 +7,23 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use checkpoint_store::{
+    OpenError, history,
+    log::{KnownTimes, NoPast, PastState, past_state},
+};
+use rescue_core::checkpoint::{
+    format::{RecordContent, Session},
+    session,
+};
+use ros1_master::master::{Master, Request};
+
 use super::{
     CommandFailure, note,
     running::{Running, is_here},
 };
 use crate::{
-    checkpoint::{
-        format::{RecordContent, Session},
-        session,
-        store::{
-            self, OpenError, history,
-            log::{KnownTimes, NoPast, PastState, past_state},
-        },
-    },
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
     clock, config,
-    master::{Master, Request},
     ros_env::DEFAULT_MASTER_PORT,
 };
 
@@ -157,7 +158,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
     if metadata.len() > LARGE && io::stderr().is_terminal() {
         eprintln!("reading `{shown}`, {} …", size(metadata.len()));
     }
-    let loaded = store::read(path).map_err(|error| {
+    let loaded = checkpoint_store::read(path).map_err(|error| {
         CommandFailure::Usage(match error {
             OpenError::NotACheckpoint { .. } => format!("`{shown}` is not a rosrescue checkpoint"),
             OpenError::OtherVersion { version, .. } => format!(

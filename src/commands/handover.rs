@@ -2,6 +2,8 @@
 
 use std::{fmt, time::Duration};
 
+use rescue_core::cluster::machine::Role;
+use ros1_master::xmlrpc::{Reply, Value};
 use serde::Serialize;
 use tokio::time::{Instant, sleep};
 
@@ -11,11 +13,9 @@ use super::{
 };
 use crate::{
     cli::HandoverArgs,
-    cluster::machine::Role,
     printable::{Lines, Page, display_lines},
     server::others::HANDOVER,
     status::computers::{Computers, LeaderStatus},
-    xmlrpc::{Reply, Value},
 };
 
 /// The caller id with which this command makes its call.

@@ -2,6 +2,11 @@
 
 use std::{collections::BTreeMap, fmt};
 
+use rescue_core::{
+    checkpoint::{compare::plain, format::shown},
+    hide::{Hide, Masked},
+};
+use ros1_master::master::{Counts, Master};
 use serde::Serialize;
 
 use super::{
@@ -10,11 +15,8 @@ use super::{
     print,
 };
 use crate::{
-    checkpoint::{compare::plain, format::shown},
     cli::InspectArgs,
     clock,
-    hide::{Hide, Masked},
-    master::{Counts, Master},
     printable::{Lines, Page, display_lines, line},
 };
 

@@ -2,15 +2,17 @@
 
 use std::{fmt::Display, time::Duration};
 
+use rescue_core::replay::Token;
+use ros1_master::{
+    master::{Master, Request},
+    xmlrpc::{Reply, Value},
+};
 use tokio::{net::TcpStream, time::timeout};
 
 use super::{CommandFailure, running::Running};
 use crate::{
-    master::{Master, Request},
-    replay::Token,
     resolver,
     upstream::{Connection, inspect},
-    xmlrpc::{Reply, Value},
 };
 
 /// Longest time to connect.

@@ -4,22 +4,18 @@ use std::{
     collections::VecDeque, io, num::NonZero, path::Path, thread::ScopedJoinHandle, time::Duration,
 };
 
+use checkpoint_store::log::{LogFile, files as log_files};
+use rescue_core::checkpoint::{
+    compare::{Difference, What},
+    format,
+    log::{Entry, LogReader},
+    putback::is_in,
+};
 use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, note, print_line};
 use crate::{
-    checkpoint::{
-        compare::{Difference, What},
-        format,
-        log::{Entry, LogReader},
-        putback::is_in,
-        store::log::{LogFile, files as log_files},
-    },
-    cli::LogArgs,
-    clock,
-    printable::Printable,
-    recovery::report_file,
-    status::report::Report,
+    cli::LogArgs, clock, printable::Printable, recovery::report_file, status::report::Report,
 };
 
 /// Pause between two looks at the checkpoint with `--follow`.

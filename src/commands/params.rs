@@ -5,15 +5,17 @@ use std::{
     io::{self, Write},
 };
 
+use rescue_core::{
+    checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
+    hide::{Hide, Masked},
+};
+use ros1_master::xmlrpc::{Struct, Value};
 use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, note, print};
 use crate::{
-    checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
     cli::ParamsArgs,
-    hide::{Hide, Masked},
     printable::{Lines, Page, display_lines},
-    xmlrpc::{Struct, Value},
 };
 
 pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, CommandFailure> {

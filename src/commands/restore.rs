@@ -7,19 +7,23 @@ use std::{
     time::{Duration, Instant},
 };
 
-use serde::Serialize;
-
-use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
-use crate::{
+use rescue_core::{
     checkpoint::{
         format::shown,
         putback::{LeftOut, ParamChanges},
     },
-    cli::RestoreArgs,
     hide::Hide,
+};
+use ros1_master::{
     master::{CALLER_ID, Master, Method, Request},
-    printable::{Lines, Page, display_lines, line},
     xmlrpc::Value,
+};
+use serde::Serialize;
+
+use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
+use crate::{
+    cli::RestoreArgs,
+    printable::{Lines, Page, display_lines, line},
 };
 
 /// Maximum number of calls in one multicall; its size is limited as well. Other callers get their turn between two

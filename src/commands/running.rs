@@ -10,6 +10,7 @@ use hyper::{
     header::{ACCEPT, CONTENT_TYPE, HOST},
 };
 use hyper_util::rt::TokioIo;
+use ros1_master::xmlrpc::{self, Call, Reply, Value};
 use serde::Deserialize;
 use tokio::{
     net::TcpStream,
@@ -22,7 +23,6 @@ use crate::{
     resolver,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
     status::summary::{SCHEMA, Status},
-    xmlrpc::{self, Call, Reply, Value},
 };
 
 /// Longest time for rosrescue to answer. It needs only milliseconds, because it waits for no other process.

@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use ros1_master::master::Counts;
 use serde::Serialize;
 use tokio::{
     signal::unix::{Signal, SignalKind, signal},
@@ -20,7 +21,6 @@ use super::{
 use crate::{
     cli::TopArgs,
     clock,
-    master::Counts,
     printable::{Lines, Page, Printable, display_lines, line},
     status::{
         computers::Computers,

@@ -2,12 +2,12 @@
 
 use std::fmt;
 
+use ros1_master::master::Counts;
 use serde::Serialize;
 
 use super::{CommandFailure, Exit, files, print};
 use crate::{
     cli::VerifyArgs,
-    master::Counts,
     printable::{Lines, Page, display_lines, line},
 };
 

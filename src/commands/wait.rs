@@ -2,6 +2,10 @@
 
 use std::{fmt, time::Duration};
 
+use ros1_master::{
+    master::Method,
+    xmlrpc::{Reply, Value},
+};
 use serde::Serialize;
 use tokio::time::{Instant, sleep_until};
 
@@ -11,10 +15,8 @@ use super::{
 };
 use crate::{
     cli::{For, WaitArgs},
-    master::Method,
     printable::{Lines, Page, display_lines},
     status::{condition::ConditionName, summary::Status},
-    xmlrpc::{Reply, Value},
 };
 
 /// Pause between two checks of the conditions.

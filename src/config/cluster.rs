@@ -7,13 +7,13 @@ use std::{
     time::Duration,
 };
 
+use checkpoint_store::regular_file::read_small;
 use hyper::Uri;
 use thiserror::Error;
 
 pub use crate::cli::{ClusterSync, WhenCutOff};
 use crate::{
     cli::{ClusterArgs, cluster::name},
-    regular_file::read_small,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 

@@ -8,6 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::health::port_of;
 use rustix::{
     io::Errno,
     net::{AddressFamily, SocketFlags, SocketType, bind, netlink::SocketAddrNetlink, socket_with},
@@ -15,7 +16,7 @@ use rustix::{
 use tokio::net::unix::pipe::Receiver;
 
 use super::{Nodes, notifications, origin};
-use crate::{clock, health::port_of, limit::rarely, resolver, status::summary::LostAddress, wait};
+use crate::{clock, limit::rarely, resolver, status::summary::LostAddress, wait};
 
 /// When to look after a change. A route or a Wi-Fi connection may come a little later than the address.
 const LOOKS: [Duration; 3] = [

@@ -5,18 +5,16 @@ use std::{
     time::Duration,
 };
 
+use rescue_core::health::Claims;
+use ros1_master::{
+    master::{self, question},
+    xmlrpc::{Call, Reply, Value},
+};
 use socket2::SockRef;
 use tokio::{net::TcpStream, time::timeout};
 
-pub(crate) use crate::health::Reaction;
-use crate::{
-    health::Claims,
-    master::{self, question},
-    resolver,
-    ros_env::MasterUri,
-    upstream::Connection,
-    xmlrpc::{Call, Reply, Value},
-};
+use crate::{resolver, ros_env::MasterUri, upstream::Connection};
+pub(crate) use rescue_core::health::Reaction;
 
 /// Largest accepted reply of a node, in bytes.
 const MAX_REPLY: usize = 16 << 20;

@@ -19,23 +19,26 @@ use super::{
     notifications,
 };
 use crate::status::report::{HealthCheck, RecoveryOutcome};
-use tracing::Instrument;
-
-use crate::{
-    gate::State,
+use rescue_core::{
     health::{
         IdentityVerdict, Reach, Reconciliation, Refusal, RegisteredName, Registration, judge,
         judge_refusal, port_of,
     },
-    ledger::activity::LastCalls,
-    ledger::owed::Telling,
-    master::{self, CALLER_ID, Kind, Method, Request, question},
     replay::Token,
+};
+use ros1_master::{
+    master::{self, CALLER_ID, Kind, Method, Request, question},
+    xmlrpc::{Reply, Value},
+};
+use tracing::Instrument;
+
+use crate::{
+    gate::State,
+    ledger::{activity::LastCalls, owed::Telling},
     resolver,
     ros_env::MasterUri,
     task::boxed,
     write_queue::batch::{self, Precondition},
-    xmlrpc::{Reply, Value},
 };
 
 /// Pause before a node is asked again to confirm a removal.

@@ -7,8 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::health::port_of;
+use ros1_master::master;
+
 use super::{Nodes, client};
-use crate::{health::port_of, master};
 
 /// Delay between a node's last registration and the question, because starting nodes are busy.
 pub(super) const IDENTIFY_AFTER: Duration = Duration::from_secs(2);

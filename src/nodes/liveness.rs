@@ -8,6 +8,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::{
+    health::{self, Evidence, Health, port_of},
+    replay::Token,
+};
+use ros1_master::master;
 use tokio::{
     sync::Semaphore,
     time::{MissedTickBehavior, interval},
@@ -22,10 +27,7 @@ use super::{
 use crate::{
     clock,
     gate::State,
-    health::{self, Evidence, Health, port_of},
     limit::rarely,
-    master,
-    replay::Token,
     resolver,
     status::{condition::NodesTrouble, summary::IllNode},
     upstream::sockets,

@@ -8,20 +8,22 @@ use std::{
     time::Instant,
 };
 
+use rescue_core::{
+    health::{
+        AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
+        Reach, Reap, Registrants, port_of,
+    },
+    replay::Token,
+};
+use ros1_master::master::{Master, Request};
 use tokio::sync::Notify;
 
 use super::{Nodes, health_check, liveness, origin::say_misaddressed};
 use crate::{
     clock,
-    health::{
-        AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
-        Reach, Reap, Registrants, port_of,
-    },
     ledger::{Ledger, activity::LastCalls},
     limit::rarely,
-    master::{Master, Request},
     process::listeners,
-    replay::Token,
     resolver,
     status::{stats::Stats, summary::Misaddressed},
     upstream::sockets,

@@ -1,6 +1,6 @@
 //! Sends notifications in place of the master, or repeats those that the master has not sent or will send late.
 //!
-//! Each port gets its notifications in [order](crate::order), one at a time. A node that does not answer delays no
+//! Each port gets its notifications in [order](rescue_core::order), one at a time. A node that does not answer delays no
 //! other node.
 
 use std::{
@@ -9,19 +9,18 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::{
+    health::{Claims, port_of},
+    order::{NextNotification, Order, Subject},
+};
+use ros1_master::master::{self, Displaced, Master};
 use tokio::sync::Semaphore;
 
 use super::{
     Nodes,
     client::{self, Reaction},
 };
-use crate::{
-    health::{Claims, port_of},
-    limit::rarely,
-    master::{self, Displaced, Master},
-    order::{NextNotification, Order, Subject},
-    wait,
-};
+use crate::{limit::rarely, wait};
 
 /// Number of nodes that are notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;

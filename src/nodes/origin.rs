@@ -7,16 +7,11 @@ use std::{
     time::Duration,
 };
 
+use rescue_core::health::{Reach, port_of};
 use tokio::time::timeout;
 
 use super::Nodes;
-use crate::{
-    health::{Reach, port_of},
-    limit::rarely,
-    resolver,
-    ros_env::MasterUri,
-    status::summary::Misaddressed,
-};
+use crate::{limit::rarely, resolver, ros_env::MasterUri, status::summary::Misaddressed};
 
 /// The addresses to which the host of `api` leads from here. `None` if it has none within `limit`.
 pub(crate) async fn addresses(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {

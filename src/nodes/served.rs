@@ -5,11 +5,10 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-use crate::{
-    health::port_of,
-    master::{Request, Write},
-    ros_env::MasterUri,
-};
+use rescue_core::health::port_of;
+use ros1_master::master::{Request, Write};
+
+use crate::ros_env::MasterUri;
 
 /// Maximum number of hosts that are remembered. A robot has few.
 const MOST: usize = 1024;
@@ -49,7 +48,7 @@ fn host_of(api: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Method;
+    use ros1_master::master::Method;
 
     #[test]
     fn a_host_is_ours_once_a_node_there_has_registered_here() {

@@ -8,10 +8,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::health::Rates;
 use tokio::sync::{Mutex as Turn, OwnedMutexGuard, Semaphore, SemaphorePermit};
 
 use super::client;
-use crate::health::Rates;
 
 /// Number of nodes that are asked at the same time. Each takes two file descriptors, at most until its deadline.
 const AT_ONCE: usize = 64;

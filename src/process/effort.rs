@@ -3,7 +3,7 @@
 
 use std::{fs, time::Duration};
 
-use crate::lifecycle::evidence::Effort;
+use rescue_core::lifecycle::evidence::Effort;
 
 /// Maximum number of processes that are counted together.
 const FAMILY_MOST: usize = 64;

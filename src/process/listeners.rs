@@ -5,11 +5,10 @@ use std::{
     fs,
 };
 
+use rescue_core::health::{Owner, Process};
+
 use super::Stat;
-use crate::{
-    health::{Owner, Process},
-    upstream::sockets,
-};
+use crate::upstream::sockets;
 
 /// The program that listens at the port of a master that rosrescue started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -12,8 +12,10 @@ use std::{
     time::Duration,
 };
 
+use checkpoint_store::regular_file;
+
 use super::beside;
-use crate::{limit::rarely, regular_file, wait};
+use crate::{limit::rarely, wait};
 
 /// How long the disk may delay a master. After that the master starts without the file.
 pub(super) const LIMIT: Duration = Duration::from_millis(250);

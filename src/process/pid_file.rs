@@ -9,8 +9,10 @@ use std::{
     thread,
 };
 
+use checkpoint_store::regular_file;
+
 use super::{Stat, beside, output};
-use crate::{regular_file, wait};
+use crate::wait;
 
 /// Largest PID file, in bytes.
 const LONGEST: u64 = 1024;

@@ -9,9 +9,9 @@ use hyper::{
     HeaderMap, StatusCode,
     header::{HOST, ORIGIN},
 };
+use ros1_master::master::{MASTER, Request};
 
 use super::hosts::without_dot;
-use crate::master::{MASTER, Request};
 
 /// A refused request.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -5,12 +5,11 @@ use std::{io, time::Duration};
 use bytes::Bytes;
 use http_body_util::BodyExt;
 use hyper::body::{Body, Incoming};
+use ros1_master::xmlrpc::Value;
 use tokio::{
     sync::{Semaphore, SemaphorePermit},
     time::{Instant, timeout, timeout_at},
 };
-
-use crate::xmlrpc::Value;
 
 /// Larger bodies, in bytes, reserve memory and are decoded outside of the runtime. Decoding this much takes some 0.3
 /// ms.

@@ -7,6 +7,11 @@ use std::{
 };
 
 use bytes::Bytes;
+use rescue_core::{checkpoint::format::Origin, cluster::sharing::Source};
+use ros1_master::{
+    master::{Kind, Master, Method, Request},
+    xmlrpc::{self, ListWriter, Reply, Value},
+};
 use thiserror::Error;
 use tokio::sync::Mutex;
 
@@ -21,13 +26,10 @@ use super::{
     },
 };
 use crate::{
-    checkpoint::format::Origin,
     cli::Reads,
-    cluster::sharing::Source,
     gate::{self, State},
     ledger::{Ledger, delivery::Delivery},
     limit::rarely,
-    master::{Kind, Master, Method, Request},
     resolver,
     status::stats::Stats,
     upstream::{Head, pool::Pool},
@@ -36,7 +38,6 @@ use crate::{
         batch::{self, AnswerAndDelivery, CallAnswer, Item},
         parts::Parts,
     },
-    xmlrpc::{self, ListWriter, Reply, Value},
 };
 
 /// A call is not answered, and its connection is closed, so that the node calls again. An error made up by rosrescue

@@ -6,12 +6,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::calls::Calls;
-use crate::{
+use ros1_master::{
     master::{Method, Request},
-    upstream::RawReply,
     xmlrpc::{self, Reply},
 };
+
+use super::calls::Calls;
+use crate::upstream::RawReply;
 
 /// Shortest time between two comparisons, because each decodes the whole answer.
 const PAUSE: Duration = Duration::from_secs(1);

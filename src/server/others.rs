@@ -9,6 +9,18 @@ use std::{
 
 use bytes::Bytes;
 use hyper::header::HeaderValue;
+use rescue_core::{
+    cluster::{
+        journal::RECORD_BYTES_MAX,
+        sharing::Source,
+        standing::{Pass, Place, Standing},
+    },
+    order::ANSWER_LIMIT,
+};
+use ros1_master::{
+    master::{Kind, Request},
+    xmlrpc::{self, Reply},
+};
 use tokio::{
     runtime::Handle,
     sync::{mpsc, oneshot, watch},
@@ -29,20 +41,12 @@ use super::{
     replies::{HttpReply, UntilWritten, forwarded, no_such_page, text, xml},
 };
 use crate::{
-    cluster::{
-        journal::RECORD_BYTES_MAX,
-        sharing::Source,
-        standing::{Pass, Place, Standing},
-    },
-    master::{Kind, Request},
     nodes::served::Served,
-    order::ANSWER_LIMIT,
     ros_env::MasterUri,
     upstream::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
     },
-    xmlrpc::{self, Reply},
 };
 
 /// Pause before a call is sent to the same leader again.

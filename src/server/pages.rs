@@ -20,6 +20,7 @@ pub(crate) mod status;
 
 use std::sync::Arc;
 
+use checkpoint_store::log::KnownTimes;
 use hyper::{
     HeaderMap, StatusCode, Uri,
     header::{
@@ -27,6 +28,8 @@ use hyper::{
         REFERRER_POLICY, VARY, X_CONTENT_TYPE_OPTIONS,
     },
 };
+use rescue_core::hide::Hide;
+use ros1_master::{master::Master, xmlrpc::Struct};
 use serde::Serialize;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
@@ -38,11 +41,8 @@ use super::{
     replies::{HttpReply, page as reply, text},
 };
 use crate::{
-    checkpoint::store::log::KnownTimes,
     gate,
-    hide::Hide,
     ledger::Ledger,
-    master::Master,
     nodes::Nodes,
     printable::plain_json,
     process::usage,
@@ -52,7 +52,6 @@ use crate::{
         stats::Stats,
     },
     upstream::Upstream,
-    xmlrpc::Struct,
 };
 
 const HTML: &str = "text/html; charset=utf-8";

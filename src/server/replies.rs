@@ -15,14 +15,16 @@ use hyper::{
     ext::ReasonPhrase,
     header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER},
 };
+use ros1_master::{
+    master::Request,
+    xmlrpc::{self, Python, Reply, Value},
+};
 use tokio::sync::mpsc;
 
 use crate::{
     ledger::delivery::Delivery,
-    master::Request,
     upstream::{Head, RawReply},
     write_queue::batch,
-    xmlrpc::{self, Python, Reply, Value},
 };
 
 /// The first bytes of everything that is compressed with gzip.

@@ -12,6 +12,10 @@ use hyper::{
     body::Incoming,
     header::{CONNECTION, CONTENT_ENCODING, HeaderValue},
 };
+use ros1_master::{
+    master::{self, Kind, Master},
+    xmlrpc::{Python, Reply},
+};
 
 use super::{
     Server,
@@ -26,12 +30,10 @@ use super::{
 };
 use crate::{
     limit::rarely,
-    master::{self, Kind, Master},
     upstream::{
         Head, INSTANCE_HEADER, open_requests,
         peer::{CALLER_HEADER, HOLD_HEADER},
     },
-    xmlrpc::{Python, Reply},
 };
 
 /// The answer to a client on another computer if rosrescue cannot decode its body. The master may be able to decode it,

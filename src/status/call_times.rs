@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use crate::master::Kind;
+use ros1_master::master::Kind;
 
 /// Upper bounds of the buckets, in microseconds. The last bucket has none.
 const BOUNDS: [u64; 14] = [

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::cluster::machine::Role;
+use rescue_core::cluster::machine::Role;
 
 /// This computer's role, and the facts about the other computers. `app::cluster` fills it.
 #[derive(Clone, Debug)]

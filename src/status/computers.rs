@@ -2,12 +2,12 @@
 
 use std::fmt;
 
+use rescue_core::cluster::machine::Role;
 use serde::{Deserialize, Serialize};
 
 use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
 use crate::{
     clock,
-    cluster::machine::Role,
     printable::{Page, line},
     ros_env::MasterUri,
 };

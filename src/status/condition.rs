@@ -8,13 +8,14 @@ use std::{
     time::Instant,
 };
 
+use rescue_core::health::Feud;
 use serde::{Deserialize, Serialize};
 
 use super::{
     Facts, Guarded, Mode,
     summary::{IllNode, LostAddress, Misaddressed, some},
 };
-use crate::{clock, gate::State, health::Feud};
+use crate::{clock, gate::State};
 
 /// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

@@ -5,13 +5,14 @@
 
 use std::fmt::{Display, Write};
 
+use rescue_core::{cluster::machine::Role, health::Health};
+
 use super::{
     computers::Computers,
     condition::ConditionName,
     stats::Stats,
     summary::{NodesStatus, Status},
 };
-use crate::{cluster::machine::Role, health::Health};
 
 /// Number of nodes that have a line of their own.
 const ILL_MOST: usize = 100;

@@ -2,9 +2,10 @@
 
 use std::{fmt, time::Duration};
 
+use ros1_master::master::Counts;
 use serde::{Deserialize, Serialize};
 
-use crate::{clock, master::Counts};
+use crate::clock;
 use crate::{
     limit::{Pair, all_clear, rarely},
     printable::{Lines, Page, display_lines, line},

@@ -2,6 +2,8 @@
 
 use std::{collections::BTreeMap, fmt, net::IpAddr};
 
+use rescue_core::health::{Feud, Health};
+use ros1_master::master::Counts;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -12,8 +14,6 @@ use super::{
 };
 use crate::{
     clock,
-    health::{Feud, Health},
-    master::Counts,
     printable::{Lines, Page, display_lines, line},
 };
 

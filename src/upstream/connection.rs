@@ -19,6 +19,7 @@ use hyper::{
     },
 };
 use hyper_util::rt::TokioIo;
+use ros1_master::xmlrpc::{self, Call, Python, Reply};
 use tokio::{net::TcpStream, time::timeout};
 
 use super::{
@@ -27,10 +28,7 @@ use super::{
     peer::{CALLER_HEADER, HOLD_HEADER},
     python,
 };
-use crate::{
-    ros_env::MasterUri,
-    xmlrpc::{self, Call, Python, Reply},
-};
+use crate::ros_env::MasterUri;
 
 /// Size in bytes from which a reply takes more than a millisecond to decode.
 const LONG: usize = 256 << 10;

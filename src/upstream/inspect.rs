@@ -1,13 +1,11 @@
 //! Reads a master's state over a connection.
 
+use rescue_core::replay::{Inspection, NotAMaster, Token};
+use ros1_master::master::{Master, Request};
 use thiserror::Error;
 
 use super::{CallError, Connection};
-use crate::{
-    limit::rarely,
-    master::{Master, Request},
-    replay::{Inspection, NotAMaster, Token},
-};
+use crate::limit::rarely;
 
 /// Why a master's state could not be read.
 #[derive(Debug, Error)]

@@ -69,13 +69,11 @@ mod tests {
     use hyper::{HeaderMap, StatusCode};
 
     use super::*;
-    use crate::{
-        replay::Token,
-        upstream::{
-            Upstream, test_master,
-            verify::{self, Verification},
-        },
+    use crate::upstream::{
+        Upstream, test_master,
+        verify::{self, Verification},
     };
+    use rescue_core::replay::Token;
 
     fn reply(keeps_alive: bool) -> RawReply {
         RawReply {

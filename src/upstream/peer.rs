@@ -10,10 +10,11 @@ use std::{
 
 use bytes::Bytes;
 use hyper::StatusCode;
+use ros1_master::{master, xmlrpc};
 use thiserror::Error;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
-use crate::{master, ros_env::MasterUri, xmlrpc};
+use crate::ros_env::MasterUri;
 
 /// Maximum number of idle connections that are kept.
 const IDLE_MOST: usize = 64;

@@ -6,6 +6,7 @@ use std::sync::{
 };
 
 use bytes::Bytes;
+use rescue_core::replay::Token;
 use thiserror::Error;
 use tokio::sync::Semaphore;
 
@@ -17,7 +18,6 @@ use super::{
 use crate::{
     gate::{self, State},
     ledger::Ledger,
-    replay::Token,
 };
 
 /// Why a read got no reply from the master.

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
+use rescue_core::replay::Token;
 use thiserror::Error;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream, sentinel::Sentinel};
-use crate::replay::Token;
 
 /// Why it is unknown whether a connection leads to the master process that holds the present state.
 #[derive(Debug, Error)]

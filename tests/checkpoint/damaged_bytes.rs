@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use indexmap::IndexMap;
-use rosrescue::checkpoint::format::{
+use rescue_core::checkpoint::format::{
     Checkpoint, Decoded, FormatError, Label, Origin, Record, RecordContent, Session, SnapshotError,
     Stamp, decode, encode_checkpoint, encode_record,
 };
-use rosrescue::master::{Snapshot, SnapshotNode};
-use rosrescue::xmlrpc::{Call, Struct, Value};
+use ros1_master::{
+    master::{Snapshot, SnapshotNode},
+    xmlrpc::{Call, Struct, Value},
+};
 
 fn checkpoint(seq: u64) -> Checkpoint {
     Checkpoint {

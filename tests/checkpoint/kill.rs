@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use rosrescue::checkpoint::format::{Checkpoint, RecordContent};
-use rosrescue::checkpoint::store::{Store, SyncJob};
-use rosrescue::xmlrpc::{Call, Value};
+use checkpoint_store::{Store, SyncJob};
+use rescue_core::checkpoint::format::{Checkpoint, RecordContent};
+use ros1_master::xmlrpc::{Call, Value};
 
 const FILE: &str = "ROSRESCUE_TEST_CHECKPOINT";
 

@@ -3,11 +3,15 @@
 use std::path::Path;
 use std::time::Instant;
 
-use rosrescue::checkpoint::format::{Checkpoint, Label, Origin, RecordContent};
-use rosrescue::checkpoint::log::LogReader;
-use rosrescue::checkpoint::store::{Store, log::files};
-use rosrescue::master::{Master, Request};
-use rosrescue::xmlrpc::{Call, Value};
+use checkpoint_store::{Store, log::files};
+use rescue_core::checkpoint::{
+    format::{Checkpoint, Label, Origin, RecordContent},
+    log::LogReader,
+};
+use ros1_master::{
+    master::{Master, Request},
+    xmlrpc::{Call, Value},
+};
 
 /// Time of the first record, in milliseconds since 1970.
 const START: u64 = 1_764_115_200_000;

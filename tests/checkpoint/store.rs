@@ -7,9 +7,9 @@ use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
-use rosrescue::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
-use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
-use rosrescue::xmlrpc::{Call, Value};
+use checkpoint_store::{OpenError, Store, StoreError};
+use rescue_core::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
+use ros1_master::xmlrpc::{Call, Value};
 use tempfile::TempDir;
 
 /// A new folder, and a path for a checkpoint in it.
@@ -165,7 +165,7 @@ fn records_made_during_a_compaction_are_in_both_files() {
     assert_eq!(seqs(&loaded.records), [3, 4, 5]);
     assert!(loaded.exact);
     assert_eq!(store.generation(), 2);
-    let previous = rosrescue::checkpoint::store::read(&folder.path().join("c.yaml.previous"))
+    let previous = checkpoint_store::read(&folder.path().join("c.yaml.previous"))
         .unwrap()
         .unwrap();
     assert_eq!(seqs(&previous.records), [1, 2, 3, 4]);

@@ -7,12 +7,14 @@ mod python;
 use self::catalogue::{catalogue, values};
 use indexmap::IndexMap;
 use proptest::prelude::*;
-use rosrescue::checkpoint::format::{
+use rescue_core::checkpoint::format::{
     Checkpoint, DEPTH_MAX, EncodeError, Label, Origin, Record, RecordContent, Session, decode,
     encode_checkpoint, encode_record,
 };
-use rosrescue::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
-use rosrescue::xmlrpc::{Call, Struct, Value};
+use ros1_master::{
+    master::{Displaced, ServiceEntry, Snapshot, SnapshotNode},
+    xmlrpc::{Call, Struct, Value},
+};
 
 const LABEL: Label = Label {
     at: 1_764_115_200_123,

@@ -6,15 +6,15 @@ use std::{
     time::Instant,
 };
 
-use rosrescue::{
+use rescue_core::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent, Session},
     cluster::{
         journal::{self, Progress},
         machine::{EtcdAnswer, Op, RevisionGuard},
-        replica::{Replica, ReplicaError},
     },
-    xmlrpc::Call,
 };
+use ros1_master::xmlrpc::Call;
+use rosrescue::cluster::replica::{Replica, ReplicaError};
 
 use crate::servers::{LIMIT, Servers, keys, settings};
 

@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::cluster::{
-    etcd::{Credentials, Etcd, EtcdError, Options},
+use rescue_core::cluster::{
     journal::{Keys, Put},
     machine::{EtcdAnswer, Op, RevisionGuard},
 };
+use rosrescue::cluster::etcd::{Credentials, Etcd, EtcdError, Options};
 use serde_json::json;
 
 use crate::servers::{LIMIT, Servers, keys, settings};

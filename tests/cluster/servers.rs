@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use rosrescue::cluster::{
-    etcd::{Credentials, Tls},
+use rescue_core::cluster::{
     journal::Keys,
     machine::{Commit, Settings, WhenAlone},
 };
+use rosrescue::cluster::etcd::{Credentials, Tls};
 
 pub(crate) use crate::support::{LIMIT, Servers};
 

@@ -2,10 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::cluster::{
-    etcd::{self, Credentials, Etcd},
-    machine::{ANSWER_LIMIT, Action, EtcdAnswer, Input, Machine, Role, View},
-};
+use rescue_core::cluster::machine::{ANSWER_LIMIT, Action, EtcdAnswer, Input, Machine, Role, View};
+use rosrescue::cluster::etcd::{self, Credentials, Etcd};
 use tokio::{
     sync::mpsc,
     task::{JoinHandle, JoinSet},

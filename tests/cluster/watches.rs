@@ -2,10 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::cluster::{
-    etcd::{Credentials, Watch, WatchEnd},
-    journal::Put,
-};
+use rescue_core::cluster::journal::Put;
+use rosrescue::cluster::etcd::{Credentials, Watch, WatchEnd};
 
 use crate::servers::{LIMIT, Servers, keys};
 

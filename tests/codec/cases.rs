@@ -1,7 +1,7 @@
 //! Random values and documents.
 
 use proptest::prelude::*;
-use rosrescue::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Text that XML and XML-RPC libraries tend to mishandle.
 pub(crate) fn text() -> impl Strategy<Value = String> {

@@ -16,13 +16,13 @@ mod peer;
 use std::fmt::Write;
 
 use proptest::prelude::*;
-use rosrescue::xmlrpc::{
-    Call, DecodeError, Python, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
-};
 
 use cases::{any_value, double, mess, returnable, text};
 use documents::{odd_documents, params, refused_documents};
 use peer::{Peer, hex};
+use ros1_master::xmlrpc::{
+    Call, DecodeError, Python, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
+};
 
 /// A value in the notation of `peer.py`.
 fn notation(value: &Value) -> String {

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-use rosrescue::xmlrpc::{Call, Value, encode_call};
+use ros1_master::xmlrpc::{Call, Value, encode_call};
 
 /// A `/usr/bin/python3` that treats documents as rosmaster does.
 pub(crate) struct Peer {

@@ -1,7 +1,7 @@
 use std::thread::{scope, sleep};
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 use crate::chance::Chance;

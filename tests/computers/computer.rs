@@ -427,7 +427,7 @@ impl Computer {
         self.within(|| self.client().set_param(key, value));
     }
 
-    pub(crate) fn param(&self, key: &str) -> Option<rosrescue::xmlrpc::Value> {
+    pub(crate) fn param(&self, key: &str) -> Option<ros1_master::xmlrpc::Value> {
         self.within(|| self.client().param(key))
     }
 

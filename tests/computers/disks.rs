@@ -1,7 +1,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::computer::Computer;
 use crate::fleet::Fleet;

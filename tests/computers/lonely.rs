@@ -1,7 +1,7 @@
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::thread::scope;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::computer::{Computer, PORT};
 use crate::fleet::Fleet;

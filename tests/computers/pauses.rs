@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::scope;
 use std::time::Duration;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 use crate::computer::{Computer, NAMES, PORT};

@@ -1,4 +1,4 @@
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::computer::{Computer, NAMES, endpoints};
 use crate::fleet::Fleet;

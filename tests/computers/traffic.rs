@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, RwLock, RwLockWriteGuard};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::computer::{Computer, Downtimes, NAMES, PORT};
 use crate::fleet::Fleet;

@@ -2,11 +2,16 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::checkpoint::{compare::compare, log::moment, store::log};
+use checkpoint_store::log;
+use rescue_core::{
+    checkpoint::{compare::compare, log::moment},
+    replay::{Inspection, Plan, Skipped, Token},
+};
+use ros1_master::{
+    master::{Kind, Master, Request},
+    xmlrpc::{Call, encode_call},
+};
 use rosrescue::clock;
-use rosrescue::master::{Kind, Master, Request};
-use rosrescue::replay::{Inspection, Plan, Skipped, Token};
-use rosrescue::xmlrpc::{Call, encode_call};
 use rustix::process::Signal;
 
 use crate::dice::{Cast, Dice};

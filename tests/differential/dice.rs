@@ -1,6 +1,6 @@
 //! Random calls with few names and values, so that they collide often.
 
-use rosrescue::xmlrpc::{Call, Struct, Value};
+use ros1_master::xmlrpc::{Call, Struct, Value};
 
 use crate::support::unordered;
 

@@ -1,8 +1,10 @@
 //! Compares the model with a bare rosmaster.
 
-use rosrescue::master::{Master, Notice, Request};
-use rosrescue::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
-use rosrescue::xmlrpc::{Call, decode_call};
+use rescue_core::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
+use ros1_master::{
+    master::{Master, Notice, Request},
+    xmlrpc::{Call, decode_call},
+};
 
 use crate::dice::{Cast, Dice};
 use crate::nodes::Node;

@@ -4,8 +4,10 @@ use std::cell::Cell;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::Notice;
-use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
+use ros1_master::{
+    master::Notice,
+    xmlrpc::{Call, Reply, Struct, Value, decode_call},
+};
 
 use crate::support::{FakeMaster, sorted, unordered};
 

@@ -18,8 +18,10 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
-use rosrescue::master::Master;
-use rosrescue::xmlrpc::{Call, Value};
+use ros1_master::{
+    master::Master,
+    xmlrpc::{Call, Value},
+};
 
 use crate::nodes::blank;
 

@@ -3,8 +3,10 @@
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::Master;
-use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
+use ros1_master::{
+    master::Master,
+    xmlrpc::{Call, Reply, Value, decode_reply, encode_call},
+};
 
 use crate::support::{self, Client, PATIENCE, Scratch, find_program, free_port, http_request};
 

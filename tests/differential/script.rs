@@ -1,6 +1,6 @@
 //! A sequence of calls as data. It can be played, printed, read back and made shorter.
 
-use rosrescue::xmlrpc::{Call, Struct, Value};
+use ros1_master::xmlrpc::{Call, Struct, Value};
 use serde_json::{Map, Value as Json, json};
 
 /// A step of a sequence.

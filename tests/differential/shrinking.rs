@@ -1,7 +1,9 @@
 //! Tests how failing sequences are made shorter, and how they are printed.
 
-use rosrescue::master::Master;
-use rosrescue::xmlrpc::{Call, Value};
+use ros1_master::{
+    master::Master,
+    xmlrpc::{Call, Value},
+};
 
 use crate::script::{Script, Step, shrink, simpler};
 use crate::{crashes, direct, takeovers};
@@ -46,7 +48,7 @@ fn shrinking_also_removes_parts_of_items() {
 }
 
 /// A master with a defect: it never removes a subscriber.
-fn wrong(model: &mut Master, call: &Call) -> Option<rosrescue::xmlrpc::Reply> {
+fn wrong(model: &mut Master, call: &Call) -> Option<ros1_master::xmlrpc::Reply> {
     (call.method != "unregisterSubscriber").then(|| model.apply(&call.clone().into()).reply)
 }
 

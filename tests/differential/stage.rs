@@ -4,9 +4,11 @@ use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Notice, Request};
-use rosrescue::replay::{accepted, difference};
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use rescue_core::replay::{accepted, difference};
+use ros1_master::{
+    master::{Master, Notice, Request},
+    xmlrpc::{Call, Reply, Value},
+};
 
 use crate::dice::{CALLERS, KEYS, NAMES};
 use crate::nodes::{self, Node};

@@ -8,8 +8,10 @@ use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Request};
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use ros1_master::{
+    master::{Master, Request},
+    xmlrpc::{Call, Reply, Value},
+};
 use rustix::process::Signal;
 use serde_json::Value as Json;
 

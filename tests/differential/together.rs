@@ -9,8 +9,10 @@
 
 use std::net::TcpListener;
 
-use rosrescue::master::Request;
-use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
+use ros1_master::{
+    master::Request,
+    xmlrpc::{Call, Reply, Value, decode_reply, encode_call},
+};
 
 use crate::dice::{Cast, Dice};
 use crate::number;

@@ -1,6 +1,6 @@
 //! Values that rosmaster cannot return. The codec must refuse to encode the same ones.
 
-use rosrescue::xmlrpc::{Call, Reply, Struct, Value, encode_call, encode_reply};
+use ros1_master::xmlrpc::{Call, Reply, Struct, Value, encode_call, encode_reply};
 
 use crate::support::{Rosmaster, Scratch, http_request};
 

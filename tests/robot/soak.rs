@@ -17,7 +17,7 @@ use crate::support::{
     Client, FailingDisk, FakeNode, Finish, PATIENCE, Rescue, Scratch, Setup, State, Trouble,
     eventually, free_port, holds, params, signal,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 const WRITERS: usize = 4;

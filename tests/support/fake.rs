@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 
-use rosrescue::xmlrpc::{self, Reply, Value};
+use ros1_master::xmlrpc::{self, Reply, Value};
 use socket2::SockRef;
 
 use super::params;

@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::tree;
 

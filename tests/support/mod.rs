@@ -78,11 +78,11 @@ pub(crate) fn short(value: impl std::fmt::Debug) -> String {
     format!("{value:?}").chars().take(200).collect()
 }
 
-/// The parameters of a call, from anything that converts to [`rosrescue::xmlrpc::Value`].
+/// The parameters of a call, from anything that converts to [`ros1_master::xmlrpc::Value`].
 #[allow(unused_macros)]
 macro_rules! params {
     ($($param:expr),* $(,)?) => {
-        vec![$(rosrescue::xmlrpc::Value::from($param)),*]
+        vec![$(ros1_master::xmlrpc::Value::from($param)),*]
     };
 }
 pub(crate) use params;
@@ -91,8 +91,8 @@ pub(crate) use params;
 #[allow(unused_macros)]
 macro_rules! tree {
     ($($key:literal => $value:expr),* $(,)?) => {
-        rosrescue::xmlrpc::Value::Struct(rosrescue::xmlrpc::Struct::from_iter([
-            $(($key.to_owned(), rosrescue::xmlrpc::Value::from($value))),*
+        ros1_master::xmlrpc::Value::Struct(ros1_master::xmlrpc::Struct::from_iter([
+            $(($key.to_owned(), ros1_master::xmlrpc::Value::from($value))),*
         ]))
     };
 }

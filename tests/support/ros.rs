@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::OnceLock;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::patience::eventually;
 use super::process::Process;

@@ -4,7 +4,7 @@ use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
-use rosrescue::xmlrpc::{self, Call, Reply, Value};
+use ros1_master::xmlrpc::{self, Call, Reply, Value};
 
 use super::patience::eventually;
 

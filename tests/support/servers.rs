@@ -2,10 +2,8 @@
 
 use std::{fs::File, process::Child, process::Command, time::Duration};
 
-use rosrescue::cluster::{
-    etcd::{Credentials, Etcd, Options},
-    journal::Keys,
-};
+use rescue_core::cluster::journal::Keys;
+use rosrescue::cluster::etcd::{Credentials, Etcd, Options};
 use rustix::process::Signal;
 
 use super::process::{signal, stop};

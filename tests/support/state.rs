@@ -3,7 +3,7 @@
 use std::fmt::{self, Display, Formatter};
 use std::io;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::kinds::{sorted, unordered};
 use super::rpc::Client;

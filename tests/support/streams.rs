@@ -1,6 +1,6 @@
 //! Live streams of messages: talkers and listeners on one topic, from both client libraries.
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::node::{Library, Node};
 use super::params;

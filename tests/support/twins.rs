@@ -1,6 +1,6 @@
 //! Sends the same requests to a bare master and to one behind rosrescue.
 
-use rosrescue::xmlrpc::{Reply, Value};
+use ros1_master::xmlrpc::{Reply, Value};
 
 use super::rescue::{Rescue, Setup};
 use super::ros::Rosmaster;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::{self, Reply, Value};
+use ros1_master::xmlrpc::{self, Reply, Value};
 
 use super::fake::FakeMaster;
 use super::links::Dice;

@@ -5,12 +5,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::cluster::{
+    machine::{Role, Settings, View},
+    member::Heard,
+};
+
 use super::ClusterDriver;
 use crate::{
-    cluster::{
-        machine::{Role, Settings, View},
-        member::Heard,
-    },
     server::others::MemberAddresses,
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };

@@ -2,6 +2,16 @@
 
 use std::{collections::VecDeque, net::IpAddr, sync::Arc, time::Duration};
 
+use rescue_core::{
+    checkpoint::session::RestorePolicy,
+    cluster::{
+        journal::Keys,
+        machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
+        member::{Member, Own},
+        standing::{Place, Standing},
+    },
+    hide::Hide,
+};
 use tokio::{
     sync::{mpsc, watch},
     task::{JoinSet, block_in_place},
@@ -11,17 +21,11 @@ use tokio_util::sync::CancellationToken;
 use super::{ClusterDriver, facts::Known, kept::Kept};
 use crate::{
     app::{context::Context, startup},
-    checkpoint::session::RestorePolicy,
     cluster::{
         etcd::{Credentials, Etcd, EtcdError, Options, Tls},
-        journal::Keys,
-        machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
-        member::{Member, Own},
         replica::Replica,
-        standing::{Place, Standing},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
-    hide::Hide,
     process::Rosmaster,
     server::others::{Forwarded, MemberAddresses, Others, Shown},
     upstream::peer::Peers,

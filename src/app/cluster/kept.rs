@@ -3,17 +3,20 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::{
+use checkpoint_store::{Store, StoreError, regular_file};
+use rescue_core::{
     checkpoint::{
         format::{Checkpoint, RecordContent},
         session,
-        store::{self, Store, StoreError},
     },
     cluster::cut_off::CutOff,
+};
+use ros1_master::master::{Master, Request};
+
+use crate::{
     ledger::journal::{DISK_PATIENCE, SILENT},
     limit::rarely,
-    master::{Master, Request},
-    regular_file, wait,
+    wait,
 };
 
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
@@ -178,7 +181,7 @@ fn entries(calls: Vec<Request>) -> Vec<RecordContent> {
 }
 
 fn remove_files(path: PathBuf) {
-    let previous = store::previous_of(&path);
+    let previous = checkpoint_store::previous_of(&path);
     for path in [path, previous] {
         if let Err(error) = std::fs::remove_file(&path)
             && error.kind() != std::io::ErrorKind::NotFound
@@ -218,7 +221,7 @@ fn say_unkept(error: &dyn std::fmt::Display) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{master::Method, xmlrpc::Value};
+    use ros1_master::{master::Method, xmlrpc::Value};
 
     fn set(key: &str, value: i32) -> Request {
         let params = [Value::from("/n"), key.into(), value.into()];

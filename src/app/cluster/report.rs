@@ -2,18 +2,20 @@
 
 use std::{collections::BTreeMap, time::Instant};
 
-use super::ClusterDriver;
-use crate::{
+use rescue_core::{
     checkpoint::format::shown,
     cluster::{
         member::{Cause, News},
         merge::{parameter_of, wire::WriteOutcome},
     },
     hide::Hide,
+};
+use ros1_master::{master::Request, xmlrpc::Value};
+
+use super::ClusterDriver;
+use crate::{
     limit::{Pair, alarm, all_clear, rarely},
-    master::Request,
     status::report::{CUT_OFF, STARTED, TAKEN_OVER},
-    xmlrpc::Value,
 };
 
 /// Limits the log lines that this computer is cut off, and that it is no longer.

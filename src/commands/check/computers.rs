@@ -1,12 +1,12 @@
 //! Asks etcd for the facts about `--cluster`.
 
+use rescue_core::cluster::journal::Keys;
 use serde::Deserialize;
 
 use crate::{
     cli::ClusterArgs,
     cluster::{
         etcd::{Credentials, Etcd, EtcdError, Options, Tls, Tried},
-        journal::Keys,
         survey::LIMIT,
     },
     commands::running,

@@ -9,6 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use checkpoint_store::LockHolder;
 use rustix::{
     fs::{Access, StatVfsMountFlags},
     process::{Resource, getrlimit},
@@ -24,7 +25,6 @@ use super::{
     units::{self, Unit},
 };
 use crate::{
-    checkpoint::store::{self, LockHolder},
     cli::CheckArgs,
     clock, config,
     process::{
@@ -476,7 +476,7 @@ impl CheckpointDisk {
             refused.or_else(|| may_write(&whole).err().filter(|error| !is_missing(error)));
         Self {
             mount: mount_of(&folder),
-            holder: store::holder_of(&whole),
+            holder: checkpoint_store::holder_of(&whole),
             is_folder: whole.is_dir(),
             checkpoint: whole,
             folder,

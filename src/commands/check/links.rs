@@ -6,17 +6,19 @@ use std::{
     time::Duration,
 };
 
+use rescue_core::replay::Token;
+use ros1_master::{
+    master::{Master, question},
+    xmlrpc::Value,
+};
 use tokio::{sync::Semaphore, task::JoinSet, time::sleep};
 
 use super::{Finding, Severity, robot};
 use crate::{
     cli::{CheckArgs, TargetArgs},
     commands::{CommandFailure, counted, live::Live, running::Running},
-    master::{Master, question},
     nodes::client::{self, Reaction},
-    replay::Token,
     status::summary::some,
-    xmlrpc::Value,
 };
 
 const SUBJECT: &str = "links";
@@ -238,7 +240,7 @@ impl Found {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{master::Request, xmlrpc::Call};
+    use ros1_master::{master::Request, xmlrpc::Call};
 
     fn state() -> Master {
         let mut state = Master::default();

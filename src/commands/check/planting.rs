@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use checkpoint_store::folder;
+
 use super::{Finding, Severity};
-use crate::checkpoint::folder;
 
 /// The finding for the checkpoint at `path`. `None` if its folders are safe.
 pub(super) fn look(path: &Path) -> Option<Finding> {

@@ -6,18 +6,20 @@ use std::{
     time::Duration,
 };
 
+use ros1_master::{
+    master,
+    xmlrpc::{Call, Value},
+};
 use serde::Deserialize;
 use tokio::net::TcpStream;
 
 use crate::{
     commands::running::Running,
-    master,
     nodes::client::{self, Reaction},
     process, resolver,
     ros_env::MasterUri,
     status::software,
     upstream::Connection,
-    xmlrpc::{Call, Value},
 };
 
 /// Longest time for a server to answer.

@@ -5,15 +5,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use ros1_master::xmlrpc::{Call, Value};
 use serde::Serialize;
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::node::NodeLog;
-use crate::{
-    nodes::client::{self, Reaction},
-    xmlrpc::{Call, Value},
-};
+use crate::nodes::client::{self, Reaction};
 
 /// Longest time for a call. A call that takes longer has failed, because rosrescue answers all calls sooner.
 const LIMIT: Duration = Duration::from_secs(10);

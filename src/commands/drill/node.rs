@@ -17,13 +17,13 @@ use hyper::{
     service::service_fn,
 };
 use hyper_util::rt::TokioIo;
+use ros1_master::xmlrpc::{self, Call, Reply, Value};
 use tokio::{net::TcpListener, sync::watch};
 
 use super::PREFIX;
 use crate::{
     ros_env::{self, MasterUri},
     server::listener,
-    xmlrpc::{self, Call, Reply, Value},
 };
 
 /// Largest call that is read, in bytes.
@@ -204,7 +204,8 @@ async fn answer(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{master, nodes::client};
+    use crate::nodes::client;
+    use ros1_master::master;
 
     #[tokio::test]
     async fn the_node_answers_for_itself_and_keeps_its_notifications() {

@@ -5,14 +5,11 @@ use std::{
     time::Duration,
 };
 
+use ros1_master::{master, xmlrpc::Value};
 use tokio::task::JoinSet;
 
 use super::{PREFIX, calls::Api};
-use crate::{
-    master,
-    nodes::client::{self, Reaction},
-    xmlrpc::Value,
-};
+use crate::nodes::client::{self, Reaction};
 
 /// Longest time for a node to report its process id.
 const NODE_LIMIT: Duration = Duration::from_secs(5);
@@ -251,7 +248,7 @@ fn is_below(fact: &str, changed: &BTreeSet<String>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::xmlrpc::Struct;
+    use ros1_master::xmlrpc::Struct;
 
     fn robot(publisher: &str, value: i32, pid: Option<i32>) -> RobotState {
         let list = |of: &str, node: &str| {

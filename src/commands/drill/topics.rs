@@ -7,11 +7,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use ros1_master::xmlrpc::Value;
 use serde::Serialize;
 use tokio::{task::JoinHandle, time::timeout};
 
 use super::{calls::Api, node::DrillNode, tcpros::Link};
-use crate::xmlrpc::Value;
 
 /// Longest time for a publisher to accept a subscriber.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);

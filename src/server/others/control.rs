@@ -1,22 +1,26 @@
 //! Requests of rosrescue itself: from the rosrescue of another computer, and from `rosrescue handover`. They are no ROS
 //! calls, so none of them reaches the write queue as a call or a master.
 
-use tokio::sync::oneshot;
-
-use super::{Call, NO_ADDRESS, Others, not_leading};
-use crate::{
+use rescue_core::{
     checkpoint::format::Origin,
     cluster::{
         merge::wire::Ask,
         standing::{Pass, Standing},
     },
+};
+use ros1_master::{
     master::{CALLER_ID, Method, Request},
+    xmlrpc::{Reply, Value},
+};
+use tokio::sync::oneshot;
+
+use super::{Call, NO_ADDRESS, Others, not_leading};
+use crate::{
     ros_env::MasterUri,
     server::{
         calls::{Calls, Closed, NOT_IN_TIME},
         replies::{HttpReply, xml},
     },
-    xmlrpc::{Reply, Value},
 };
 
 /// The method by which `rosrescue handover` asks the leader to give up leadership. Its parameters are the caller's id and

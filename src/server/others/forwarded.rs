@@ -6,7 +6,8 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-use crate::{cluster::merge::weight, master::Request};
+use rescue_core::cluster::merge::weight;
+use ros1_master::master::Request;
 
 /// Maximum number of calls that are remembered.
 const MOST: usize = 1000;
@@ -67,7 +68,7 @@ impl Drop for Sent {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Method;
+    use ros1_master::master::Method;
 
     #[test]
     fn a_write_is_remembered_until_it_is_answered() {

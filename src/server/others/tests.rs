@@ -2,6 +2,11 @@
 
 use http_body_util::BodyExt;
 use hyper::StatusCode;
+use rescue_core::checkpoint::format::{Record, RecordContent, Session};
+use ros1_master::{
+    master::{Master, Method},
+    xmlrpc::{Value, decode_reply, encode_call, encode_reply},
+};
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpListener,
@@ -12,15 +17,12 @@ use super::{
     *,
 };
 use crate::{
-    checkpoint::format::{Record, RecordContent, Session},
     cli::{Reads, SyncPolicy},
     gate,
     ledger::Ledger,
-    master::{Master, Method},
     ros_env::MasterUri,
     upstream::{Upstream, pool::Pool},
     write_queue::write_queue,
-    xmlrpc::{Value, decode_reply, encode_call, encode_reply},
 };
 
 const OWN: &str = "http://127.0.0.1:11311/";
@@ -80,7 +82,7 @@ impl Computer {
             stats,
             None,
             Arc::new(()),
-            crate::lifecycle::Patience::new(second),
+            rescue_core::lifecycle::Patience::new(second),
         );
         let (standing, standing_rx) = watch::channel(standing);
         let (handovers_tx, handovers) = mpsc::channel(1);

@@ -12,6 +12,7 @@ use std::{
 
 use bytes::Bytes;
 use hyper::{Response, StatusCode};
+use rescue_core::health::Health;
 use serde::Serialize;
 use serde_json::{Map, Value};
 use tokio::{
@@ -22,7 +23,6 @@ use tokio::{
 use super::robot::Robot;
 use crate::{
     gate::State,
-    health::Health,
     server::{
         Server,
         replies::{HttpReply, ReplyBody, text},

@@ -2,20 +2,22 @@
 
 use std::{collections::BTreeSet, fs, path::Path, sync::Arc};
 
+use checkpoint_store::log::files;
 use hyper::StatusCode;
-use serde::Serialize;
-
-use super::{Asked, in_background, json, past::busy, text};
-use crate::{
+use rescue_core::{
     checkpoint::{
         compare::What,
         format,
         log::{Entry, LogReader},
-        store::log::files,
     },
+    replay::Token,
+};
+use serde::Serialize;
+
+use super::{Asked, in_background, json, past::busy, text};
+use crate::{
     cli::When,
     clock,
-    replay::Token,
     server::{Server, replies::HttpReply},
 };
 
@@ -148,7 +150,7 @@ fn events(entries: &[Entry]) -> Vec<NodeEvent> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::checkpoint::compare::Difference;
+    use rescue_core::checkpoint::compare::Difference;
 
     fn entry(at: u64, from: &str, [a, b]: [Option<&str>; 2]) -> Entry {
         Entry {

@@ -1,12 +1,9 @@
 //! Parameters as the page shows them. Hides the values that the operator wants hidden, and lists a part of the tree at
 //! a time, so that even 100,000 parameters are no problem.
 
+use rescue_core::hide::{Hide, Masked};
+use ros1_master::xmlrpc::{Struct, Value};
 use serde::Serialize;
-
-use crate::{
-    hide::{Hide, Masked},
-    xmlrpc::{Struct, Value},
-};
 
 /// Maximum number of entries in one answer. The answer says where entries are left out, and the page can ask for them.
 const ENTRIES: usize = 1000;

@@ -3,15 +3,13 @@
 
 use std::{fs, path::Path, sync::Arc};
 
+use checkpoint_store::log::{KnownTimes, PastState, oldest, past_state};
 use hyper::StatusCode;
+use rescue_core::checkpoint::compare::{Described, compare};
 use serde::Serialize;
 
 use super::{Asked, Pages, WholeState, in_background, robot::Robot, text};
 use crate::{
-    checkpoint::{
-        compare::{Described, compare},
-        store::log::{KnownTimes, PastState, oldest, past_state},
-    },
     cli::When,
     clock,
     server::{Server, replies::HttpReply},

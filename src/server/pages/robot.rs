@@ -5,9 +5,11 @@ use std::{
     hash::{DefaultHasher, Hash, Hasher},
 };
 
+use rescue_core::{health::Health, replay::Token};
+use ros1_master::master::Snapshot;
 use serde::Serialize;
 
-use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Nodes, replay::Token};
+use crate::{clock, ledger::Ledger, nodes::Nodes};
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
 pub(super) struct NodeRow {
@@ -92,7 +94,7 @@ impl Robot {
         robot
     }
 
-    /// The content of a snapshot, without the [`Token`](crate::replay::Token) by which rosrescue recognises a master.
+    /// The content of a snapshot, without the [`Token`](rescue_core::replay::Token) by which rosrescue recognises a master.
     pub(super) fn of(snapshot: Snapshot) -> Self {
         let mut nodes: BTreeMap<String, NodeRow> = BTreeMap::new();
         for (name, node) in snapshot.nodes {
@@ -186,7 +188,7 @@ impl NodeRow {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::{Master, Method, Request};
+    use ros1_master::master::{Master, Method, Request};
 
     #[test]
     fn each_name_is_where_it_belongs() {

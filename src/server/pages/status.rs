@@ -6,13 +6,14 @@ use std::{
     time::Instant,
 };
 
+use rescue_core::health::Health;
+use ros1_master::master::Master;
+
 use super::Pages;
 use crate::{
     clock,
     gate::State,
-    health::Health,
     ledger::journal::StoreState,
-    master::Master,
     nodes::liveness::Life,
     status::{
         DiskStatus,

@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use rescue_core::cluster::machine::Role;
+
 use super::ConditionName;
 use crate::{
-    cluster::machine::Role,
     gate::State,
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts},
 };

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use rosrescue::checkpoint::store::{OpenError, Store};
+use checkpoint_store::{OpenError, Store};
 
 use super::{checkpoint, entry, names, place, seqs, started};
 
@@ -134,7 +134,7 @@ fn without_any_snapshot_the_records_are_still_used() {
     let mut bytes = fs::read(&path).unwrap();
     bytes[200] ^= 1;
     fs::write(&path, &bytes).unwrap();
-    let loaded = rosrescue::checkpoint::store::read(&path).unwrap().unwrap();
+    let loaded = checkpoint_store::read(&path).unwrap().unwrap();
     assert!(loaded.checkpoint.is_none() && !loaded.exact);
     assert_eq!(loaded.records.len(), 3);
 }

@@ -3,7 +3,7 @@
 use std::fs::{self, File};
 use std::path::Path;
 
-use rosrescue::checkpoint::store::{CheckJob, OpenError, Store, StoreError};
+use checkpoint_store::{CheckJob, OpenError, Store, StoreError};
 
 use super::{checkpoint, entry, names, place, started};
 

@@ -1,7 +1,7 @@
 //! Values that some YAML readers misread, and random values.
 
 use proptest::prelude::*;
-use rosrescue::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Texts that some YAML readers read as something else.
 #[rustfmt::skip]

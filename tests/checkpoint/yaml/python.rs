@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::{Command, Stdio};
 
 use proptest::prelude::*;
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::catalogue::{catalogue, values};
 use super::{file_with, in_array, in_struct, nested};

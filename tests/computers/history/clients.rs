@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use super::checker::{End, History, Loss, Op, Sample, Says, Time, Told, What};
 use crate::computer::{NAMES, PORT};

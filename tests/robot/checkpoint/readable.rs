@@ -6,11 +6,12 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, Tool, eventually, kinds, params,
     sorted, tree,
 };
-use rosrescue::xmlrpc::Value;
 
 /// The output of the script that compares `checkpoint` with the master at `uri`.
 fn compared(checkpoint: &Path, uri: &str) -> String {

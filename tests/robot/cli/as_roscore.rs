@@ -2,10 +2,11 @@
 
 use std::process::Command;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Client, Process, Scratch, Setup, State, eventually_some, find_program, free_port,
 };
-use rosrescue::xmlrpc::Value;
 
 /// The state of a complete core, with rosout and all parameters.
 fn complete(client: &Client) -> State {

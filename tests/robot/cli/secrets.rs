@@ -2,10 +2,11 @@
 
 use std::fs;
 
+use ros1_master::xmlrpc::{Call, Value};
+
 use crate::support::{
     Mode, Robot, encode_call, eventually, eventually_some, http_request, params, request, tree,
 };
-use rosrescue::xmlrpc::{Call, Value};
 
 const SECRET: &str = "hunter2";
 

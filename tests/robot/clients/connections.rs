@@ -4,11 +4,12 @@
 use std::thread;
 use std::time::Duration;
 
+use ros1_master::xmlrpc::{Reply, Value};
+
 use crate::support::{
     Client, FakeNode, Rosmaster, Scratch, Setup, Twins, assert_form, encode_call, free_port, gzip,
     holds, http_request, params, request, within,
 };
-use rosrescue::xmlrpc::{Reply, Value};
 
 #[test]
 fn connections_are_kept_as_long_as_a_bare_master_keeps_them() {

@@ -1,8 +1,9 @@
 //! Forwarding: a bare rosmaster and one behind rosrescue give the same answer to the same raw request,
 //! whatever HTTP and XML-RPC allow or forbid, and in a form that all clients understand.
 
+use ros1_master::xmlrpc::{Call, Value};
+
 use crate::support::{Twins, encode_call, http_request, params, request, stop, tree};
-use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
 fn calls_are_answered_with_the_same_bytes_as_by_a_bare_master() {

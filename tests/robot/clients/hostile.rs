@@ -6,11 +6,12 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
 use std::time::Duration;
 
+use ros1_master::xmlrpc::{Call, Reply, Value};
+
 use crate::support::{
     Client, Mode, Netns, PATIENCE, Robot, Scratch, Setup, encode_call, eventually, free_port, gzip,
     http_request, params, request, within,
 };
-use rosrescue::xmlrpc::{Call, Reply, Value};
 
 #[test]
 fn bytes_that_are_not_http_are_refused_and_other_clients_served() {

@@ -3,8 +3,9 @@
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{Mode, Robot, tree};
-use rosrescue::xmlrpc::Value;
 
 const WRITERS: usize = 6;
 const READERS: usize = 4;

@@ -142,7 +142,7 @@ fn a_node_at_a_host_without_an_address_is_found() {
     let master = Rosmaster::start(&scratch);
     let rescue = Setup::proxy(&scratch, master.client().port()).start();
     let register = ["/lost", "/chatter", "*", "http://nobody.invalid:4711/"];
-    let register = register.map(rosrescue::xmlrpc::Value::from).to_vec();
+    let register = register.map(ros1_master::xmlrpc::Value::from).to_vec();
     rescue.client().ok("registerSubscriber", register);
     let found = Found::by(&mut check(&scratch, rescue.port()));
     found.assert_problem("nodes", "/lost registered at nobody.invalid");
@@ -453,7 +453,7 @@ fn a_firewall_on_another_computer_is_found() {
         .start();
     let register = |node: &str, port: &str| {
         let api = format!("http://{far}:{port}/");
-        let register = [node, "/chatter", "*", &api].map(rosrescue::xmlrpc::Value::from);
+        let register = [node, "/chatter", "*", &api].map(ros1_master::xmlrpc::Value::from);
         rescue.client().ok("registerSubscriber", register.to_vec());
     };
     register("/blocked", &blocked);

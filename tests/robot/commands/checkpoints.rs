@@ -3,9 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use rosrescue::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
-use rosrescue::master::Snapshot;
-use rosrescue::xmlrpc::Call;
+use rescue_core::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
+use ros1_master::{master::Snapshot, xmlrpc::Call};
 
 use crate::support::{
     FakeNode, Library, Mode, Robot, Scratch, Tool, eventually, free_port, params, tree,

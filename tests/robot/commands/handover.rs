@@ -5,7 +5,7 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use rosrescue::xmlrpc::{self, Reply, Value};
+use ros1_master::xmlrpc::{self, Reply, Value};
 use serde_json::{Value as Json, json};
 
 use crate::support::{Mode, Robot, Tool, free_port, status};

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::support::{FakeNode, Mode, Robot, Scratch, Tool, eventually};
 

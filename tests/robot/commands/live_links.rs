@@ -1,10 +1,11 @@
 //! `rosrescue check --live` names a subscriber that is not connected to a publisher of its topic.
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Client, Library, Mode, Robot, Tool, eventually, eventually_some, free_port, params, port_of,
     stop,
 };
-use rosrescue::xmlrpc::Value;
 
 #[test]
 fn a_link_that_was_broken_is_found_and_named() {

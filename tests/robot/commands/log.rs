@@ -1,6 +1,6 @@
 //! `log`: what changed, when and by whom, and the state at an earlier time.
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use serde_json::Value as Json;
 
 use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes, page, params};

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::process::{Command, Stdio};
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::support::{
     FakeNode, Mode, Robot, Tool, eventually, in_both_modes, params, ros_command, tree,

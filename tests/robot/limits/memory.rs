@@ -1,7 +1,8 @@
 //! However often the master of a large robot dies, rosrescue needs little memory.
 
+use ros1_master::xmlrpc::{Call, Reply, Struct, Value, decode_call};
+
 use crate::support::{Client, FakeMaster, Mode, Robot, eventually, params};
-use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
 /// Number of nodes, each with two publishers and two subscribers.
 const NODES: usize = 1_000;

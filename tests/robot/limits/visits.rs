@@ -6,8 +6,9 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::Call;
+
 use crate::support::{Client, Mode, Robot, eventually, names, params};
-use rosrescue::xmlrpc::Call;
 
 /// A host that counts connections and closes them without an answer.
 struct Host {

@@ -3,10 +3,11 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::{Call, Reply, Struct, Value};
+
 use crate::support::{
     Client, Mode, Robot, Twins, encode_call, eventually, http_request, params, unreadable,
 };
-use rosrescue::xmlrpc::{Call, Reply, Struct, Value};
 
 fn sets(name: &str, count: i32) -> impl Iterator<Item = Call> {
     let name = name.to_owned();

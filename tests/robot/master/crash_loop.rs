@@ -5,11 +5,12 @@ use std::ops::{Deref, DerefMut};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Failing, FakeNode, Heard, State, eventually, holds, page, params, status, tree, unreadable,
     within,
 };
-use rosrescue::xmlrpc::Value;
 
 /// Maximum time for a call on a busy computer.
 const SOON: Duration = Duration::from_secs(5);

@@ -1,11 +1,12 @@
 //! How the mirror notices that it differs from the master: by answers that differ, lost replies, calls that
 //! it cannot read, and by reading the master's state.
 
+use ros1_master::xmlrpc::{Reply, Value};
+
 use crate::support::{
     FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, State, eventually, eventually_some, params,
     status,
 };
-use rosrescue::xmlrpc::{Reply, Value};
 
 /// How many parameters the mirror holds.
 fn mirrored(client: &crate::support::Client) -> u64 {

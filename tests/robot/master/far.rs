@@ -5,11 +5,12 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Client, NameServer, Netns, Process, Rosmaster, Scratch, Setup, eventually, find_program,
     free_port, holds, params, status, within,
 };
-use rosrescue::xmlrpc::Value;
 
 /// The address of the master on the other side.
 const HOST: u8 = 2;

@@ -4,11 +4,12 @@
 use std::fs;
 use std::sync::{Arc, Mutex};
 
+use ros1_master::xmlrpc::{Call, Reply, Value};
+
 use crate::support::{
     FakeMaster, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, encode_call, eventually,
     eventually_some, http_request, params, status,
 };
-use rosrescue::xmlrpc::{Call, Reply, Value};
 
 /// A real master behind a fake that gives a fixed answer to calls with a certain word.
 struct Garbled {
@@ -287,7 +288,7 @@ fn a_master_that_answers_only_faults_for_a_while_counts_as_away() {
 #[test]
 fn unusual_but_valid_answers_of_the_master_are_accepted() {
     let reply = Reply::Value(Value::Array(vec![1.into(), "unusual".into(), 0.into()]));
-    let body = String::from_utf8(rosrescue::xmlrpc::encode_reply(&reply)).unwrap();
+    let body = String::from_utf8(ros1_master::xmlrpc::encode_reply(&reply)).unwrap();
     let (left, right) = body.split_at(body.len() / 2);
     let answers = [
         format!("HTTP/1.0 200 OK\r\n\r\n{body}"),

@@ -10,7 +10,7 @@ use crate::support::{
     encode_call, eventually, holds, http_request, in_both_modes, params, signal, status, stop,
     tree, unreadable,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 const PROGRAM: &str = "http10_rosmaster.py";

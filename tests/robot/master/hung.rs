@@ -10,7 +10,7 @@ use crate::support::{
     FakeNode, Finish, Library, Mode, NODES, Robot, State, alive, encode_call, eventually, holds,
     params, request, within,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Options that make a master count as hung when it has not answered for a second.

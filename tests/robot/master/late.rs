@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use crate::support::{
     FakeNode, Finish, Mode, Robot, Scratch, State, alive, eventually, signal, status, stop,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// With these options a master never counts as hung within a test.

@@ -2,8 +2,9 @@
 //! While there is no master, rosrescue does the same.
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
-use rosrescue::xmlrpc::Value;
 use std::time::Duration;
+
+use ros1_master::xmlrpc::Value;
 
 in_both_modes!(a_node_that_sets_a_parameter_is_notified_as_by_the_old_master);
 

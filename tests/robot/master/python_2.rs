@@ -3,11 +3,12 @@
 
 use std::time::Duration;
 
+use ros1_master::xmlrpc::{Reply, Value};
+
 use crate::support::{
     Client, FakeNode, Mode, NODES, Netns, Robot, Scratch, Setup, encode_call, eventually,
     free_port, holds, http_request, in_both_modes, params, status, tree,
 };
-use rosrescue::xmlrpc::{Reply, Value};
 
 in_both_modes!(the_order_of_dictionaries_is_no_divergence);
 

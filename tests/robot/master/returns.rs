@@ -8,7 +8,7 @@ use crate::support::{
     Client, FakeNode, Mode, Relay, Rescue, Robot, Rosmaster, Scratch, Setup, State, eventually,
     free_port, params, signal, status, stop,
 };
-use rosrescue::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 use rustix::process::Signal;
 
 /// Options that make a master count as hung when it has not answered for 0.3 s.

@@ -13,7 +13,7 @@ use std::time::Duration;
 use crate::support::{
     Client, NODES, Scratch, Setup, eventually, eventually_some, free_port, signal, within,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// Takes the port of the next rosmaster. Returns the port, and the number of bytes that it has received.

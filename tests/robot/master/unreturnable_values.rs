@@ -1,10 +1,11 @@
 //! Values that a master accepts and that break its answers, or that XML changes on the way. rosrescue serves such a
 //! master, and knows the rest of its state.
 
+use ros1_master::xmlrpc::{Call, Reply, Value};
+
 use crate::support::{
     FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, http_request, params, tree,
 };
-use rosrescue::xmlrpc::{Call, Reply, Value};
 
 /// CPython writes a carriage return unescaped, which XML readers read as a line feed.
 #[test]

@@ -5,7 +5,7 @@ use std::process::Command;
 use crate::support::{
     Process, Scratch, Setup, eventually, find_program, free_port, signal, status,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// Starts a roscore and waits until it has set its parameters and started rosout, or has ended.

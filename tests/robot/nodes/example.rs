@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Instant, SystemTime};
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 use crate::support::{

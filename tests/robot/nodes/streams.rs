@@ -5,8 +5,9 @@
 //!
 //! `ROSRESCUE_KILLS` sets how often the master dies in each test (20 by default).
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{LIBRARIES, Library, Mode, Node, Robot, State, Streams, alive, eventually};
-use rosrescue::xmlrpc::Value;
 
 /// Number of deaths of the master for each death of rosrescue.
 const KILLS_EACH: usize = 5;

@@ -9,7 +9,7 @@ use crate::support::{
     Client, Library, Mode, NODES, Node, Process, Robot, Rosmaster, Scratch, State, Tool,
     eventually, holds, in_both_modes, ros_command, sorted, tree, within,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// A small robot, which the tools examine.

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::{self, Call, Reply, Value};
+use ros1_master::xmlrpc::{self, Call, Reply, Value};
 use socket2::SockRef;
 
 use crate::support::links::Dice;

@@ -4,7 +4,7 @@
 use std::thread;
 use std::time::Duration;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::support::{
     Client, Mode, Robot, State, eventually,

@@ -4,11 +4,12 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::{Call, Value};
+
 use crate::support::{
     FakeNode, Mode, Robot, Rosmaster, State, encode_call, eventually, holds, http_request,
     in_both_modes, kinds, params, request, tree, unreadable, within,
 };
-use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
 fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {

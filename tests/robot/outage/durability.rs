@@ -9,7 +9,7 @@ use crate::support::{
     Client, FailingDisk, FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, Setup, Trouble,
     eventually, holds, params, signal, status, stop, unreadable,
 };
-use rosrescue::xmlrpc::{Reply, Value};
+use ros1_master::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 
 /// Runs `work` while no sync of `disk` finishes, and checks that `work` ends only after the sync.

@@ -3,11 +3,12 @@
 
 use std::time::Duration;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Client, FakeNode, Mode, Robot, Rosmaster, eventually, holds, in_both_modes, names, params,
     status,
 };
-use rosrescue::xmlrpc::Value;
 
 /// Pause between the calls of a node that ends. It is longer than the time until rosrescue asks a refusing
 /// port again.

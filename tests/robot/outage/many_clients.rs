@@ -5,11 +5,12 @@ use std::sync::{Arc, Barrier};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::{Reply, Value};
+
 use crate::support::{
     Client, Control, FakeNode, Mode, Robot, State, Wire, encode_call, http_request, in_both_modes,
     params,
 };
-use rosrescue::xmlrpc::{Reply, Value};
 
 /// Number of clients that call at once, a multiple of four.
 const CLIENTS: i32 = 200;

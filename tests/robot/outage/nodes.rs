@@ -7,7 +7,7 @@ use crate::support::{
     LIBRARIES, Mode, Node, Process, Robot, State, Tool, eventually, holds, in_both_modes,
     ros_command, within,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// Starts a node of each library, named with the library's suffix, without waiting for it.

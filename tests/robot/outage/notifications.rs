@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, params, tree};
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 use crate::support::{
     FakeNode, Library, Mode, Node, Robot, eventually, eventually_some, holds, in_both_modes,

@@ -86,7 +86,7 @@ fn a_browser_gets_the_page_and_curl_gets_text() {
 fn no_answer_holds_a_hidden_value() {
     let robot = Robot::start_with(Mode::Core, &["--hide-values", "^/login|pin$"]);
     let client = robot.client();
-    let list = rosrescue::xmlrpc::Value::Array(vec![tree! { "pin" => SECRET }]);
+    let list = ros1_master::xmlrpc::Value::Array(vec![tree! { "pin" => SECRET }]);
     client.set_param("/login", tree! { "user" => SECRET });
     client.set_param(
         "/door",
@@ -137,8 +137,8 @@ fn a_hundred_thousand_parameters_are_sent_in_parts_and_delay_no_other_request() 
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let client = robot.client();
     let many =
-        (0..100_000).map(|index| (format!("p{index}"), rosrescue::xmlrpc::Value::Int(index)));
-    client.set_param("/many", rosrescue::xmlrpc::Value::Struct(many.collect()));
+        (0..100_000).map(|index| (format!("p{index}"), ros1_master::xmlrpc::Value::Int(index)));
+    client.set_param("/many", ros1_master::xmlrpc::Value::Struct(many.collect()));
     client.set_param("/few", 1);
     let page = get(&client, "/state.json", &[]);
     assert!(page.body.len() < 10_000, "{} bytes", page.body.len());

@@ -270,7 +270,7 @@ fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
         tree! {
             "wifi" => tree! { "password" => SECRET, "ssid" => "field" },
             "API_Keys" => tree! { "maps" => SECRET },
-            "logins" => rosrescue::xmlrpc::Value::Array(logins),
+            "logins" => ros1_master::xmlrpc::Value::Array(logins),
         },
     );
     let mut browser = Browser::start(&robot.scratch);

@@ -4,10 +4,11 @@
 use std::ops::RangeInclusive;
 use std::thread;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     FakeNode, Heard, Library, Mode, Node, Robot, eventually, in_both_modes, status,
 };
-use rosrescue::xmlrpc::Value;
 
 const TOPIC: &str = "/chatter";
 

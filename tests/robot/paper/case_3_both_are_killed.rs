@@ -9,11 +9,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ros1_master::xmlrpc::{Struct, Value};
+
 use crate::support::{
     Client, FakeNode, Finish, Library, Mode, PATIENCE, Robot, State, everywhere, params, short,
     unordered,
 };
-use rosrescue::xmlrpc::{Struct, Value};
 
 everywhere!(nothing_acknowledged_is_lost);
 

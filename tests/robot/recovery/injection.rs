@@ -5,11 +5,12 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::Duration;
 
+use ros1_master::xmlrpc::Value;
+
 use crate::support::{
     Client, Failing, FakeNode, Forkserver, Rescue, Scratch, Setup, State, eventually,
     eventually_some, free_port, holds, open_to, params, status,
 };
-use rosrescue::xmlrpc::Value;
 
 /// Number of calls that a master gets before the injection, to read its state.
 const LOOK: usize = 5;

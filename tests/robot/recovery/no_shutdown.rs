@@ -8,7 +8,7 @@ use crate::support::{
     Client, FakeNode, Library, Mode, Robot, State, eventually, eventually_some, holds,
     in_both_modes, params, status,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// How often each scenario is run. `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once

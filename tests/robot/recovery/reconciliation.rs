@@ -4,11 +4,12 @@
 use std::path::Path;
 use std::time::Duration;
 
+use ros1_master::xmlrpc::{Reply, Value};
+
 use crate::support::{
     Client, FakeMaster, FakeNode, Library, Mode, NODES, Robot, eventually, holds, names, params,
     status,
 };
-use rosrescue::xmlrpc::{Reply, Value};
 
 /// The master dies before it has notified any node, and rosrescue dies with it.
 #[test]

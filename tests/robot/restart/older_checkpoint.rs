@@ -4,12 +4,13 @@
 use std::fs;
 use std::path::Path;
 
+use ros1_master::xmlrpc::Value;
+
 use super::sessions::another_boot;
 use crate::support::{
     Client, FakeNode, Rescue, Rosmaster, Scratch, Setup, SmallDisk, State, eventually, free_port,
     params, status,
 };
-use rosrescue::xmlrpc::Value;
 
 /// The changing nodes of a robot: they start, end and move. Parameters change as well.
 struct Nodes {

@@ -14,7 +14,7 @@ use crate::support::{
     Client, FakeNode, Library, Mode, Netns, Node, Robot, Rosmaster, Scratch, Setup, State, alive,
     eventually, free_port, in_both_modes, params, signal,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 /// A file with the id of another boot, as the kernel shows it.

@@ -12,7 +12,7 @@ use crate::support::{
     Client, FakeNode, Library, Mode, NODES, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State,
     alive, eventually, eventually_some, free_port, in_both_modes, signal, status,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 in_both_modes!(a_killed_rosrescue_adopts_the_living_master_when_restarted);

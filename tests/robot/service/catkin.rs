@@ -10,7 +10,7 @@ use crate::support::{
     Client, Process, Scratch, eventually, eventually_some, free_port, open_to, ros_command, signal,
     status,
 };
-use rosrescue::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use checkpoint_store::LockHolder;
+
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
@@ -12,7 +14,7 @@ use super::{
     },
     host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
 };
-use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
+use crate::ros_env::MasterUri;
 
 #[test]
 fn a_robot_without_problems_has_no_findings() {

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use checkpoint_store::LockHolder;
+
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
@@ -12,7 +14,7 @@ use super::{
     },
     one, process, rosrescue, said, unit,
 };
-use crate::{checkpoint::store::LockHolder, ros_env::MasterUri};
+use crate::ros_env::MasterUri;
 
 #[test]
 fn where_the_checkpoint_goes() {
