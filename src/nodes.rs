@@ -133,11 +133,11 @@ impl Nodes {
     /// Whether the node at `port` may be notified. At a loopback address of another computer's node, a stranger would get
     /// the notification. A computer that is cut off does not notify nodes of other computers,
     /// because the leader notifies those nodes.
-    pub(super) async fn may_tell(&self, port: &str) -> bool {
-        let may_tell = !self.alone.load(Ordering::Relaxed)
+    pub(super) async fn may_notify(&self, port: &str) -> bool {
+        let may_notify = !self.alone.load(Ordering::Relaxed)
             || self.served.has(port)
             || !resolver::is_elsewhere(port, self.timeout).await;
-        may_tell && self.leads_to_node(port).await
+        may_notify && self.leads_to_node(port).await
     }
 
     fn lock(&self) -> MutexGuard<'_, Unreachable> {
@@ -288,7 +288,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
                 let unanswered = nodes.unanswered.load(Ordering::Relaxed) > 0;
                 let holding_up = unanswered || !nodes.lock().is_empty();
                 for change in repeats.due(Instant::now(), holding_up) {
-                    tell(&nodes, change);
+                    notify_of_change(&nodes, change);
                 }
             }
             () = nodes.changed.notified() => {}
@@ -338,10 +338,10 @@ pub(crate) fn notify_after_restart(nodes: &Arc<Nodes>) {
     notify_owed(nodes, now, Telling::Twice);
 }
 
-fn tell(nodes: &Arc<Nodes>, change: NotifyingChange) {
+fn notify_of_change(nodes: &Arc<Nodes>, change: NotifyingChange) {
     match change {
         NotifyingChange::Param(api, key) => {
-            notifications::tell(nodes, &api, Subject::Param(key.to_string()));
+            notifications::notify_node(nodes, &api, Subject::Param(key.to_string()));
         }
         NotifyingChange::Topic(topic) => {
             notifications::notify_subscribers(nodes, &topic);
@@ -365,8 +365,8 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
         crate::task::spawn(async move {
             let outcome = health_check::visit(&nodes, port, false).await;
             match outcome.sign {
-                Reaction::Alive => say(&outcome, "an unreachable node answers again"),
-                Reaction::Dead if !outcome.removed.is_empty() => say(
+                Reaction::Alive => log_visit(&outcome, "an unreachable node answers again"),
+                Reaction::Dead if !outcome.removed.is_empty() => log_visit(
                     &outcome,
                     "unregistered a dead node: its port refuses connections",
                 ),
@@ -376,7 +376,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
     }
 }
 
-fn say(outcome: &CheckResult, what: &str) {
+fn log_visit(outcome: &CheckResult, what: &str) {
     let CheckResult {
         removed,
         reconciled,

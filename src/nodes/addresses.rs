@@ -110,14 +110,14 @@ fn is_change(mut messages: &[u8], links: &mut BTreeMap<[u8; 4], u32>) -> bool {
 pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut changes = match Changes::open() {
         Ok(changes) => changes,
-        Err(error) => return say_blind(&error),
+        Err(error) => return log_no_events(&error),
     };
     let mut looks = VecDeque::<Instant>::new();
     loop {
         tokio::select! {
             changed = changes.next() => {
                 if let Err(error) = changed {
-                    return say_blind(&error);
+                    return log_no_events(&error);
                 }
                 let now = Instant::now();
                 // A look that is due soon stays, even if changes keep coming.
@@ -126,20 +126,20 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
             }
             () = wait::until(looks.front().map(|at| (*at).into())) => {
                 looks.pop_front();
-                look(&nodes).await;
+                check_addresses(&nodes).await;
             }
         }
     }
 }
 
-fn say_blind(error: &io::Error) {
+fn log_no_events(error: &io::Error) {
     tracing::info!(%error, "cannot watch this computer's addresses; a lost one is not reported");
 }
 
 impl Nodes {
     /// The addresses that this computer has lost, and at which nodes are registered.
     pub(crate) fn lost_addresses(&self) -> Vec<LostAddress> {
-        let lost = self.local.lost().into_iter();
+        let lost = self.local.lost_addresses().into_iter();
         lost.map(|(address, (since, ports))| LostAddress {
             address,
             since: clock::wall_time_of(since).round(),
@@ -150,14 +150,14 @@ impl Nodes {
 }
 
 /// Finds lost and returned addresses, and asks unreachable nodes again at once.
-async fn look(nodes: &Arc<Nodes>) {
-    for port in nodes.local.lost_ports() {
+async fn check_addresses(nodes: &Arc<Nodes>) {
+    for port in nodes.local.ports_at_lost_addresses() {
         // The name may have another address by now.
         if let Some(addresses) = origin::addresses(&port, nodes.timeout).await {
             nodes.local.set_addresses(&port, addresses);
         }
     }
-    let changes = nodes.local.look_at_addresses(resolver::is_own);
+    let changes = nodes.local.update_addresses(resolver::is_own);
     if !changes.lost.is_empty() {
         let names = names_at(nodes, &changes.lost);
         rarely!(
@@ -174,7 +174,7 @@ async fn look(nodes: &Arc<Nodes>) {
             ?names,
             "the address of these nodes is back; telling all nodes that use them"
         );
-        tell(nodes, &changes.returned);
+        notify_returned(nodes, &changes.returned);
     }
     nodes.lock().ask_all_at(Instant::now());
     nodes.changed.notify_one();
@@ -189,8 +189,8 @@ fn names_at(nodes: &Nodes, ports: &[String]) -> Vec<String> {
 }
 
 /// Tells the nodes at `ports`, and the subscribers of their topics, the present state.
-fn tell(nodes: &Arc<Nodes>, ports: &[String]) {
-    notifications::notify_of_all(nodes, |of| ports.iter().any(|port| port == of));
+fn notify_returned(nodes: &Arc<Nodes>, ports: &[String]) {
+    notifications::notify_ports(nodes, |of| ports.iter().any(|port| port == of));
     let names = names_at(nodes, ports);
     let topics: Vec<String> = nodes.ledger.with_mirror(|mirror| {
         let topics = names.iter().flat_map(|name| mirror.publications(name));

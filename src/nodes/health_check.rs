@@ -211,7 +211,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
                 refused = None;
                 if nodes.clear(port) {
                     // Notifications to this node were held back until now.
-                    notifications::notify_of_all(nodes, |of| of == port);
+                    notifications::notify_ports(nodes, |of| of == port);
                 }
             }
         }

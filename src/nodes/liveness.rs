@@ -173,7 +173,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         }
         let now = Instant::now();
         next = now + SETTLE;
-        look(&nodes);
+        check_nodes(&nodes);
         if noted.is_none_or(|noted| noted + NOTE_AGAIN <= now) {
             nodes.note_lives();
             noted = Some(now);
@@ -181,8 +181,8 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     }
 }
 
-/// Looks at all nodes once.
-fn look(nodes: &Arc<Nodes>) {
+/// Checks all nodes once.
+fn check_nodes(nodes: &Arc<Nodes>) {
     let names = local::names(&nodes.ledger);
     let registered: BTreeSet<_> = names.iter().map(|name| name.port.clone()).collect();
     // This blocks for less than a millisecond: the kernel generates some kilobytes.
@@ -192,7 +192,7 @@ fn look(nodes: &Arc<Nodes>) {
     };
     let listens = nodes
         .local
-        .look(&names, &listening, nodes.gate.state() != State::Elsewhere);
+        .update(&names, &listening, nodes.gate.state() != State::Elsewhere);
     let due = nodes.liveness.lock().liveness.round(
         &registered,
         |port| listens.get(port).copied(),
@@ -226,7 +226,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
         None => None,
         // What listens there is another program.
         Some(_) if reaches.is_empty() => None,
-        Some(at) if is_among(&own(at), &listening) => Some(Reaction::Alive),
+        Some(at) if is_among(&local_addresses(at), &listening) => Some(Reaction::Alive),
         Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {
             Some(_admitted) => Some(client::ask(&port, &master::get_pid(), nodes.timeout).await),
             None => None,
@@ -262,7 +262,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
 }
 
 /// Those of `addresses` that belong to this computer.
-pub(super) fn own(addresses: &[SocketAddr]) -> Vec<SocketAddr> {
+pub(super) fn local_addresses(addresses: &[SocketAddr]) -> Vec<SocketAddr> {
     let own = addresses.iter().filter(|at| resolver::is_own(at.ip()));
     own.copied().collect()
 }
@@ -272,7 +272,7 @@ mod tests {
     use super::*;
 
     async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
-        Some(own(&origin::addresses(api, limit).await?))
+        Some(local_addresses(&origin::addresses(api, limit).await?))
     }
 
     #[tokio::test]

@@ -18,7 +18,7 @@ use rescue_core::{
 use ros1_master::master::{Master, Request};
 use tokio::sync::Notify;
 
-use super::{Nodes, health_check, liveness, origin::say_misaddressed};
+use super::{Nodes, health_check, liveness, origin::log_misaddressed};
 use crate::{
     clock,
     ledger::{Ledger, activity::LastCalls},
@@ -114,7 +114,7 @@ impl LocalNodes {
 
     /// Notes the addresses to which `port` leads.
     pub(super) fn set_addresses(&self, port: &str, addresses: Vec<SocketAddr>) {
-        let here = liveness::own(&addresses);
+        let here = liveness::local_addresses(&addresses);
         let at = addresses.iter().map(SocketAddr::ip).collect();
         let mut known = self.lock();
         known.at.insert(port.to_owned(), at);
@@ -139,10 +139,10 @@ impl LocalNodes {
         self.lock().misaddressed.values().cloned().collect()
     }
 
-    /// Looks at all nodes, with `listening` as the socket table, which must be read after `names`. Returns whether a
-    /// process listens at each port of this computer. Without `proves`, as on a computer that does not see all
+    /// Updates what is known of all nodes. `listening` is the socket table, which must be read after `names`. Returns
+    /// whether a process listens at each port of this computer. Without `proves`, as on a computer that does not see all
     /// registrations, the table proves nothing about single names.
-    pub(super) fn look(
+    pub(super) fn update(
         &self,
         names: &[Named],
         listening: &Listening,
@@ -176,12 +176,12 @@ impl LocalNodes {
         let misaddressed: BTreeMap<_, _> = misaddressed.map(|it| (it.node.clone(), it)).collect();
         let new = misaddressed.values();
         let new = new.filter(|it| known.misaddressed.get(&it.node) != Some(it));
-        say_misaddressed(&new.cloned().collect::<Vec<_>>());
+        log_misaddressed(&new.cloned().collect::<Vec<_>>());
         known.misaddressed = misaddressed;
         let names = local;
         let local: Vec<_> = names.iter().map(|name| name.local()).collect();
         if proves {
-            known.registrants.look(&local, at);
+            known.registrants.update(&local, at);
         }
         known.evidence.clear();
         for name in names {
@@ -208,16 +208,16 @@ impl LocalNodes {
     }
 
     /// The ports of nodes that are registered at a lost address.
-    pub(super) fn lost_ports(&self) -> Vec<String> {
+    pub(super) fn ports_at_lost_addresses(&self) -> Vec<String> {
         let known = self.lock();
-        let lost = known.addresses.lost();
+        let lost = known.addresses.lost_ports();
         lost.map(|(port, ..)| port.to_owned()).collect()
     }
 
     /// The addresses that this computer has lost and that nodes are registered at, each with their ports and the time.
-    pub(crate) fn lost(&self) -> BTreeMap<IpAddr, (Instant, BTreeSet<String>)> {
+    pub(crate) fn lost_addresses(&self) -> BTreeMap<IpAddr, (Instant, BTreeSet<String>)> {
         let mut lost = BTreeMap::new();
-        for (port, address, since) in self.lock().addresses.lost() {
+        for (port, address, since) in self.lock().addresses.lost_ports() {
             let (at, ports) = lost
                 .entry(address)
                 .or_insert_with(|| (since, BTreeSet::new()));
@@ -227,9 +227,9 @@ impl LocalNodes {
         lost
     }
 
-    /// Looks which nodes' addresses this computer has lost or got back.
-    pub(super) fn look_at_addresses(&self, is_own: impl Fn(IpAddr) -> bool) -> AddressChanges {
-        self.lock().addresses.look(is_own, Instant::now())
+    /// Finds which nodes' addresses this computer has lost or got back.
+    pub(super) fn update_addresses(&self, is_own: impl Fn(IpAddr) -> bool) -> AddressChanges {
+        self.lock().addresses.update(is_own, Instant::now())
     }
 
     /// The sockets of nodes whose owners have not been looked for yet.
@@ -352,12 +352,12 @@ impl MoveJudge for LocalNodes {
             if moving.is_unregistered_first(self.reap, evidence) {
                 if hits_another {
                     self.stats.shutdowns_prevented.count();
-                    say_prevented(&moving);
+                    log_prevented_shutdown(&moving);
                 }
                 gone.insert(moving.node);
             } else if hits_another {
                 self.stats.shutdowns_misdirected.count();
-                say_misdirected(&moving);
+                log_misdirected_shutdown(&moving);
             }
         }
         Some(ledger.with_mirror(|mirror| Eviction::of(mirror, gone)))
@@ -368,7 +368,7 @@ impl MoveJudge for LocalNodes {
     }
 }
 
-fn say_prevented(moving: &Moving) {
+fn log_prevented_shutdown(moving: &Moving) {
     let Moving {
         node, from, others, ..
     } = moving;
@@ -381,7 +381,7 @@ fn say_prevented(moving: &Moving) {
     );
 }
 
-fn say_misdirected(moving: &Moving) {
+fn log_misdirected_shutdown(moving: &Moving) {
     let Moving {
         node, from, others, ..
     } = moving;

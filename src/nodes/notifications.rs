@@ -57,18 +57,18 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
         .ledger
         .with_mirror(|mirror| mirror.subscribers_of(topic));
     for api in &subscribers {
-        tell(nodes, api, Subject::Topic(topic.to_owned()));
+        notify_node(nodes, api, Subject::Topic(topic.to_owned()));
     }
     !subscribers.is_empty()
 }
 
 /// Notifies each node of every topic and parameter that it subscribes to.
 pub(crate) fn notify_all(nodes: &Arc<Nodes>) {
-    notify_of_all(nodes, |_| true);
+    notify_ports(nodes, |_| true);
 }
 
 /// Notifies the nodes at these ports of every topic and parameter that they subscribe to.
-pub(super) fn notify_of_all(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
+pub(super) fn notify_ports(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
     nodes.ledger.with_order(|order, mirror| {
         for (name, api) in mirror.nodes().filter(|(_, api)| ports(port_of(api))) {
             let port = port_of(api);
@@ -89,7 +89,7 @@ pub(super) fn notify_of_all(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
 
 /// Tells the node at `api` the present publishers of a topic, or the present value of a parameter, which `subject`
 /// names.
-pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
+pub(crate) fn notify_node(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     let port = port_of(api);
     let tell = |order: &mut Order, _: &Master| order.tell_state(port, subject);
     nodes.ledger.with_order(tell);
@@ -117,7 +117,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         // The semaphore is never closed.
         let permit = notifications.permits.acquire().await.ok();
         nodes.ledger.lease.wait().await;
-        if !nodes.may_tell(&port).await {
+        if !nodes.may_notify(&port).await {
             return nodes.ledger.with_order(|order, _| order.drop_port(&port));
         }
         changed.mark_unchanged();
@@ -183,7 +183,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             let name = Subject::Name(displaced.node.clone());
             answers_are_written(&nodes, port_of(&displaced.api), &name).await;
             nodes.ledger.lease.wait().await;
-            if !nodes.may_tell(port_of(&displaced.api)).await {
+            if !nodes.may_notify(port_of(&displaced.api)).await {
                 return;
             }
             if is_taken(&nodes, &displaced.api) {

@@ -69,7 +69,7 @@ impl Nodes {
 }
 
 /// Logs nodes that have just been found to be misaddressed.
-pub(super) fn say_misaddressed(new: &[Misaddressed]) {
+pub(super) fn log_misaddressed(new: &[Misaddressed]) {
     for Misaddressed {
         node, api, from, ..
     } in new

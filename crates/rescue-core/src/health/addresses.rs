@@ -17,7 +17,7 @@ struct At {
     lost: Option<Instant>,
 }
 
-/// What has changed since the last look. Each entry is a node's address up to the port.
+/// What has changed since the last update. Each entry is a node's address up to the port.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct AddressChanges {
     pub lost: Vec<String>,
@@ -40,8 +40,8 @@ impl NodeAddresses {
         self.0.retain(|port, _| registered(port));
     }
 
-    /// Looks which addresses this computer has at `now`.
-    pub fn look(&mut self, is_own: impl Fn(IpAddr) -> bool, now: Instant) -> AddressChanges {
+    /// Finds out which addresses this computer has at `now`.
+    pub fn update(&mut self, is_own: impl Fn(IpAddr) -> bool, now: Instant) -> AddressChanges {
         let all: BTreeSet<_> = self.0.values().flat_map(|at| &at.addresses).collect();
         let own: BTreeSet<_> = all.into_iter().filter(|it| is_own(**it)).copied().collect();
         let mut changes = AddressChanges::default();
@@ -62,7 +62,7 @@ impl NodeAddresses {
     }
 
     /// The ports with lost addresses, each with one address and since when it is lost.
-    pub fn lost(&self) -> impl Iterator<Item = (&str, IpAddr, Instant)> {
+    pub fn lost_ports(&self) -> impl Iterator<Item = (&str, IpAddr, Instant)> {
         let lost = self.0.iter();
         lost.filter_map(|(port, at)| Some((port.as_str(), *at.addresses.first()?, at.lost?)))
     }
@@ -84,22 +84,22 @@ mod tests {
             move |address: IpAddr| addresses.iter().any(|own| ip(own) == address)
         };
         let before = had(&["127.0.0.1", "10.0.0.7"]);
-        assert_eq!(nodes.look(before, now), AddressChanges::default());
-        let changes = nodes.look(had(&["127.0.0.1", "10.0.0.9"]), now);
+        assert_eq!(nodes.update(before, now), AddressChanges::default());
+        let changes = nodes.update(had(&["127.0.0.1", "10.0.0.9"]), now);
         assert_eq!(
             (changes.lost, changes.returned),
             (vec!["a".to_owned()], vec![])
         );
         // The address of a name that is looked up again.
         nodes.set("a", [ip("10.0.0.7")]);
-        let lost: Vec<_> = nodes.lost().collect();
+        let lost: Vec<_> = nodes.lost_ports().collect();
         assert_eq!(lost, [("a", ip("10.0.0.7"), now)]);
-        let changes = nodes.look(before, now);
+        let changes = nodes.update(before, now);
         assert_eq!(
             (changes.lost, changes.returned),
             (vec![], vec!["a".to_owned()])
         );
         nodes.retain(|port| port == "b");
-        assert_eq!(nodes.look(|_| false, now).lost, ["b"]);
+        assert_eq!(nodes.update(|_| false, now).lost, ["b"]);
     }
 }

@@ -101,7 +101,7 @@ pub struct Registrants {
 impl Registrants {
     /// Brings the names up to date. `sockets` gives the inodes of the sockets that listen at a port of this computer,
     /// and `None` for a port of another computer. It must be read after `names`.
-    pub fn look<'a>(
+    pub fn update<'a>(
         &mut self,
         names: &[LocalName<'a>],
         sockets: impl Fn(&'a str) -> Option<&'a [u64]>,
@@ -260,7 +260,7 @@ mod tests {
     /// `/a`, which listens with socket 7 of process 1 and has answered `said`.
     fn registered(said: Option<i32>, owner: Option<Owner>) -> Registrants {
         let mut known = Registrants::default();
-        known.look(&[name("/a", 1, said)], |_| Some(&[7]));
+        known.update(&[name("/a", 1, said)], |_| Some(&[7]));
         assert_eq!(known.unowned(), BTreeSet::from([7]));
         known.set_owner(7, owner);
         assert!(known.unowned().is_empty());
@@ -313,19 +313,19 @@ mod tests {
     fn a_socket_with_several_names_proves_nothing() {
         let mut known = registered(Some(1), owner(1, 1));
         let both = [name("/a", 1, Some(1)), name("/b", 2, Some(1))];
-        known.look(&both, |_| Some(&[7]));
+        known.update(&both, |_| Some(&[7]));
         for sockets in [&[7][..], &[]] {
             assert_eq!(of_a(&mut known, sockets, &[1]), Evidence::Unknown);
         }
         assert_eq!(of_a(&mut known, &[8], &[1]), Evidence::Replaced);
         // One of several sockets at a port may be anybody's.
         let mut known = Registrants::default();
-        known.look(&[name("/a", 1, Some(1))], |_| Some(&[7, 8]));
+        known.update(&[name("/a", 1, Some(1))], |_| Some(&[7, 8]));
         assert_eq!(of_a(&mut known, &[8], &[1]), Evidence::Unknown);
         // Nobody listened when the name registered, so a later socket is not the node's.
         let mut known = Registrants::default();
         for sockets in [&[][..], &[9]] {
-            known.look(&[name("/a", 1, None)], |_| Some(sockets));
+            known.update(&[name("/a", 1, None)], |_| Some(sockets));
         }
         assert_eq!(of_a(&mut known, &[9], &[]), Evidence::Replaced);
     }
@@ -334,14 +334,14 @@ mod tests {
     fn a_name_that_registers_again_is_another_process() {
         let mut known = registered(Some(1), owner(1, 1));
         // Another program has the port. The name has not registered since.
-        known.look(&[name("/a", 1, Some(1))], |_| Some(&[8]));
+        known.update(&[name("/a", 1, Some(1))], |_| Some(&[8]));
         assert!(matches!(of_a(&mut known, &[8], &[1]), Evidence::Ended(_)));
         // The node was started again at the same port.
-        known.look(&[name("/a", 5, None)], |_| Some(&[8]));
+        known.update(&[name("/a", 5, None)], |_| Some(&[8]));
         assert_eq!(of_a(&mut known, &[8], &[1]), Evidence::Listens);
         assert_eq!(known.unowned(), BTreeSet::from([8]));
         // The name is on another computer now.
-        known.look(&[name("/a", 6, None)], |_| None);
+        known.update(&[name("/a", 6, None)], |_| None);
         assert_eq!(of_a(&mut known, &[], &[1]), Evidence::Unknown);
     }
 }

@@ -298,7 +298,7 @@ impl World {
             self.programs[before].names.remove(&name);
         }
         // rosrescue looks at once, before the kernel gives a port to another program.
-        self.look(false);
+        self.check_sockets(false);
     }
 
     /// The master tells what listens at the old address to shut down.
@@ -357,7 +357,7 @@ impl World {
         if is_open || self.looking {
             return;
         }
-        self.look(false);
+        self.check_sockets(false);
         for name in dead {
             assert_ne!(self.mirror.api_of(&name), Some(api.as_str()), "{name}");
             self.counts.known += 1;
@@ -468,7 +468,7 @@ impl World {
     }
 
     /// Looks at all nodes. If `slow`, an event may happen meanwhile, as with real reads of the kernel's tables.
-    fn look(&mut self, slow: bool) {
+    fn check_sockets(&mut self, slow: bool) {
         if std::mem::replace(&mut self.looking, true) {
             return;
         }
@@ -510,7 +510,7 @@ impl World {
         };
         let local: Vec<_> = (0..names.len()).map(of).collect();
         self.known
-            .look(&local, |port| sockets.get(port).map(Vec::as_slice));
+            .update(&local, |port| sockets.get(port).map(Vec::as_slice));
         if event_at == 0 {
             self.event();
         }
@@ -545,7 +545,7 @@ impl World {
         }
         self.looking = false;
         if self.registrations > registrations {
-            self.look(false);
+            self.check_sockets(false);
         }
     }
 
@@ -607,7 +607,7 @@ fn play(seed: u64, events: usize, reap: Reap) -> Counts {
     for _ in 0..events {
         world.event();
         if world.dice.one_in(4) {
-            world.look(true);
+            world.check_sockets(true);
         }
     }
     world.counts
