@@ -41,7 +41,7 @@ impl AccessRules {
 
     /// What a connection from `peer` to the address `own` of this computer may do. This computer may do everything,
     /// because rosmaster, rosout and the robot's own nodes run here. A client that may make changes may also read.
-    pub(crate) fn of(&self, peer: IpAddr, own: Option<IpAddr>) -> Grant {
+    pub(crate) fn grant_for(&self, peer: IpAddr, own: Option<IpAddr>) -> Grant {
         let peer = peer.to_canonical();
         let here = peer.is_loopback() || own.map(|own| own.to_canonical()) == Some(peer);
         let is_in = |nets: &[IpNet]| nets.iter().any(|net| net.contains(&peer));
@@ -154,7 +154,7 @@ mod tests {
 
     fn grant(allow: &[&str], write: &[&str], peer: &str) -> Grant {
         let own = "10.0.0.7".parse().unwrap();
-        AccessRules::new(nets(allow), nets(write)).of(peer.parse().unwrap(), Some(own))
+        AccessRules::new(nets(allow), nets(write)).grant_for(peer.parse().unwrap(), Some(own))
     }
 
     #[test]

@@ -56,7 +56,7 @@ pub(crate) struct Room<'a> {
 
 impl<'a> Room<'a> {
     /// An empty reservation from `pool`, which counts KiB.
-    pub(crate) fn of(pool: &'a Semaphore) -> Self {
+    pub(crate) fn new(pool: &'a Semaphore) -> Self {
         Self {
             pool,
             held: None,
@@ -161,7 +161,7 @@ mod tests {
     #[tokio::test]
     async fn short_values_take_more_room_than_their_text() {
         let pool = Semaphore::new(80 << 10);
-        let mut room = Room::of(&pool);
+        let mut room = Room::new(&pool);
         let text = Bytes::from("<value/>".repeat(100_000));
         room_for_values(&text, &mut room).await.unwrap();
         assert!(pool.available_permits() < (80 << 10) - 100 * 2 * size_of::<Value>());
@@ -172,7 +172,7 @@ mod tests {
     async fn bodies_with_a_part_of_the_room_do_not_wait_for_each_other() {
         let pool = Semaphore::new(256);
         let body = || async {
-            let mut room = Room::of(&pool);
+            let mut room = Room::new(&pool);
             for kib in [32, 64, 128, 256] {
                 room.grow(kib << 10).await;
                 tokio::task::yield_now().await;

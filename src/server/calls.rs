@@ -114,7 +114,7 @@ pub(super) struct Incoming {
 
 impl Incoming {
     /// A call from `source`, made at the address `caller`. `own` is the address that stands for this computer.
-    pub(super) fn of(source: Source, caller: IpAddr, own: IpAddr) -> Self {
+    pub(super) fn new(source: Source, caller: IpAddr, own: IpAddr) -> Self {
         let caller = caller.to_canonical();
         // This computer may lose the address later, and its nodes are still its own.
         let is_here = resolver::is_own(caller);
@@ -160,7 +160,7 @@ impl Calls {
         match &self.others {
             None => {
                 let own = IpAddr::V4(Ipv4Addr::LOCALHOST);
-                let incoming = Incoming::of(Source::Here, peer.ip(), own);
+                let incoming = Incoming::new(Source::Here, peer.ip(), own);
                 let mut hold = Hold::new(self.hold);
                 Ok(self
                     .answer_here(head, body, call, incoming, &mut hold)
@@ -248,7 +248,7 @@ impl Calls {
     }
 
     /// The mirror's answer to a read in place of a master that is away or late.
-    pub(super) async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
+    pub(super) async fn answer_from_mirror(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call?;
         let reply = self.encode(|| self.ledger.answer(read)).await?;
         self.stats.calls_without_master.count();
@@ -257,7 +257,7 @@ impl Calls {
 
     /// The mirror's answer to a `subscribeParam` whose subscription already exists, while another computer has the
     /// master.
-    pub(super) async fn stand_in_for_subscribed(&self, call: &Request) -> Option<HttpReply> {
+    pub(super) async fn answer_subscribed_from_mirror(&self, call: &Request) -> Option<HttpReply> {
         let reply = self
             .encode(|| self.ledger.answer_if_subscribed(call))
             .await?;
@@ -360,7 +360,7 @@ impl Calls {
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);
                     if patience <= tokio::time::Instant::now()
-                        && let Some(reply) = self.stand_in(known_now).await
+                        && let Some(reply) = self.answer_from_mirror(known_now).await
                     {
                         return Ok(reply);
                     }
@@ -373,7 +373,7 @@ impl Calls {
                         Ok(reply) => reply,
                         Err(_) => {
                             self.write_queue.report_slow();
-                            if let Some(reply) = self.stand_in(known_now).await {
+                            if let Some(reply) = self.answer_from_mirror(known_now).await {
                                 // The read continues, because its end shows that the master answers again.
                                 let pool = self.pool.clone();
                                 crate::task::spawn(async move {
@@ -392,12 +392,12 @@ impl Calls {
                         }
                         Err(error) => tracing::debug!(%error, "read"),
                     }
-                    if let Some(reply) = self.stand_in(known).await {
+                    if let Some(reply) = self.answer_from_mirror(known).await {
                         return Ok(reply);
                     }
                 }
                 State::StandingIn | State::Late | State::Injecting => {
-                    if let Some(reply) = self.stand_in(known).await {
+                    if let Some(reply) = self.answer_from_mirror(known).await {
                         return Ok(reply);
                     }
                 }

@@ -80,7 +80,7 @@ mod tests {
 
     use super::*;
 
-    fn is_told(close: &Notify) -> bool {
+    fn is_notified(close: &Notify) -> bool {
         let told = pin!(close.notified());
         told.poll(&mut Context::from_waker(Waker::noop()))
             .is_ready()
@@ -97,18 +97,18 @@ mod tests {
         let _first = idle.enter(&first);
         assert!(
             ![&first, &second]
-                .map(|close| is_told(close))
+                .map(|close| is_notified(close))
                 .contains(&true)
         );
         let left = idle.enter(&third);
         assert_eq!(
-            [&second, &first, &third].map(|close| is_told(close)),
+            [&second, &first, &third].map(|close| is_notified(close)),
             [true, false, false]
         );
         // Ended connections make room for others.
         drop(left);
         let _fourth = idle.enter(&fourth);
-        assert!(!is_told(&first));
+        assert!(!is_notified(&first));
         assert_eq!(idle.queue().waiting.len(), 2);
     }
 

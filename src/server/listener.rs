@@ -189,7 +189,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let _ = SockRef::from(&stream).set_tcp_keepalive(&keepalive);
     let _ = stream.set_nodelay(true);
     let own = stream.local_addr().ok().map(|own| own.ip());
-    let grant = server.access.of(peer.ip(), own);
+    let grant = server.access.grant_for(peer.ip(), own);
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
     let here = server.clone();
     let _present = here.clients.enter(peer);

@@ -275,7 +275,7 @@ impl Others {
                         Some(_) => Source::Forwarded,
                         None => Source::Here,
                     };
-                    let incoming = Incoming::of(source, call.from, own_address(&calls.uri));
+                    let incoming = Incoming::new(source, call.from, own_address(&calls.uri));
                     let answered = tokio::select! {
                         biased;
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
@@ -496,8 +496,8 @@ impl Call<'_> {
             return None;
         }
         match self.kind {
-            Kind::Read => self.calls.stand_in(Some(call)).await,
-            _ => self.calls.stand_in_for_subscribed(call).await,
+            Kind::Read => self.calls.answer_from_mirror(Some(call)).await,
+            _ => self.calls.answer_subscribed_from_mirror(call).await,
         }
     }
 

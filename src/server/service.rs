@@ -128,7 +128,7 @@ async fn post(
             .cloned(),
     };
     // The memory stays reserved until the call is answered.
-    let mut room = Room::of(&server.bodies);
+    let mut room = Room::new(&server.bodies);
     let read = async {
         let limit = server.max_body;
         let body = body::read(request.into_body(), limit, &mut room).await?;

@@ -78,7 +78,7 @@ impl Known {
     /// Updates the facts from what a computer has written about itself.
     pub(super) fn heard(&mut self, heard: &Heard) {
         let uri = heard.said.as_ref().map(|said| &*said.uri);
-        self.addresses.heard(&heard.name, uri);
+        self.addresses.set_address(&heard.name, uri);
         let Some(said) = &heard.said else { return };
         let mut roles = Role::ALL.into_iter();
         let role = roles.find(|role| role.as_str() == said.role);

@@ -18,8 +18,8 @@ impl MemberAddresses {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes the address of the computer `name`. `None` if it is no member any more.
-    pub(crate) fn heard(&self, name: &str, uri: Option<&str>) {
+    /// Sets the address of the computer `name`. `None` if it is no member any more.
+    pub(crate) fn set_address(&self, name: &str, uri: Option<&str>) {
         let Some(MasterUri { host, port }) = uri.and_then(|uri| MasterUri::parse(uri).ok()) else {
             self.lock().remove(name);
             return;
@@ -56,13 +56,13 @@ mod tests {
     fn only_the_present_addresses_of_members_count() {
         let members = MemberAddresses::default();
         let has = |address: &str| members.has(address.parse().unwrap());
-        members.heard("pc-1", Some("http://10.0.0.1:11311/"));
-        members.heard("pc-2", Some("http://[fd00::2]:11311/"));
+        members.set_address("pc-1", Some("http://10.0.0.1:11311/"));
+        members.set_address("pc-2", Some("http://[fd00::2]:11311/"));
         assert!(has("10.0.0.1") && has("::ffff:10.0.0.1") && has("fd00::2"));
         assert!(!has("10.0.0.9") && !has("127.0.0.1"));
-        members.heard("pc-1", Some("http://10.0.0.3:11311/"));
+        members.set_address("pc-1", Some("http://10.0.0.3:11311/"));
         assert!(!has("10.0.0.1") && has("10.0.0.3"));
-        members.heard("pc-1", None);
+        members.set_address("pc-1", None);
         assert!(!has("10.0.0.3"));
     }
 }

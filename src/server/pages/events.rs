@@ -120,20 +120,20 @@ pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     let stop = server.pages.stop.clone();
     let task = crate::task::spawn(async move {
         tokio::select! {
-            () = tell(latest, &events) => {}
+            () = send_events(latest, &events) => {}
             () = events.closed() => {}
             () = stop.cancelled() => {}
         }
     });
     listeners.push_back((Instant::now(), task.abort_handle()));
     if !feed.running.swap(true, Ordering::AcqRel) {
-        crate::task::spawn(look(server.clone()));
+        crate::task::spawn(watch_for_changes(server.clone()));
     }
     Response::new(ReplyBody::Events(body))
 }
 
 /// Sends new events. A listener that reads slowly misses outdated events.
-async fn tell(mut latest: watch::Receiver<Latest>, events: &mpsc::Sender<Bytes>) {
+async fn send_events(mut latest: watch::Receiver<Latest>, events: &mpsc::Sender<Bytes>) {
     let mut sent = Latest::default();
     let mut next = Bytes::from_static(BEGIN);
     while events.send(next).await.is_ok() {
@@ -159,24 +159,24 @@ async fn tell(mut latest: watch::Receiver<Latest>, events: &mpsc::Sender<Bytes>)
     }
 }
 
-/// Looks for changes while there are listeners.
-async fn look(server: Arc<Server>) {
+/// Watches for changes while there are listeners.
+async fn watch_for_changes(server: Arc<Server>) {
     let pages = &server.pages;
     let mut gate = pages.gate.clone();
-    let mut known = Known::default();
+    let mut last = LastCheck::default();
     let mut shut = gate.look();
     loop {
         let asked = server.clone();
         let look = move || {
-            let latest = known.look(&asked, shut);
-            (known, latest)
+            let latest = last.latest(&asked, shut);
+            (last, latest)
         };
         let Ok((same, latest)) = crate::task::spawn_blocking(look).await else {
             // The task panicked. The next listener starts another one.
             pages.state.feed.running.store(false, Ordering::Release);
             break;
         };
-        known = same;
+        last = same;
         pages.state.feed.latest.send_if_modified(|before| {
             let is_new = *before != latest;
             *before = latest;
@@ -203,15 +203,15 @@ async fn look(server: Arc<Server>) {
 
 /// What the last check for changes has found.
 #[derive(Default)]
-struct Known {
+struct LastCheck {
     version: Option<u64>,
     health: Vec<Health>,
     removed: usize,
     registrations: u64,
 }
 
-impl Known {
-    fn look(&mut self, server: &Server, gate: State) -> Latest {
+impl LastCheck {
+    fn latest(&mut self, server: &Server, gate: State) -> Latest {
         let pages = &server.pages;
         let version = pages.ledger.version();
         let lives = pages.nodes.lives();
