@@ -100,7 +100,7 @@ pub(crate) struct MasterAddresses {
 
 impl MasterAddresses {
     /// Resolves the master's address. `None` if its host has no address.
-    pub(crate) async fn of(master: &MasterUri) -> Option<Self> {
+    pub(crate) async fn resolve(master: &MasterUri) -> Option<Self> {
         let found = resolver::addresses(&master.host, master.port).await.ok()?;
         let addresses: Vec<_> = found.iter().map(|at| at.ip().to_canonical()).collect();
         Some(Self {
@@ -134,9 +134,9 @@ pub(crate) struct Bypass {
 }
 
 impl Bypass {
-    /// Looks at the sockets of this computer once, and returns the new clients. Blocks for milliseconds if it has to search
-    /// for the owner of a new socket.
-    pub(crate) fn look(&mut self, place: &MasterAddresses) -> Vec<Who> {
+    /// Reads the socket table of this computer once, and returns the new clients. Blocks for milliseconds if it has to
+    /// search for the owner of a new socket.
+    pub(crate) fn find_new_clients(&mut self, place: &MasterAddresses) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
         let (clients, hosts) = split(table, place, &own, resolver::is_own);
@@ -231,11 +231,11 @@ pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: Strin
     let mut bypass = Bypass::default();
     loop {
         looks.tick().await;
-        let Some(place) = MasterAddresses::of(&upstream.address()).await else {
+        let Some(place) = MasterAddresses::resolve(&upstream.address()).await else {
             continue;
         };
         let looked = crate::task::spawn_blocking(move || {
-            let new = bypass.look(&place);
+            let new = bypass.find_new_clients(&place);
             (place.is_open(), new, bypass)
         });
         let Ok((is_open, new, now)) = looked.await else {
@@ -295,12 +295,12 @@ mod tests {
             let listener = TcpListener::bind(address).unwrap();
             let port = listener.local_addr().unwrap().port();
             let host = "127.0.0.1".to_owned();
-            let place = MasterAddresses::of(&MasterUri { host, port })
+            let place = MasterAddresses::resolve(&MasterUri { host, port })
                 .await
                 .unwrap();
             let _client = TcpStream::connect(("127.0.0.1", port)).unwrap();
             let mut bypass = Bypass::default();
-            assert_eq!(bypass.look(&place), []);
+            assert_eq!(bypass.find_new_clients(&place), []);
             assert_eq!(place.is_open(), is_open, "{address}");
         }
     }

@@ -29,15 +29,15 @@ impl Holder {
         if holds_one(child, &sockets) {
             return Self::Master;
         }
-        judge(!sockets.is_empty(), &at(port), own, |pid| {
+        choose_holder(!sockets.is_empty(), &at(port), own, |pid| {
             descends(pid, child)
         })
     }
 }
 
-/// Tells from the listeners that were `seen` who has the port. `taken` says that a process other than the child
-/// listens.
-fn judge(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
+/// Chooses the program that has the port from the listeners that were `seen`. `taken` says that a process other than
+/// the child listens.
+fn choose_holder(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
     match seen.first() {
         _ if !taken => Holder::Unknown,
         _ if seen.iter().any(|pid| descends(*pid)) => Holder::Master,
@@ -164,8 +164,8 @@ pub(super) fn holds_one(pid: u32, sockets: &HashSet<u64>) -> bool {
     !open_sockets(pid).is_disjoint(sockets)
 }
 
-/// Waits until no process listens at `port`. A process that another test is starting holds a closed socket until it runs
-/// its program.
+/// Waits until no process listens at `port`. A process that another test is starting holds a closed socket until it
+/// runs its program.
 #[cfg(test)]
 pub(crate) fn wait_closed(port: u16) {
     while !sockets(port).is_empty() {
@@ -182,12 +182,18 @@ mod tests {
     #[test]
     fn a_stranger_at_the_masters_port_is_distinguished_from_its_processes() {
         let child = |pid| pid == 7;
-        assert_eq!(judge(false, &[], true, child), Holder::Unknown);
-        assert_eq!(judge(true, &[7], false, child), Holder::Master);
-        assert_eq!(judge(true, &[8, 7], false, child), Holder::Master);
-        assert_eq!(judge(true, &[8], false, child), Holder::Stranger(Some(8)));
-        assert_eq!(judge(true, &[], true, child), Holder::Stranger(None));
-        assert_eq!(judge(true, &[], false, child), Holder::Unknown);
+        assert_eq!(choose_holder(false, &[], true, child), Holder::Unknown);
+        assert_eq!(choose_holder(true, &[7], false, child), Holder::Master);
+        assert_eq!(choose_holder(true, &[8, 7], false, child), Holder::Master);
+        assert_eq!(
+            choose_holder(true, &[8], false, child),
+            Holder::Stranger(Some(8))
+        );
+        assert_eq!(
+            choose_holder(true, &[], true, child),
+            Holder::Stranger(None)
+        );
+        assert_eq!(choose_holder(true, &[], false, child), Holder::Unknown);
     }
 
     #[test]

@@ -70,12 +70,12 @@ impl Rosmaster {
                 all
             }
         };
-        let is_told = |pid, port| match last {
+        let was_started_for = |pid, port| match last {
             Last::Running { port: told, .. } => told == port,
-            _ => is_told(pid, port),
+            _ => was_started_for(pid, port),
         };
         if let Some(port) = port
-            && let Some(left) = choose(port, &all, owner, is_told)
+            && let Some(left) = choose(port, &all, owner, was_started_for)
         {
             let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
             if !matches!(last, Last::Running { .. }) {
@@ -96,19 +96,19 @@ impl Rosmaster {
     }
 }
 
-/// Chooses from `all` the process that listens at `port` or will listen there. `is_told` says whether a process was
-/// started with that port. If none of `all` listens, the listener may be another process of `owner`, because a program
-/// given by `--rosmaster` may have started the real rosmaster.
+/// Chooses from `all` the process that listens at `port` or will listen there. `was_started_for` says whether a process
+/// was started with that port. If none of `all` listens, the listener may be another process of `owner`, because a
+/// program given by `--rosmaster` may have started the real rosmaster.
 fn choose(
     port: u16,
     all: &[u32],
     owner: &OsStr,
-    is_told: impl Fn(u32, u16) -> bool,
+    was_started_for: impl Fn(u32, u16) -> bool,
 ) -> Option<Orphan> {
     let sockets = listeners::sockets(port);
     let mut known = all.iter().copied();
     if sockets.is_empty() {
-        let starting = known.find(|pid| is_told(*pid, port));
+        let starting = known.find(|pid| was_started_for(*pid, port));
         return starting.map(Orphan::Starting);
     }
     let serving = known
@@ -121,7 +121,7 @@ fn choose(
 }
 
 /// Whether the process `pid` was started with `port` as its port.
-fn is_told(pid: u32, port: u16) -> bool {
+fn was_started_for(pid: u32, port: u16) -> bool {
     let command_line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     let words: Vec<_> = command_line.split(|byte| *byte == 0).collect();
     let port = port.to_string();
@@ -274,10 +274,10 @@ mod tests {
         let own = std::process::id();
         let pid = starting.id();
         // The kernel shows the command line a moment after the program has begun.
-        while !is_told(pid, port) {
+        while !was_started_for(pid, port) {
             std::thread::sleep(Duration::from_millis(1));
         }
-        let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), is_told);
+        let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), was_started_for);
         assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
         assert_eq!(choose(port, &[pid]), None, "its port is taken");
         drop(listener);

@@ -24,13 +24,14 @@ pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
 ) -> Result<Inspection, InspectError> {
-    let whole = look(connection, Inspection::call(token), token).await;
+    let whole = inspect_with(connection, Inspection::call(token), token).await;
     match whole {
         Err(InspectError::NotAMaster(
             NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
-        )) => look(connection, Inspection::call_without_params(token), token).await,
+        )) => inspect_with(connection, Inspection::call_without_params(token), token).await,
         Err(error) if is_broken_document(&error) => {
-            let rest = look(connection, Inspection::call_without_params(token), token).await;
+            let rest =
+                inspect_with(connection, Inspection::call_without_params(token), token).await;
             // A server that does not speak XML-RPC may have closed the connection.
             rest.map_err(|_| error)
         }
@@ -38,7 +39,7 @@ pub(crate) async fn first(
     }
 }
 
-async fn look(
+async fn inspect_with(
     connection: &mut Connection,
     call: Request,
     token: &Token,

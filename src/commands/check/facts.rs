@@ -438,13 +438,13 @@ pub(super) struct UpstreamMaster {
 impl UpstreamMaster {
     /// Looks for clients that bypass rosrescue. `known` are those that the running rosrescue has seen.
     async fn look(uri: MasterUri, known: Vec<String>) -> Self {
-        let place = timeout(LOOKUP_LIMIT, MasterAddresses::of(&uri))
+        let place = timeout(LOOKUP_LIMIT, MasterAddresses::resolve(&uri))
             .await
             .ok()
             .flatten();
         let mut bypass = Bypass::default();
         if let Some(place) = &place {
-            bypass.look(place);
+            bypass.find_new_clients(place);
         }
         let all: BTreeSet<_> = bypass.all().into_iter().chain(known).collect();
         Self {
