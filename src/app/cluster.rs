@@ -2,7 +2,7 @@
 
 mod facts;
 mod join;
-mod kept;
+mod partition_writes;
 mod report;
 mod survey;
 mod trouble;
@@ -36,7 +36,7 @@ use tokio::{
 use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
 pub(super) use self::join::{ClusterSetup, join};
-use self::{facts::Known, kept::Kept, trouble::Trouble};
+use self::{facts::ComputerFacts, partition_writes::PartitionWritesFile, trouble::Trouble};
 use super::{RunError, context::MasterDuties, life};
 use crate::{
     cluster::{
@@ -95,9 +95,9 @@ pub(super) struct ClusterDriver {
     duties: Option<MasterDuties>,
     /// Processes that are being stopped.
     endings: JoinSet<()>,
-    kept: Kept,
+    partition_writes: PartitionWritesFile,
     trouble: Arc<Trouble>,
-    known: Known,
+    facts: ComputerFacts,
 }
 
 impl ClusterDriver {
@@ -148,7 +148,7 @@ impl ClusterDriver {
             tracing::trace!(?input, "cluster");
         }
         for heard in input.heard() {
-            self.known.heard(heard);
+            self.facts.note_member_entry(heard);
         }
         let actions = self.member.on(now, input);
         let lease = self.member.machine().lease(now);
@@ -182,7 +182,7 @@ impl ClusterDriver {
                 let replica = self.replica.clone();
                 let trouble = self.trouble.clone();
                 self.spawn(Input::Loaded(None), async move {
-                    let loaded = trouble.of(replica.load(known).await);
+                    let loaded = trouble.note_result(replica.load(known).await);
                     Input::Loaded(loaded.and_then(|loaded| read(&replica.keys, loaded)))
                 });
             }
@@ -268,18 +268,22 @@ impl ClusterDriver {
             Action::TurnAway => context.gate_tx.set(State::Elsewhere),
             Action::ServeOwnOnly(own_only) => context.nodes.set_alone(own_only),
             Action::KeepAll { base, calls } => {
-                self.kept.replace(&context.checkpoint, base, calls).await;
+                self.partition_writes
+                    .replace(&context.checkpoint, base, calls)
+                    .await;
             }
             Action::Keep(calls) => {
-                self.kept.add(calls).await;
-                if self.kept.has_outgrown()
+                self.partition_writes.add(calls).await;
+                if self.partition_writes.has_outgrown()
                     && let Some((base, calls)) = self.member.kept()
                 {
                     let path = &self.setup.context.checkpoint;
-                    self.kept.replace(path, base.clone(), calls).await;
+                    self.partition_writes
+                        .replace(path, base.clone(), calls)
+                        .await;
                 }
             }
-            Action::KeepNothing => self.kept.remove(&context.checkpoint).await,
+            Action::KeepNothing => self.partition_writes.remove(&context.checkpoint).await,
             Action::Merge { number, ask, to } => {
                 let (peers, queue) = (self.peers.clone(), context.write_queue.clone());
                 let own = others::own_address(&self.member.settings().uri);
@@ -307,7 +311,8 @@ impl ClusterDriver {
                 let key = self.replica.keys.member(&self.member.settings().name);
                 let value = serde_json::to_vec(&self.member.says()).unwrap_or_default();
                 let put = Put { key, value };
-                self.beside.spawn(say(self.replica.client.clone(), put));
+                self.beside
+                    .spawn(publish_member_entry(self.replica.client.clone(), put));
             }
             Action::WriteSnapshot {
                 term,
@@ -354,7 +359,7 @@ impl ClusterDriver {
                     Input::RosoutEnded
                 });
             }
-            Action::Tell(news) => self.tell(news),
+            Action::Tell(news) => self.log_news(news),
             Action::End | Action::EndForNamesake(_) => {}
         }
     }
@@ -376,7 +381,9 @@ impl ClusterDriver {
                 }
                 replica.run(&settings, &op, entry.as_ref()).await
             };
-            let answer = trouble.of(run.await).unwrap_or(EtcdAnswer::Silence);
+            let answer = trouble
+                .note_result(run.await)
+                .unwrap_or(EtcdAnswer::Silence);
             Input::Answer { number, answer }
         });
     }
@@ -400,7 +407,7 @@ impl ClusterDriver {
                     Some(_) => drop(tell.send(Err("a handover is already under way".to_owned()))),
                     None => {
                         self.handover = Some(tell);
-                        let refused = self.known.successor(&to).err();
+                        let refused = self.facts.successor(&to).err();
                         return Ok(Input::HandOver { to, refused });
                     }
                 },
@@ -431,7 +438,7 @@ impl ClusterDriver {
             if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
                 self.trouble.set(&error.into());
             }
-            heard.extend(said(
+            heard.extend(member_entry(
                 &keys,
                 &change.key,
                 change.revision,
@@ -473,7 +480,7 @@ impl ClusterDriver {
 /// Converts what was read from etcd for the [`Member`]. `None` if the state in etcd is invalid.
 fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     let members = loaded.members.iter();
-    let heard = members.filter_map(|kv| said(keys, &kv.key, kv.revision, Some(kv)));
+    let heard = members.filter_map(|kv| member_entry(keys, &kv.key, kv.revision, Some(kv)));
     let heard = heard.collect();
     let state = match loaded.checkpoint {
         None => None,
@@ -499,7 +506,7 @@ fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
 }
 
 /// The member entry at `key`, if `key` belongs to a member.
-fn said(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
+fn member_entry(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
     let name = key.strip_prefix(&keys.member(""))?.to_owned();
     let said = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
     Some(Heard {
@@ -568,7 +575,7 @@ async fn merge(
 }
 
 /// Writes this computer's entry among the members to etcd.
-async fn say(client: Etcd, put: Put) {
+async fn publish_member_entry(client: Etcd, put: Put) {
     let said = async {
         let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;
         client.put_with_lease(&put, lease, LIMIT).await

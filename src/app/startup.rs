@@ -40,7 +40,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let own = config.clone();
     let opened = wait::within(OPENING, move || {
         let path = &own.checkpoint;
-        let found = Folder::look(path);
+        let found = Folder::inspect(path);
         let mut opened = Store::open(path);
         if let Ok((store, _)) = &mut opened {
             store.keep_log(own.log_bytes());
@@ -67,7 +67,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
         Some(Err((_, error))) => return Err(RunError::Checkpoint(error)),
         None => {
-            say_silent(&config.checkpoint);
+            log_silent_disk(&config.checkpoint);
             (None, None)
         }
     };
@@ -163,7 +163,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     })
 }
 
-fn say_silent(checkpoint: &Path) {
+fn log_silent_disk(checkpoint: &Path) {
     tracing::error!(
         checkpoint = %checkpoint.display(),
         "unprotected: the disk has not opened the checkpoint within {OPENING:?}; starting without it, and \
@@ -189,7 +189,7 @@ async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
             (Some(store), None)
         }
         None => {
-            say_silent(&path);
+            log_silent_disk(&path);
             (None, None)
         }
     }
@@ -202,7 +202,7 @@ struct Folder<'a> {
 }
 
 impl<'a> Folder<'a> {
-    fn look(checkpoint: &'a Path) -> Self {
+    fn inspect(checkpoint: &'a Path) -> Self {
         let folder = checkpoint
             .parent()
             .filter(|folder| !folder.as_os_str().is_empty());

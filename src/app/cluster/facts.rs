@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// Facts about the other computers.
-pub(super) struct Known {
+pub(super) struct ComputerFacts {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
     addresses: MemberAddresses,
@@ -31,7 +31,7 @@ pub(super) struct Known {
     pub(super) times_cut_off: u64,
 }
 
-impl Known {
+impl ComputerFacts {
     pub(super) fn new(settings: &Settings, addresses: MemberAddresses) -> Self {
         Self {
             settings: settings.clone(),
@@ -48,7 +48,7 @@ impl Known {
     }
 
     /// Updates the facts from the keys `leader` and `alive`.
-    pub(super) fn look(&mut self, view: &View) {
+    pub(super) fn note_view(&mut self, view: &View) {
         let now = Instant::now();
         if let Some(leader) = &view.leader
             && self.leader.as_ref().is_none_or(|of| of.term != leader.term)
@@ -76,7 +76,7 @@ impl Known {
     }
 
     /// Updates the facts from what a computer has written about itself.
-    pub(super) fn heard(&mut self, heard: &Heard) {
+    pub(super) fn note_member_entry(&mut self, heard: &Heard) {
         let uri = heard.said.as_ref().map(|said| &*said.uri);
         self.addresses.set_address(&heard.name, uri);
         let Some(said) = &heard.said else { return };
@@ -148,25 +148,25 @@ impl Known {
 }
 
 impl ClusterDriver {
-    /// Since when no computer leads, as far as is known.
+    /// Since when no computer leads, as far as is facts.
     fn leaderless(&self) -> Option<Instant> {
-        let (role, since) = self.known.role;
+        let (role, since) = self.facts.role;
         let gone = match role {
             Role::Leading => false,
             Role::Following => self.member.was_released() || self.member.view().leader.is_none(),
             Role::Joining | Role::CatchingUp | Role::Alone => true,
         };
-        let sign = self.known.sign.map_or(since, |(_, at)| at);
+        let sign = self.facts.sign.map_or(since, |(_, at)| at);
         gone.then_some(sign)
     }
 
     /// Updates the status.
     pub(super) fn show(&mut self) {
-        self.known.look(self.member.view());
-        if self.known.role.0 != self.member.role() {
-            self.known.role = (self.member.role(), Instant::now());
+        self.facts.note_view(self.member.view());
+        if self.facts.role.0 != self.member.role() {
+            self.facts.role = (self.member.role(), Instant::now());
         }
-        let known = &self.known;
+        let facts = &self.facts;
         let own = self.member.says();
         let own = MemberFacts {
             name: self.member.settings().name.clone(),
@@ -176,7 +176,7 @@ impl ClusterDriver {
             seq: own.seq,
             heard: Some(Instant::now()),
         };
-        let others = known.members.values().filter(|of| of.name != own.name);
+        let others = facts.members.values().filter(|of| of.name != own.name);
         let mut members: Vec<_> = others.cloned().collect();
         members.push(own);
         members.sort_by(|a, b| a.name.cmp(&b.name));
@@ -184,9 +184,9 @@ impl ClusterDriver {
         let last = self.member.view().seq().max(seq);
         let facts = ClusterFacts {
             name,
-            role: known.role.0,
-            since: known.role.1,
-            leader: known.leader.clone(),
+            role: facts.role.0,
+            since: facts.role.1,
+            leader: facts.leader.clone(),
             leaderless: self.leaderless(),
             seq: last,
             behind: last - seq,
@@ -199,10 +199,10 @@ impl ClusterDriver {
                 ))
             }),
             members,
-            takeovers: known.takeovers,
-            last_takeover: known.last_takeover.clone(),
-            lost_writes: known.lost_writes,
-            times_cut_off: known.times_cut_off,
+            takeovers: facts.takeovers,
+            last_takeover: facts.last_takeover.clone(),
+            lost_writes: facts.lost_writes,
+            times_cut_off: facts.times_cut_off,
         };
         let board = &self.setup.context.board;
         board.update(|board| board.cluster = Some(facts));

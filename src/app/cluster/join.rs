@@ -18,7 +18,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use super::{ClusterDriver, facts::Known, kept::Kept};
+use super::{ClusterDriver, facts::ComputerFacts, partition_writes::PartitionWritesFile};
 use crate::{
     app::{context::Context, startup},
     cluster::{
@@ -109,7 +109,8 @@ pub(in crate::app) async fn join(
         // own leader first.
         hold: setup.hold.max(2 * config.ttl),
     };
-    let (kept, left) = Kept::left(&context.checkpoint, setup.restored).await;
+    let (partition_writes, left) =
+        PartitionWritesFile::load(&context.checkpoint, setup.restored).await;
     let session = context.ledger.session();
     let own = Own {
         state: context.ledger.with_mirror(Clone::clone),
@@ -120,7 +121,7 @@ pub(in crate::app) async fn join(
     let keys = Keys::new(&config.robot);
     let id = settings.id.clone();
     let driver = ClusterDriver {
-        known: Known::new(&settings, members),
+        facts: ComputerFacts::new(&settings, members),
         member: Member::new(settings, keys.clone(), own, left, id),
         replica: Replica {
             client,
@@ -142,7 +143,7 @@ pub(in crate::app) async fn join(
         watched: View::default(),
         duties: None,
         endings: JoinSet::new(),
-        kept,
+        partition_writes,
         trouble: Arc::default(),
     };
     Ok((others, driver))

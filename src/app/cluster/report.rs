@@ -23,17 +23,17 @@ static ALONE: Pair = Pair::new();
 
 impl ClusterDriver {
     /// Logs an event.
-    pub(super) fn tell(&mut self, news: News) {
+    pub(super) fn log_news(&mut self, news: News) {
         match news {
             News::Alone { serves } => {
-                self.known.times_cut_off += 1;
-                self.tell_alone(serves);
+                self.facts.times_cut_off += 1;
+                self.log_cut_off(serves);
             }
             News::NotAlone => {
                 let role = self.member.role().as_str();
                 all_clear!(info, ALONE, role, "no longer cut off");
             }
-            News::Leads { before, released } => self.known.taken_over(before, released),
+            News::Leads { before, released } => self.facts.taken_over(before, released),
             News::LeadsAgain => {
                 tracing::warn!("this computer leads again, because etcd has answered");
             }
@@ -65,7 +65,7 @@ impl ClusterDriver {
                 "cannot write a change to etcd; the other computers do not get it"
             ),
             News::Merged { sent, lost } => {
-                self.known.lost_writes += lost;
+                self.facts.lost_writes += lost;
                 tracing::info!(
                     sent,
                     lost,
@@ -75,7 +75,7 @@ impl ClusterDriver {
         }
     }
 
-    fn tell_alone(&self, serves: bool) {
+    fn log_cut_off(&self, serves: bool) {
         let silent = self.trouble.is_silent(self.member.settings().ttl / 2);
         let own = &self.member.settings().id;
         let leader = self.member.view().leader.as_ref();

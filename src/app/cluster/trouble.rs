@@ -29,10 +29,10 @@ impl Trouble {
     }
 
     pub(super) fn set(&self, error: &ReplicaError) {
-        self.say(error.to_string());
+        self.report(error.to_string());
     }
 
-    fn say(&self, text: String) {
+    fn report(&self, text: String) {
         let (trouble, _) = &mut *self.lock();
         match trouble {
             Some((_, said)) => *said = text,
@@ -49,7 +49,7 @@ impl Trouble {
         let (known, heard) = self.lock().clone();
         let silent = heard.elapsed();
         if silent > limit && known.is_none() {
-            self.say(format!("no answer for {:.1} s", silent.as_secs_f64()));
+            self.report(format!("no answer for {:.1} s", silent.as_secs_f64()));
         }
         silent > limit
     }
@@ -63,7 +63,7 @@ impl Trouble {
     }
 
     /// Notes the result of a request. Returns what etcd answered, if it did.
-    pub(super) fn of<T>(&self, result: Result<T, ReplicaError>) -> Option<T> {
+    pub(super) fn note_result<T>(&self, result: Result<T, ReplicaError>) -> Option<T> {
         match result {
             Ok(given) => {
                 self.clear();

@@ -24,24 +24,24 @@ const FILE_BYTES: u64 = 64 << 10;
 
 /// The file `CHECKPOINT.alone`, which holds the writes that were answered while this computer was cut off.
 #[derive(Default)]
-pub(super) struct Kept {
+pub(super) struct PartitionWritesFile {
     /// `None` while there is nothing to keep, or while the disk hangs.
     store: Option<Store>,
     /// The size of the file's journal when it was last rewritten, in bytes.
     written: u64,
 }
 
-fn path_of(checkpoint: &Path) -> PathBuf {
+fn file_path(checkpoint: &Path) -> PathBuf {
     let mut name = checkpoint.as_os_str().to_owned();
     name.push(".alone");
     name.into()
 }
 
-impl Kept {
+impl PartitionWritesFile {
     /// Opens the file, and returns the writes that an earlier process left. If the session of that process does not
     /// continue (`goes_on` is false), the file is kept under another name.
-    pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
-        let path = path_of(checkpoint);
+    pub(super) async fn load(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
+        let path = file_path(checkpoint);
         let opened = wait::within(DISK_PATIENCE, move || {
             if let Err(error) = check(&path) {
                 return Some(Err(error.to_string()));
@@ -51,7 +51,7 @@ impl Kept {
             }
             let mut opened = Store::open(&path).map_err(|error| error.to_string());
             if let (Ok((store, Some(_))), false) = (&mut opened, goes_on) {
-                keep_of_session(store);
+                set_aside(store);
                 return None;
             }
             Some(opened)
@@ -89,7 +89,7 @@ impl Kept {
 
     /// Replaces the file's content by `calls`, which were answered since the state was `base`.
     pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
-        let path = path_of(checkpoint);
+        let path = file_path(checkpoint);
         let store = match self.store.take() {
             Some(store) => Some(Ok(store)),
             None => {
@@ -102,8 +102,8 @@ impl Kept {
         };
         match store {
             Some(Ok(store)) => self.write(store, base, calls).await,
-            Some(Err(error)) => say_unkept(&error),
-            None => say_unkept(&SILENT),
+            Some(Err(error)) => log_unsaved(&error),
+            None => log_unsaved(&SILENT),
         }
     }
 
@@ -147,10 +147,10 @@ impl Kept {
         work: impl FnOnce() -> (Result<(), StoreError>, Store) + Send + 'static,
     ) {
         let Some((done, store)) = wait::within(DISK_PATIENCE, work).await else {
-            return say_unkept(&SILENT);
+            return log_unsaved(&SILENT);
         };
         if let Err(error) = done {
-            say_unkept(&error);
+            log_unsaved(&error);
         }
         self.store = Some(store);
     }
@@ -158,7 +158,7 @@ impl Kept {
     /// Removes the file, because all writes have been sent.
     pub(super) async fn remove(&mut self, checkpoint: &Path) {
         self.store = None;
-        let path = path_of(checkpoint);
+        let path = file_path(checkpoint);
         // A hanging disk may remove the file later: it must only be gone before the next start.
         wait::within(DISK_PATIENCE, move || remove_files(path)).await;
     }
@@ -196,7 +196,7 @@ fn remove_files(path: PathBuf) {
 }
 
 /// Keeps the writes of an ended session under another name.
-fn keep_of_session(store: &mut Store) {
+fn set_aside(store: &mut Store) {
     match store.set_aside("session") {
         Ok(Some(kept)) => tracing::warn!(
             kept = %kept.display(),
@@ -209,7 +209,7 @@ fn keep_of_session(store: &mut Store) {
     }
 }
 
-fn say_unkept(error: &dyn std::fmt::Display) {
+fn log_unsaved(error: &dyn std::fmt::Display) {
     rarely!(
         error,
         %error,
@@ -238,8 +238,8 @@ mod tests {
         of.calls().cloned().collect()
     }
 
-    async fn begun(checkpoint: &Path) -> Kept {
-        let mut kept = Kept::default();
+    async fn begun(checkpoint: &Path) -> PartitionWritesFile {
+        let mut kept = PartitionWritesFile::default();
         kept.replace(checkpoint, base(), Vec::new()).await;
         kept
     }
@@ -262,13 +262,18 @@ mod tests {
         kept.add(vec![set("/b", 2)]).await;
         drop(kept);
         for _ in 0..2 {
-            let (_kept, left) = Kept::left(&checkpoint, true).await;
+            let (_kept, left) = PartitionWritesFile::load(&checkpoint, true).await;
             assert!(left.base() == Some(&base()));
             assert_eq!(calls(&left), [set("/a", 1), set("/b", 2)]);
         }
-        Kept::default().remove(&checkpoint).await;
+        PartitionWritesFile::default().remove(&checkpoint).await;
         assert_eq!(files(&checkpoint), [""; 0]);
-        assert!(Kept::left(&checkpoint, true).await.1.is_empty());
+        assert!(
+            PartitionWritesFile::load(&checkpoint, true)
+                .await
+                .1
+                .is_empty()
+        );
     }
 
     #[tokio::test]
@@ -278,12 +283,22 @@ mod tests {
         let mut kept = begun(&checkpoint).await;
         kept.add(vec![set("/a", 1)]).await;
         drop(kept);
-        assert!(Kept::left(&checkpoint, false).await.1.is_empty());
+        assert!(
+            PartitionWritesFile::load(&checkpoint, false)
+                .await
+                .1
+                .is_empty()
+        );
         let names = files(&checkpoint);
         assert!(!names.is_empty() && !names.contains(&"chkpt.yaml.alone".to_owned()));
         let text = std::fs::read_to_string(folder.path().join(&names[0])).unwrap();
         assert!(text.contains("before"), "{text}");
-        assert!(Kept::left(&checkpoint, true).await.1.is_empty());
+        assert!(
+            PartitionWritesFile::load(&checkpoint, true)
+                .await
+                .1
+                .is_empty()
+        );
     }
 
     #[tokio::test]
@@ -299,12 +314,12 @@ mod tests {
                 kept.replace(&checkpoint, base(), values(round).collect())
                     .await;
             }
-            let bytes = std::fs::metadata(path_of(&checkpoint)).unwrap().len();
+            let bytes = std::fs::metadata(file_path(&checkpoint)).unwrap().len();
             largest = largest.max(bytes);
         }
         assert!(largest < 3 * FILE_BYTES, "{largest}");
         drop(kept);
-        let (_kept, left) = Kept::left(&checkpoint, true).await;
+        let (_kept, left) = PartitionWritesFile::load(&checkpoint, true).await;
         assert_eq!(calls(&left), values(299).collect::<Vec<_>>());
     }
 }
