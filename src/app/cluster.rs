@@ -554,7 +554,7 @@ async fn decide(
     Input::Decided { seq, goes_on }
 }
 
-/// Sends writes that were answered while cut off to the leader. `to` is its address and term, or `None` if this
+/// Sends partition writes to the leader. `to` is its address and term, or `None` if this
 /// computer leads.
 async fn merge(
     ask: Ask,

@@ -30,8 +30,7 @@ pub struct ClusterFacts {
     /// Number of takeovers by this computer.
     pub takeovers: u64,
     pub last_takeover: Option<Takeover>,
-    /// Number of writes that this computer answered while it was cut off and that were then lost, because other
-    /// computers had changed the same data.
+    /// Number of this computer's partition writes that were lost, because other computers had changed the same data.
     pub lost_writes: u64,
     /// How often this computer was cut off since this process started.
     pub times_cut_off: u64,

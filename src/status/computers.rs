@@ -38,7 +38,7 @@ pub(crate) struct Computers {
     pub(crate) takeovers: u64,
     /// The last takeover by this computer.
     pub(crate) last_takeover: Option<Taken>,
-    /// Number of writes that this computer answered while it was cut off and that were then lost.
+    /// Number of this computer's partition writes that were lost.
     pub(crate) lost_writes: u64,
     /// How often this computer was cut off since its rosrescue started.
     pub(crate) times_cut_off: u64,

@@ -12,7 +12,7 @@
 //! * [`member`]: what one computer follows, answers, writes to the journal and merges, and when it runs a master.
 //! * [`standing`]: who has the master, and where calls go.
 //! * [`sharing`]: changes that the other computers must get; [`outgoing`]: those that are not in the journal yet.
-//! * [`cut_off`]: writes that were answered while this computer was cut off.
+//! * [`cut_off`]: the partition writes of this computer.
 //! * [`journal`]: records and snapshots to and from keys and values.
 //! * [`merge`]: which writes of a computer that was cut off still hold.
 //! * [`namesake`]: another computer with this one's name.

@@ -1,5 +1,4 @@
-//! Stores the writes that were answered while this computer was cut off beside the checkpoint, until the leader has
-//! them.
+//! Stores this computer's partition writes beside the checkpoint, until the leader has them.
 
 use std::path::{Path, PathBuf};
 
@@ -22,7 +21,7 @@ use crate::{
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
 const FILE_BYTES: u64 = 64 << 10;
 
-/// The file `CHECKPOINT.alone`, which holds the writes that were answered while this computer was cut off.
+/// The file `CHECKPOINT.alone`, which holds the partition writes.
 #[derive(Default)]
 pub(super) struct PartitionWritesFile {
     /// `None` while there is nothing to keep, or while the disk hangs.

@@ -111,7 +111,7 @@ pub(super) fn cause(of: Cause) -> &'static str {
     }
 }
 
-/// Logs which of the writes that were answered while cut off are lost. Logs one line per parameter, topic or service,
+/// Logs which partition writes are lost. Logs one line per parameter, topic or service,
 /// because a node may have written the same one a thousand times.
 pub(super) fn report(hide: &Hide, outcomes: Vec<(Request, WriteOutcome)>) {
     let mut subjects: BTreeMap<_, u64> = BTreeMap::new();

@@ -31,7 +31,7 @@ pub(super) const PASSED_ON: &str = "rosrescue/passedOn";
 
 /// A request of rosrescue itself.
 pub(super) enum Control {
-    /// Make these writes, which a computer answered while it was cut off.
+    /// Make these partition writes of another computer.
     Merge(Ask),
     /// Let this computer lead, or any if the name is empty.
     HandOver(String),

@@ -1,5 +1,5 @@
-//! Keeps the writes that were answered while this computer was cut off, until a leader has them. Pure; `app/cluster`
-//! also stores them beside the checkpoint.
+//! Keeps this computer's partition writes until a leader has them. Pure; `app/cluster` also stores them beside the
+//! checkpoint.
 
 use std::collections::VecDeque;
 
@@ -63,7 +63,7 @@ impl CutOff {
         }
     }
 
-    /// Whether a leader has all writes that were answered while cut off.
+    /// Whether a leader has all partition writes.
     pub fn is_empty(&self) -> bool {
         self.periods.is_empty()
     }
@@ -143,8 +143,7 @@ impl CutOff {
         state
     }
 
-    /// Keeps writes that were answered while cut off. `given` says whether they may also get into the journal. Returns
-    /// the writes.
+    /// Keeps partition writes. `given` says whether they may also get into the journal. Returns the writes.
     pub fn add<'a>(
         &mut self,
         changes: impl IntoIterator<Item = &'a Change>,

@@ -51,7 +51,7 @@ use self::{
     name_check::Namesake, probes::Probing, release::Release,
 };
 pub use self::{
-    chores::SAYS_EVERY,
+    chores::PUBLISH_EVERY,
     probes::PROBES,
     types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
 };
@@ -92,7 +92,7 @@ impl Journal {
 
 /// What `app/cluster` knows once it has carried out the returned actions.
 #[derive(Debug)]
-struct Told {
+struct LastPublished {
     role: Role,
     standing: Standing,
     /// Whether this computer has a master, or starts one.
@@ -113,7 +113,7 @@ struct Before {
 pub struct Member {
     keys: Keys,
     machine: Machine,
-    told: Told,
+    published: LastPublished,
     own: Own,
     data_loss: DataLoss,
     journal: Journal,
@@ -140,14 +140,14 @@ struct Queue {
 }
 
 impl Member {
-    /// Creates a member that waits for [`Input::Begin`]. `left` holds the writes that an earlier process answered while
-    /// it was cut off. `id` is the unique name under which such writes are sent to a leader.
+    /// Creates a member that waits for [`Input::Begin`]. `left` holds the partition writes of an earlier process.
+    /// `id` is the unique name under which partition writes are sent to a leader.
     pub fn new(settings: Settings, keys: Keys, own: Own, left: CutOff, id: String) -> Self {
         let known = own.restored;
         Self {
             keys,
             machine: Machine::new(settings),
-            told: Told {
+            published: LastPublished {
                 role: Role::Joining,
                 standing: Standing::Nobody { known },
                 has_master: false,
@@ -171,7 +171,7 @@ impl Member {
 
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
-        self.hear(now, input.heard());
+        self.note_member_entries(now, input.heard());
         match input {
             Input::Begin => {
                 self.queue.start_by = Some(now + START_BY);
@@ -179,7 +179,7 @@ impl Member {
             }
             Input::Answer { number, answer } => {
                 let answer = self.doubt_answer(now, number, answer);
-                self.tell_machine(machine::Input::Answer { number, answer });
+                self.queue_input(machine::Input::Answer { number, answer });
             }
             Input::Watched {
                 view,
@@ -195,7 +195,7 @@ impl Member {
             Input::Prepared(leads) => self.prepared(leads),
             Input::Decided { seq, goes_on } => {
                 self.reading.deciding = false;
-                self.tell_machine(machine::Input::Decided { seq, goes_on });
+                self.queue_input(machine::Input::Decided { seq, goes_on });
             }
             Input::Probed { number, leads } => self.probed(number, leads),
             Input::Merged { number, answer } => self.portion_answered(now, number, answer),
@@ -242,7 +242,7 @@ impl Member {
 
     /// The machine's role after the actions that were returned last.
     pub fn role(&self) -> Role {
-        self.told.role
+        self.published.role
     }
 
     pub fn settings(&self) -> &Settings {
@@ -260,7 +260,7 @@ impl Member {
 
     /// Who has the master, and where calls go.
     pub fn standing(&self) -> &Standing {
-        &self.told.standing
+        &self.published.standing
     }
 
     /// The place in the journal up to which the mirror is current.
@@ -291,7 +291,7 @@ impl Member {
         }
     }
 
-    /// The writes answered while cut off that have not reached a leader, with the state before them.
+    /// The partition writes that have not reached a leader, with the state before them.
     pub fn kept(&self) -> Option<(&Master, Vec<Request>)> {
         let base = self.cut_off.base()?;
         Some((base, self.cut_off.calls().cloned().collect()))
@@ -311,7 +311,7 @@ impl Member {
             notifies: self
                 .chores
                 .notifying
-                .says(&settings.id, !self.cut_off.is_empty()),
+                .marker(&settings.id, !self.cut_off.is_empty()),
         }
     }
 
@@ -319,11 +319,11 @@ impl Member {
         self.queue.actions.push(action);
     }
 
-    fn tell(&mut self, news: News) {
+    fn report_news(&mut self, news: News) {
         self.act(Action::Tell(news));
     }
 
-    fn tell_machine(&mut self, input: machine::Input) {
+    fn queue_input(&mut self, input: machine::Input) {
         self.queue.inputs.push_back(input);
     }
 
@@ -354,7 +354,7 @@ impl Member {
 
     /// Whether calls are recorded on this computer: it leads, or it is cut off and serves.
     fn records(&self) -> bool {
-        self.told.standing.records()
+        self.published.standing.records()
     }
 
     /// Whether the ledger must hold the journal's state, because this computer does not record calls itself.
@@ -370,7 +370,7 @@ impl Member {
 
     /// Whether writes answered now are kept for a later leader.
     fn keeps(&self) -> bool {
-        self.told.role == Role::Alone && self.settings().alone == WhenAlone::Serve
+        self.published.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
     /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and

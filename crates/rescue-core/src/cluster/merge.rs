@@ -1,5 +1,6 @@
-//! Decides which of the writes that a computer answered while it was cut off still hold: all, except those to a
-//! parameter, node, service or topic registration that others have changed since, even if they have changed it back.
+//! Decides which partition writes (writes that a computer answered while it was cut off) still hold. A partition write is
+//! lost if other computers have since changed the same parameter, node, service or topic registration. It is lost even if
+//! they have changed it back.
 //!
 //! The same rules apply twice: on the computer that was cut off, to the changes that it reads in the journal; and on
 //! the leader, before it makes the writes of each request, to later changes. See decision 42.
@@ -24,27 +25,27 @@ use crate::{
 /// The caller of the calls that set a parameter again, so that nodes are notified of its value. No node has this name.
 pub(super) const TELLER: &str = "/rosrescue";
 
-/// Which writes of a computer that was cut off are sent to the leader, and which are lost.
+/// Which partition writes are sent to the leader, and which are lost.
 #[derive(Debug, Default, PartialEq)]
 pub struct Merged {
     /// The writes to send to the leader, in this order.
     pub send: Vec<Request>,
-    pub lost: Vec<Lost>,
+    pub lost: Vec<LostWrite>,
     /// The parameters that others have set to the same value. They may have set another value since, which nodes on this
     /// computer heard before this computer's own value.
     pub equal: Vec<String>,
 }
 
-/// A write that was answered while its computer was cut off, and that is lost because of a conflict.
+/// A partition write that is lost because of a conflict.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Lost {
+pub struct LostWrite {
     pub call: Request,
     pub why: Conflict,
     /// The parameter's value after others changed it, or a namespace around it.
     pub present: Option<Value>,
 }
 
-/// What happens to one write of a computer that was cut off; see [`judge`].
+/// What happens to one partition write; see [`judge_write`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum Verdict {
     /// The leader makes the write, because others have not changed the same parameter, node, service or topic
@@ -52,10 +53,10 @@ pub enum Verdict {
     Runs,
     /// The write is unnecessary: others have made the same change, or what it unregisters is no longer registered.
     Holds,
-    Lost(Lost),
+    Lost(LostWrite),
 }
 
-/// What others changed while a computer was cut off, so that the computer's own write is lost.
+/// What others changed during the partition, so that a partition write is lost.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conflict {
     Parameter(String),
@@ -111,7 +112,7 @@ pub fn merge<'a>(
     let pending: Vec<_> = pending.into_iter().collect();
     for call in pending.into_iter().rev() {
         let path = param_of(call);
-        match judge(changes, now, call) {
+        match judge_write(changes, now, call) {
             Verdict::Runs => merged.send.push(call.clone()),
             Verdict::Holds => merged.equal.extend(parameter_of(call)),
             // A value that this computer itself deleted later does not count as lost.
@@ -127,8 +128,9 @@ pub fn merge<'a>(
     merged
 }
 
-/// Decides what happens to `call`, which must not be a multicall, after `changes` by others, whose state is `now`.
-pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
+/// Decides what happens to the partition write `call`, which must not be a multicall, after `changes` by others, whose
+/// state is `now`.
+pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let Some(why) = conflict(changes, now, call) else {
         return Verdict::Runs;
     };
@@ -150,7 +152,7 @@ pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
         return Verdict::Holds;
     }
     let call = call.clone();
-    Verdict::Lost(Lost { call, why, present })
+    Verdict::Lost(LostWrite { call, why, present })
 }
 
 fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict> {

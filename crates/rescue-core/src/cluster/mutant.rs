@@ -22,13 +22,13 @@ pub(crate) enum Mutant {
     MergesByState,
     /// A value that equals this computer's own write never counts as another computer's change.
     GuessesByValues,
-    /// Writes made while cut off are checked for conflicts once, and then sent whatever others write meanwhile.
+    /// Partition writes are checked for conflicts once, and then sent whatever others write meanwhile.
     JudgesOnce,
     /// A leader that is cut off keeps calls that other computers forwarded to it.
     KeepsForwarded,
-    /// Every write made while cut off is kept, instead of the last one of each subject.
+    /// Every partition write is kept, instead of the last one of each subject.
     KeepsEachWrite,
-    /// A leader that was alone deletes its file of lone writes before the journal has them.
+    /// A leader that was alone deletes its file of partition writes before the journal has them.
     DeletesKeptWrites,
     /// An etcd that has lost its data is not recognised.
     TrustsLostEtcd,

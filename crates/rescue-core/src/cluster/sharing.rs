@@ -167,8 +167,8 @@ impl Sharing {
         Change::State { seq, state }
     }
 
-    /// Decides what happens to `calls`, which a computer answered while it was cut off, in the state `mirror`. That
-    /// computer sends them under the name `merge`, and has taken the others' changes up to record `seq` into account.
+    /// Decides what happens to the partition writes `calls` of a computer in the state `mirror`. That computer sends
+    /// them under the name `merge`, and has taken the others' changes up to record `seq` into account.
     /// `None` if the changes after that record are no longer known, or the record is of a journal that etcd has lost.
     pub fn judge(
         &self,
@@ -183,7 +183,7 @@ impl Sharing {
             false => self.recent.since(seq, merge)?,
         };
         let verdicts = calls.iter().map(|call| {
-            match merge::judge(&changes, mirror, call) {
+            match merge::judge_write(&changes, mirror, call) {
                 // It sets the present value again, so that nodes are notified.
                 Verdict::Holds if call.text(0) == Some(merge::TELLER) => Verdict::Runs,
                 verdict => verdict,

@@ -8,7 +8,7 @@ pub enum Pass {
     Calls,
     /// The mirror answers reads. Writes wait for the next leader.
     Reads,
-    /// No call is answered: writes answered while cut off are not merged yet, so their callers would not see them.
+    /// No call is answered: partition writes are not merged yet, so their callers would not see them.
     Nothing,
 }
 

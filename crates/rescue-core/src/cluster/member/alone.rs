@@ -9,10 +9,10 @@ use crate::{
 impl Member {
     pub(super) fn be_alone(&mut self) {
         let serves = self.settings().alone == WhenAlone::Serve;
-        self.tell(News::Alone { serves });
+        self.report_news(News::Alone { serves });
         if !serves {
             self.give_up();
-            return self.stand(Standing::Nobody { known: true });
+            return self.publish_standing(Standing::Nobody { known: true });
         }
         let led = self.records();
         self.end_master();
@@ -33,7 +33,7 @@ impl Member {
             self.keep(kept);
         } else {
             // The standing changes first, so that no more calls are forwarded.
-            self.stand(Standing::Nobody { known: true });
+            self.publish_standing(Standing::Nobody { known: true });
             self.act(Action::AskForwarded);
             let seq = self.machine.committed();
             self.outgoing.start(seq);
@@ -41,7 +41,7 @@ impl Member {
             self.act(Action::Lead { seq, held, state });
         }
         self.act(Action::StandIn);
-        self.stand(Standing::Alone);
+        self.publish_standing(Standing::Alone);
         self.all_ready();
     }
 

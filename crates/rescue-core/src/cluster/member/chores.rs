@@ -6,7 +6,7 @@ use super::{Action, Member, notifying::Notifying};
 use crate::cluster::{journal::Progress, machine::Role};
 
 /// How often a computer updates its entry among the members.
-pub const SAYS_EVERY: Duration = Duration::from_secs(5);
+pub const PUBLISH_EVERY: Duration = Duration::from_secs(5);
 /// How often the leader compacts etcd, and the age from which revisions are dropped.
 const FORGET: Duration = Duration::from_secs(300);
 /// Pause after a snapshot that could not be written.
@@ -16,7 +16,7 @@ const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 #[derive(Debug, Default)]
 pub(super) struct Chores {
     /// When to write this computer's entry among the members.
-    pub(super) say_at: Option<Instant>,
+    pub(super) publish_at: Option<Instant>,
     /// Whether a snapshot is being written.
     pub(super) snapshot: bool,
     /// The last record that a snapshot of this computer holds or will hold. Its entry and those before are deleted.
@@ -34,12 +34,12 @@ pub(super) struct Chores {
 impl Chores {
     pub(super) fn due(&self) -> Option<Instant> {
         let forget = self.forget.map(|(at, _)| at);
-        [self.say_at, forget].into_iter().flatten().min()
+        [self.publish_at, forget].into_iter().flatten().min()
     }
 
     /// Has this computer's entry among the members updated at `now`.
-    pub(super) fn say_at(&mut self, now: Instant) {
-        self.say_at = Some(now);
+    pub(super) fn publish_entry_by(&mut self, now: Instant) {
+        self.publish_at = Some(now);
     }
 
     /// Keeps the file of kept writes as it is until the journal has record `seq`. If the leader lost its power before,
@@ -61,8 +61,8 @@ impl Member {
         // Before the watch for a namesake is over, the entry could overwrite that of another computer.
         let watch = self.namesake.watch.as_ref();
         let may_say = watch.is_some_and(|of| of.is_over(now));
-        if self.chores.say_at.is_none_or(|at| at <= now) {
-            self.chores.say_at = Some(now + SAYS_EVERY);
+        if self.chores.publish_at.is_none_or(|at| at <= now) {
+            self.chores.publish_at = Some(now + PUBLISH_EVERY);
             if may_say {
                 self.act(Action::Say);
             }

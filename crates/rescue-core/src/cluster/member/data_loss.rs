@@ -57,7 +57,7 @@ impl DataLoss {
     }
 
     /// Whether `view` shows nothing but what is left of the lost journal.
-    pub(super) fn is_left(&self, view: &View) -> bool {
+    pub(super) fn is_remainder(&self, view: &View) -> bool {
         let shown = view.guard();
         let left = self.present.is_some_and(|loss| loss.left == shown);
         left && !Mutant::BelievesOldCopy.lives()
@@ -159,11 +159,11 @@ impl Member {
             },
         };
         let holds = self.data_loss.holds().unwrap_or(holds);
-        self.tell(News::EtcdLost);
+        self.report_news(News::EtcdLost);
         // The ledger keeps its state, if no leader has written its own to the journal yet.
         self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
         // A leader holds the most, as long as no other computer can lead.
-        let leads = self.told.role == Role::Leading && self.machine.is_sole(now);
+        let leads = self.published.role == Role::Leading && self.machine.is_sole(now);
         let wait = if leads {
             Duration::ZERO
         } else {
@@ -210,14 +210,14 @@ impl Member {
 
     /// Notes how much another computer holds of a journal that etcd has lost, and whether it cannot read the present
     /// one.
-    pub(super) fn hear_of_loss(&mut self, now: Instant, heard: &Heard) {
+    pub(super) fn note_holdings(&mut self, now: Instant, heard: &Heard) {
         let said = heard.said.as_ref();
         let holds = said.and_then(|said| said.holds);
         match holds {
             Some(holds) => self.data_loss.others.insert(heard.name.clone(), holds),
             None => self.data_loss.others.remove(&heard.name),
         };
-        let (leads, view) = (self.told.role == Role::Leading, self.view());
+        let (leads, view) = (self.published.role == Role::Leading, self.view());
         let shown = Holds {
             term: view.term(),
             seq: view.seq(),
@@ -238,9 +238,9 @@ impl Member {
         let Some(Loss { since, holds, .. }) = self.data_loss.present else {
             return;
         };
-        if !self.journal.own_wins || self.told.role == Role::Leading {
+        if !self.journal.own_wins || self.published.role == Role::Leading {
             self.data_loss.present = None;
-            return self.chores.say_at(now);
+            return self.chores.publish_entry_by(now);
         }
         let name = &self.settings().name;
         let mine = (holds, name);
@@ -252,7 +252,7 @@ impl Member {
             self.machine.hold_claims(until);
         }
         // A request of this computer may have succeeded since.
-        if self.data_loss.is_left(self.view()) || self.leader().is_none() {
+        if self.data_loss.is_remainder(self.view()) || self.leader().is_none() {
             return;
         }
         // Another computer has led since, so its journal counts. Those that have read it claim first.

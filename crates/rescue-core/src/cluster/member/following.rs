@@ -94,7 +94,7 @@ impl Member {
         let there = seq >= wanted.unwrap_or_default();
         if news && self.reading.loaded && !self.records() && there {
             (self.reading.wanted, self.reading.reported) = (None, seq);
-            self.tell_machine(machine::Input::Followed(seq));
+            self.queue_input(machine::Input::Followed(seq));
         }
         if self.reading.loaded && seq >= self.view().seq() {
             self.decide(seq);
@@ -124,7 +124,7 @@ impl Member {
         }
         if self.journal.own_wins || seq == 0 {
             let goes_on = true;
-            return self.tell_machine(machine::Input::Decided { seq, goes_on });
+            return self.queue_input(machine::Input::Decided { seq, goes_on });
         }
         self.reading.deciding = true;
         let (state, closed) = (self.journal.state.clone(), self.before.released);
@@ -145,7 +145,7 @@ impl Member {
         if view.revision >= self.view().revision && self.doubts(now, &view) {
             return;
         }
-        let leads = self.told.role == Role::Leading && !Mutant::TrustsDeletedKeys.lives();
+        let leads = self.published.role == Role::Leading && !Mutant::TrustsDeletedKeys.lives();
         if leads && deleted.is_some_and(|seq| seq > self.chores.replaced) {
             self.reading.check_all(now);
         }
@@ -170,7 +170,7 @@ impl Member {
             }
         }
         self.follow(now, &records);
-        self.yield_own_state();
+        self.discard_own_state();
     }
 
     /// Passes the keys `leader` and `alive` to the machine.
@@ -178,13 +178,13 @@ impl Member {
         if view.revision >= self.reading.view.revision {
             self.reading.view = view.clone();
         }
-        self.yield_own_state();
+        self.discard_own_state();
         self.drive(now, machine::Input::View(view));
     }
 
     /// Gives up this computer's own state if another computer leads and its state is in the journal, or if the journal
     /// has more.
-    fn yield_own_state(&mut self) {
+    fn discard_own_state(&mut self) {
         let leader = self.view().leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings().id);
         let leads = other.is_some_and(|leader| !self.was_self(leader));
@@ -255,7 +255,7 @@ impl Member {
         if self.has_lost(&read.view, &before, read.is_readable) {
             return self.start_over(now, &read.view);
         }
-        if self.data_loss.is_left(&read.view) {
+        if self.data_loss.is_remainder(&read.view) {
             read = Read {
                 view: read.view,
                 ..Read::empty()
@@ -339,7 +339,7 @@ impl Member {
             }
             self.see(now, read.view);
         }
-        self.yield_own_state();
+        self.discard_own_state();
     }
 
     /// Starts the machine, unless it has started already.
@@ -356,7 +356,7 @@ impl Member {
     }
 
     /// Handles what computers have written into their entries among the members.
-    pub(super) fn hear(&mut self, now: Instant, heard: &[Heard]) {
+    pub(super) fn note_member_entries(&mut self, now: Instant, heard: &[Heard]) {
         let mut outdated = false;
         for heard in heard {
             let own = self.machine.settings();
@@ -364,10 +364,10 @@ impl Member {
                 self.namesake.sign = heard.sign_of_namesake(own);
                 continue;
             }
-            self.hear_of_loss(now, heard);
-            outdated |= self.chores.notifying.hear(heard);
+            self.note_holdings(now, heard);
+            outdated |= self.chores.notifying.note_entry(heard);
         }
-        if outdated && self.told.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
+        if outdated && self.published.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
             self.act(Action::TellAll);
         }
     }

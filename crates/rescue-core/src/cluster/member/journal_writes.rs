@@ -20,9 +20,9 @@ impl Member {
         let entry = match entry {
             Ok(entry) => entry,
             Err(error) => {
-                self.tell(News::TooLarge(error.to_string()));
+                self.report_news(News::TooLarge(error.to_string()));
                 let answer = EtcdAnswer::Silence;
-                return self.tell_machine(machine::Input::Answer { number, answer });
+                return self.queue_input(machine::Input::Answer { number, answer });
             }
         };
         let parts = match &entry {
@@ -61,7 +61,7 @@ impl Member {
             true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),
             true => {}
         }
-        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+        self.queue_input(machine::Input::Recorded(self.outgoing.ready()));
     }
 
     /// Replaces the changes that have piled up by one state.
@@ -74,7 +74,7 @@ impl Member {
 
     pub(super) fn all_ready(&mut self) {
         self.outgoing.all_ready();
-        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+        self.queue_input(machine::Input::Recorded(self.outgoing.ready()));
     }
 
     fn prepare(&mut self) {
@@ -90,12 +90,12 @@ impl Member {
                 }
                 Ok(None) => break,
                 Err(error) => {
-                    self.tell(News::TooLarge(error.to_string()));
+                    self.report_news(News::TooLarge(error.to_string()));
                     self.outgoing.leave_out_next();
                 }
             }
         }
-        self.tell_machine(machine::Input::Recorded(self.outgoing.ready()));
+        self.queue_input(machine::Input::Recorded(self.outgoing.ready()));
     }
 
     pub(super) fn prepared(&mut self, leads: Option<bool>) {

@@ -1,4 +1,4 @@
-//! Sends the writes that were answered while cut off to the leader, except those that conflict with others' writes.
+//! Sends the partition writes to the leader, except those that conflict with others' writes.
 
 use std::{
     collections::BTreeSet,
@@ -46,8 +46,7 @@ enum Step {
 /// The state of sending the writes of the oldest period of being cut off to the leader.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The first part of the name under which this computer sends the writes that it answered while it was cut off. The
-    /// second part is `periods`.
+    /// The first part of the name under which this computer sends its partition writes. The second part is `periods`.
     id: String,
     /// For how many periods of being cut off all writes were sent before.
     periods: u64,
@@ -103,7 +102,7 @@ impl Merging {
 }
 
 impl Member {
-    /// The leader that takes writes answered while cut off: its address and term, or `Some(None)` for this computer.
+    /// The leader that takes partition writes: its address and term, or `Some(None)` for this computer.
     /// `None` if no leader is known.
     fn merges_to(&self) -> Option<Option<(String, u64)>> {
         match self.machine.role() {
@@ -122,12 +121,12 @@ impl Member {
         match &mut self.merging.step {
             Step::Idle => {
                 if to.is_some() && !self.cut_off.is_empty() {
-                    self.judge_again(now);
+                    self.find_conflicts_again(now);
                 }
             }
             Step::Reading => {
                 if self.reading.is_fresh() {
-                    self.judge(now);
+                    self.find_conflicts(now);
                 }
             }
             Step::Asked(ask, asked) => {
@@ -141,7 +140,7 @@ impl Member {
                     match ask.take() {
                         Some(ask) => self.ask(now, ask),
                         None if to.is_none() => *until = now + MERGE_AGAIN,
-                        None => self.judge_again(now),
+                        None => self.find_conflicts_again(now),
                     }
                 }
             }
@@ -155,13 +154,13 @@ impl Member {
         }
     }
 
-    fn judge_again(&mut self, now: Instant) {
+    fn find_conflicts_again(&mut self, now: Instant) {
         self.merging.step = Step::Reading;
         self.reading.refresh(now);
     }
 
     /// Decides which of the remaining writes conflict with others' changes, up to the journal's last record.
-    fn judge(&mut self, now: Instant) {
+    fn find_conflicts(&mut self, now: Instant) {
         let Some(period) = self.cut_off.first_mut() else {
             self.merging.step = Step::Idle;
             return;
@@ -195,7 +194,7 @@ impl Member {
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
         if calls.is_empty() {
             match self.merging.unread {
-                true => self.judge_again(now),
+                true => self.find_conflicts_again(now),
                 false => self.merged(now),
             }
             return;
@@ -243,7 +242,7 @@ impl Member {
             Some(wire::MergeAnswer::Done(outcomes)) => {
                 self.merging.unread = true;
                 if self.merging.telling {
-                    return self.told(now, &ask, &outcomes);
+                    return self.parameters_set_again(now, &ask, &outcomes);
                 }
                 if let Some(left) = &mut self.merging.left {
                     left.drain(..ask.calls.len().min(left.len()));
@@ -260,7 +259,7 @@ impl Member {
     }
 
     /// Handles the answer to a request that set parameters again.
-    fn told(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
+    fn parameters_set_again(&mut self, now: Instant, ask: &Ask, outcomes: &[WriteOutcome]) {
         let is_last = self.merging.rounds >= ROUNDS_MAX;
         let untold = &mut self.merging.untold;
         let before = untold.len();
@@ -292,20 +291,20 @@ impl Member {
     /// Finishes the oldest period of being cut off: all its writes have been sent.
     pub(super) fn merged(&mut self, now: Instant) {
         let (sent, lost) = (self.merging.sent, self.merging.lost);
-        self.tell(News::Merged { sent, lost });
+        self.report_news(News::Merged { sent, lost });
         self.merging = Merging {
             periods: self.merging.periods + 1,
             asked: self.merging.asked,
             ..Merging::new(std::mem::take(&mut self.merging.id))
         };
         self.cut_off.sent();
-        self.chores.say_at(now);
+        self.chores.publish_entry_by(now);
         if !self.chores.keeps_file() {
             self.keep_all();
         }
         self.adopt();
-        if let (Role::Leading, Some(term)) = (self.told.role, self.machine.term()) {
-            self.stand_leading(term);
+        if let (Role::Leading, Some(term)) = (self.published.role, self.machine.term()) {
+            self.publish_leading(term);
         }
         self.update_standing();
     }

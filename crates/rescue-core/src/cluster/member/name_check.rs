@@ -28,7 +28,7 @@ impl Member {
         if let (Some(until), Some(uri)) = (watch.hold(), watch.suspect()) {
             let uri = uri.to_owned();
             self.queue.start_by = self.queue.start_by.map(|_| until);
-            self.tell(News::Suspect { uri, until });
+            self.report_news(News::Suspect { uri, until });
         }
         self.namesake.watch = Some(watch);
     }
@@ -48,7 +48,9 @@ impl Member {
             // Only one process runs on a computer at a time, so any other leader is another computer.
             if is_this {
                 self.namesake.led = true;
-            } else if self.namesake.led && leader.name == own.name && !self.data_loss.is_left(view)
+            } else if self.namesake.led
+                && leader.name == own.name
+                && !self.data_loss.is_remainder(view)
             {
                 there = there.or_else(|| Some(leader.uri.clone()));
             }

@@ -20,8 +20,8 @@ impl Notifying {
     }
 
     /// What this computer's entry says: see [`Said::notifies`](super::Said::notifies). `keeps` says whether the leader
-    /// lacks writes that this computer answered while cut off.
-    pub(super) fn says(&self, process: &str, keeps: bool) -> String {
+    /// lacks partition writes of this computer.
+    pub(super) fn marker(&self, process: &str, keeps: bool) -> String {
         match keeps {
             true => String::new(),
             false => format!("{process} {}", self.stopped),
@@ -30,7 +30,7 @@ impl Notifying {
 
     /// Notes the entry of another computer. Returns whether that computer has stopped notifying nodes since its last
     /// entry.
-    pub(super) fn hear(&mut self, heard: &Heard) -> bool {
+    pub(super) fn note_entry(&mut self, heard: &Heard) -> bool {
         let says = heard.said.as_ref().map(|said| &said.notifies);
         let Some(says) = says.filter(|says| !says.is_empty()) else {
             return false;

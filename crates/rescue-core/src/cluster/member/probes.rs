@@ -43,7 +43,7 @@ impl Member {
     pub(super) fn probed(&mut self, number: u64, leads: bool) {
         if self.probing.under_way && self.probing.number == number {
             self.probing.under_way = false;
-            self.tell_machine(machine::Input::Peer(leads));
+            self.queue_input(machine::Input::Peer(leads));
         }
     }
 }

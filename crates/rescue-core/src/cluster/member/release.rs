@@ -39,7 +39,7 @@ impl Release {
 
 impl Member {
     pub(super) fn stop(&mut self, now: Instant) {
-        if self.told.has_master {
+        if self.published.has_master {
             self.release.why = Why::EndingRosout;
             self.release.by = Some(now + STOP_LIMIT);
             self.act(Action::EndRosout);
@@ -74,8 +74,8 @@ impl Member {
     fn begin_release(&mut self, why: Why, to: String) {
         self.release.why = why;
         let term = self.machine.term().unwrap_or_default();
-        self.stand_leading(term);
-        self.tell_machine(machine::Input::HandOver(to));
+        self.publish_leading(term);
+        self.queue_input(machine::Input::HandOver(to));
     }
 
     /// Ends a handover: another computer may lead now.
@@ -102,7 +102,7 @@ impl Member {
         if self.queue.start_by.is_some_and(|by| by <= now) {
             self.start(now);
         }
-        self.tell_machine(machine::Input::Wake);
+        self.queue_input(machine::Input::Wake);
     }
 
     /// Finishes a stop as soon as this computer no longer leads.

@@ -14,16 +14,16 @@ use crate::{
 
 impl Member {
     pub(super) fn become_role(&mut self, now: Instant, role: Role) {
-        let before = std::mem::replace(&mut self.told.role, role);
+        let before = std::mem::replace(&mut self.published.role, role);
         if before == Role::Alone && role != Role::Alone {
-            self.tell(News::NotAlone);
+            self.report_news(News::NotAlone);
         }
         match role {
             Role::Leading => self.lead(now),
             Role::Alone => self.be_alone(),
             Role::Joining | Role::Following | Role::CatchingUp => {
                 if self.records() {
-                    self.tell(News::Deposed);
+                    self.report_news(News::Deposed);
                 }
                 self.released();
                 // What is left was not answered, and its callers call again.
@@ -31,7 +31,7 @@ impl Member {
                 self.give_up();
             }
         }
-        self.chores.say_at(now);
+        self.chores.publish_entry_by(now);
     }
 
     fn lead(&mut self, now: Instant) {
@@ -39,7 +39,7 @@ impl Member {
         match self.records() {
             false => self.begin_to_lead(now),
             true => {
-                self.tell(News::LeadsAgain);
+                self.report_news(News::LeadsAgain);
                 self.act(Action::ServeOwnOnly(false));
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
@@ -49,7 +49,7 @@ impl Member {
             }
         }
         self.keep_term(term);
-        self.stand_leading(term);
+        self.publish_leading(term);
     }
 
     /// Has the checkpoint name the present term.
@@ -68,7 +68,7 @@ impl Member {
             false => Cause::Started,
         };
         let released = self.before.released;
-        self.tell(News::Leads { before, released });
+        self.report_news(News::Leads { before, released });
         let owns = std::mem::take(&mut self.journal.own_wins);
         let seq = self.machine.committed();
         if seq > 0 {
@@ -79,7 +79,7 @@ impl Member {
         let held = self.journal.state.clone();
         let state = match over {
             true => Some(Master::default()),
-            // Writes answered while cut off are merged later. They are not part of the state that the others get.
+            // Partition writes are merged later. They are not part of the state that the others get.
             false => (!self.cut_off.is_empty() && !owns).then(|| held.clone()),
         };
         self.act(Action::Lead { seq, held, state });
@@ -89,15 +89,15 @@ impl Member {
     }
 
     fn begin_master(&mut self, cause: Cause) {
-        self.told.has_master = true;
+        self.published.has_master = true;
         self.act(Action::BeginMaster(cause));
     }
 
     pub(super) fn end_master(&mut self) {
-        if Mutant::MasterWhileAlone.lives() && self.told.role == Role::Alone {
+        if Mutant::MasterWhileAlone.lives() && self.published.role == Role::Alone {
             return;
         }
-        if std::mem::take(&mut self.told.has_master) {
+        if std::mem::take(&mut self.published.has_master) {
             self.act(Action::EndMaster);
         }
     }
@@ -105,11 +105,11 @@ impl Member {
     /// Runs a master as long as the machine allows it.
     pub(super) fn update_master(&mut self) {
         let may = self.machine.may_have_master();
-        if self.told.has_master && !may {
-            self.tell(News::Lapsed);
+        if self.published.has_master && !may {
+            self.report_news(News::Lapsed);
             self.end_master();
             self.act(Action::StandIn);
-        } else if !self.told.has_master && may && self.records() {
+        } else if !self.published.has_master && may && self.records() {
             self.begin_master(Cause::WasCutOff);
         }
     }
@@ -123,7 +123,7 @@ impl Member {
         let binds = !self.keeps();
         self.act(Action::Leave { binds });
         let known = self.knows();
-        self.stand(Standing::Nobody { known });
+        self.publish_standing(Standing::Nobody { known });
         self.end_master();
         self.act(Action::ServeOwnOnly(false));
         self.act(Action::TurnAway);

@@ -8,21 +8,21 @@ use crate::cluster::{
 
 impl Member {
     /// Publishes who has the master and where calls go, if that has changed.
-    pub(super) fn stand(&mut self, standing: Standing) {
-        if self.told.standing != standing {
-            self.told.standing = standing.clone();
+    pub(super) fn publish_standing(&mut self, standing: Standing) {
+        if self.published.standing != standing {
+            self.published.standing = standing.clone();
             self.act(Action::Stand(standing));
         }
     }
 
-    /// Publishes that this computer leads. Calls wait while earlier writes, answered while cut off, are being merged.
-    pub(super) fn stand_leading(&mut self, term: u64) {
+    /// Publishes that this computer leads. Calls wait while partition writes are being merged.
+    pub(super) fn publish_leading(&mut self, term: u64) {
         let pass = match (self.cut_off.is_empty(), self.release.is_begun()) {
             (false, _) => Pass::Nothing,
             (true, true) => Pass::Reads,
             (true, false) => Pass::Calls,
         };
-        self.stand(Standing::Leads { term, pass });
+        self.publish_standing(Standing::Leads { term, pass });
     }
 
     /// The address and term of the leader, if it is another computer that has not given up leadership.
@@ -37,7 +37,7 @@ impl Member {
 
     /// Notes who leads. If this computer follows, publishes where its calls go.
     pub(super) fn update_standing(&mut self) {
-        self.look_at_place();
+        self.update_place();
         let own = &self.settings().id;
         let view = self.view();
         let other = view.leader.as_ref().filter(|leader| leader.id != *own);
@@ -47,7 +47,7 @@ impl Member {
             self.before.leader = seen.map(|at| (leader.name.clone(), at));
             self.before.released = released;
         }
-        if self.machine.role() != Role::Following || self.told.role != Role::Following {
+        if self.machine.role() != Role::Following || self.published.role != Role::Following {
             return;
         }
         // After a restart, a term that etcd has not reached would mean that etcd has lost its data.
@@ -55,7 +55,7 @@ impl Member {
             self.keep_term(term);
         }
         let standing = match self.leader() {
-            // Writes answered while cut off must be merged before new calls.
+            // Partition writes must be merged before new calls.
             Some((uri, term)) if self.cut_off.is_empty() => {
                 let uri = uri.to_owned();
                 Standing::Follows { uri, term }
@@ -64,11 +64,11 @@ impl Member {
                 known: self.knows(),
             },
         };
-        self.stand(standing);
+        self.publish_standing(standing);
     }
 
     /// Updates the place up to which the mirror is current.
-    fn look_at_place(&mut self) {
+    fn update_place(&mut self) {
         let seq = self.journal.progress.seq;
         // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
         // lacks.

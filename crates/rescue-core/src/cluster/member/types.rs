@@ -45,8 +45,8 @@ pub struct Said {
     pub unreadable: u64,
     /// Changes when this process stops notifying nodes, because it no longer leads or is no longer cut off, and with
     /// each start. The leader then notifies all nodes of the present state, because they may have heard an older one
-    /// last. Empty until the leader has the writes that this computer answered while cut off: before, its nodes would
-    /// lose the publishers that were started meanwhile.
+    /// last. Empty until the leader has this computer's partition writes: before, its nodes would lose the publishers that
+    /// were started meanwhile.
     pub notifies: String,
 }
 
@@ -221,7 +221,7 @@ pub enum News {
     },
     /// A change is too large for the journal.
     TooLarge(String),
-    /// The writes made while cut off have been merged: `sent` were accepted, `lost` were not.
+    /// The partition writes have been merged: `sent` were accepted, `lost` were not.
     Merged {
         sent: u64,
         lost: u64,
@@ -299,12 +299,12 @@ pub enum Action {
     TurnAway,
     /// Notify only this computer's own nodes if true, all nodes if false.
     ServeOwnOnly(bool),
-    /// Keep exactly these writes, which were answered while cut off. `base` is the state before them.
+    /// Keep exactly these partition writes. `base` is the state before them.
     KeepAll {
         base: Master,
         calls: Vec<Request>,
     },
-    /// Keep these writes, too, until a leader has them.
+    /// Keep these partition writes, too, until a leader has them.
     Keep(Vec<Request>),
     /// Delete the kept writes, because none is left to send.
     KeepNothing,
@@ -314,7 +314,7 @@ pub enum Action {
         ask: Ask,
         to: Option<(String, u64)>,
     },
-    /// Report the outcomes of writes that were answered while cut off.
+    /// Report the outcomes of partition writes.
     Report(Vec<(Request, WriteOutcome)>),
     /// Ask the rosrescue at `uri` whether it leads in `term`. Wait for a quarter of the time to live at most.
     Probe {

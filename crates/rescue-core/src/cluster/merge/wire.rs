@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::{Conflict, Lost, Verdict};
+use super::{Conflict, LostWrite, Verdict};
 use crate::{
     master::{CALLER_ID, Method, Request, entry_reply, is_success},
     xmlrpc::{Call, Reply, Value},
@@ -13,7 +13,7 @@ pub const METHOD: &str = "rosrescue/merge";
 /// The name of the method that contains several calls.
 const MULTICALL: &str = "system.multicall";
 
-/// A request to the leader to make some of the writes that were answered while cut off.
+/// A request to the leader to make some partition writes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
     /// The name under which all writes of one period of being cut off are sent.
@@ -70,8 +70,8 @@ impl WriteOutcome {
     }
 }
 
-impl From<&Lost> for WriteOutcome {
-    fn from(lost: &Lost) -> Self {
+impl From<&LostWrite> for WriteOutcome {
+    fn from(lost: &LostWrite) -> Self {
         Self::Lost {
             why: lost.why.to_string(),
             present: match lost.why {
@@ -207,7 +207,7 @@ mod tests {
         let call = set("/a", 1);
         let why = Conflict::Parameter("/a".to_owned());
         let present = Some(Value::Int(2));
-        let lost = Verdict::Lost(Lost { call, why, present });
+        let lost = Verdict::Lost(LostWrite { call, why, present });
         let verdicts = [Verdict::Runs, lost, Verdict::Holds, Verdict::Runs];
         let result = |code: i32, text: &str| {
             let reply: Vec<Value> = vec![code.into(), text.into(), 0.into()];

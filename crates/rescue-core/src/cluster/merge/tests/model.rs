@@ -3,7 +3,7 @@
 use super::super::{
     Changes, Verdict, WritesToSend,
     changes::{param_of, value_at},
-    judge, merge,
+    judge_write, merge,
     wire::{MergeAnswer, WriteOutcome},
 };
 use crate::{
@@ -82,7 +82,7 @@ impl There {
         }
         let verdicts: Vec<_> = calls
             .iter()
-            .map(|call| judge(&changes, &self.state, call))
+            .map(|call| judge_write(&changes, &self.state, call))
             .collect();
         let runs = verdicts.iter().zip(calls);
         let runs = runs.filter(|(verdict, _)| **verdict == Verdict::Runs);
