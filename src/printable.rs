@@ -90,7 +90,7 @@ impl Printable {
     }
 
     /// Text of the program itself that contains nothing from elsewhere, such as a manual page.
-    pub(crate) fn own(text: String) -> Self {
+    pub(crate) fn trusted(text: String) -> Self {
         Self(text)
     }
 

@@ -127,7 +127,7 @@ fn start(
             if !no_guardian {
                 return Ok(guardian::run(&listeners, &words)?);
             }
-            Sockets::own(listeners)
+            Sockets::from_listeners(listeners)
         }
     };
     config.fit_into(raise_file_limit());

@@ -112,7 +112,7 @@ impl Etcd {
     ///
     /// Why they could not be read.
     pub async fn view(&self, keys: &Keys, limit: Duration) -> Result<View, EtcdError> {
-        let done = self.txn(&look(keys), limit).await?;
+        let done = self.txn(&read_leader_keys(keys), limit).await?;
         view(keys, done.revision, done.gets.iter().flatten())
     }
 
@@ -226,7 +226,7 @@ fn get_view(keys: &Keys) -> Vec<TxnOp> {
 }
 
 /// A transaction that reads `origin`, `leader` and `alive`.
-fn look(keys: &Keys) -> Txn {
+fn read_leader_keys(keys: &Keys) -> Txn {
     Txn {
         success: get_view(keys),
         ..Txn::default()
@@ -272,7 +272,7 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
         failure: get_view(keys),
     };
     match op {
-        Op::Read => (look(keys), 0),
+        Op::Read => (read_leader_keys(keys), 0),
         Op::Claim {
             guard,
             claim,

@@ -1,10 +1,10 @@
 //! `rosrescue check`: finds problems in the robot's setup before it drives.
 //!
-//! [`facts`] gathers and does not judge; [`judge`] judges and does not gather.
+//! [`facts`] gathers and does not judge; [`findings`] judges and does not gather.
 
 mod computers;
 mod facts;
-mod judge;
+mod findings;
 mod launch;
 mod links;
 mod planting;
@@ -30,7 +30,7 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     let master = args.master.as_deref().map(MasterUri::parse).transpose();
     let master = master.map_err(|error| CommandFailure::Usage(format!("--master: {error}")))?;
     if args.live {
-        return finish(args, links::look(args).await?);
+        return finish(args, links::check_links(args).await?);
     }
     let facts = SetupFacts::gather(args, master);
     let slow = async {
@@ -42,9 +42,9 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
         facts = facts => facts,
         never = slow => match never {},
     };
-    let mut findings = judge::judge(&facts);
+    let mut findings = findings::from_facts(&facts);
     findings.extend(robot(args).await);
-    findings.extend(planting::look(&facts.disk.checkpoint));
+    findings.extend(planting::find_unsafe_folder(&facts.disk.checkpoint));
     findings.extend(sources(&args.settings));
     finish(args, findings)
 }

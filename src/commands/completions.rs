@@ -11,7 +11,7 @@ use crate::{
 pub(super) async fn run(args: &CompletionsArgs) -> Result<Exit, CommandFailure> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut Cli::command(), "rosrescue", &mut script);
-    print_line(&Printable::own(
+    print_line(&Printable::trusted(
         String::from_utf8_lossy(&script).into_owned(),
     ))?;
     Ok(Exit::Good)

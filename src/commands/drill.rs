@@ -211,7 +211,7 @@ impl Drill<'_> {
             },
         };
         for topic in &mut topics {
-            topic.judge(&difference.ended);
+            topic.count_failures(&difference.ended);
         }
         let mut verdict = DrillVerdict {
             passed: false,
@@ -227,7 +227,7 @@ impl Drill<'_> {
             notes: Vec::new(),
         };
         let shutdown = self.node.heard.shutdown();
-        verdict.judge(difference, shutdown, self.args.limit);
+        verdict.collect_failures(difference, shutdown, self.args.limit);
         Ok(verdict)
     }
 

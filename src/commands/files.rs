@@ -61,7 +61,7 @@ impl Opened {
 pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     let env = |name: &str| std::env::var(name).ok();
     let running = match place.checkpoint {
-        None => of_running().await,
+        None => checkpoint_of_running().await,
         Some(_) => None,
     };
     let path = running.unwrap_or_else(|| {
@@ -81,7 +81,7 @@ fn target() -> TargetArgs {
 
 /// The checkpoint of the rosrescue that runs on this computer. Asks rosrescue, because a service may run as another
 /// user, whose home folder is another one.
-async fn of_running() -> Option<PathBuf> {
+async fn checkpoint_of_running() -> Option<PathBuf> {
     let running = Running::find(&target()).ok()?;
     if !is_here(&running.address).await {
         return None;
@@ -125,7 +125,7 @@ pub(super) struct Listed {
 
 /// The checkpoint at `present` and those kept beside it, newest first.
 pub(super) fn list(present: &Path) -> Vec<Listed> {
-    let mut listed: Vec<_> = history::kept(present)
+    let mut listed: Vec<_> = history::saved_checkpoints(present)
         .unwrap_or_default()
         .into_iter()
         .map(|kept| Listed {

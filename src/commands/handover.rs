@@ -196,7 +196,7 @@ mod tests {
     use super::*;
     use crate::status::cluster::ClusterFacts;
 
-    fn said(from: &str, to: Option<&str>, wanted: Option<&str>) -> (bool, String) {
+    fn shown(from: &str, to: Option<&str>, wanted: Option<&str>) -> (bool, String) {
         let running = Running {
             address: crate::ros_env::MasterUri::parse("http://pc-2:1").unwrap(),
         };
@@ -229,7 +229,7 @@ mod tests {
             ("a", Some("a"), Some("b"), false, "a still leads"),
             ("a", None, None, false, "no computer leads"),
         ] {
-            let (good, said) = said(from, to, wanted);
+            let (good, said) = shown(from, to, wanted);
             assert_eq!(good, handed_over, "{said}");
             assert!(said.contains(text), "{said}");
         }

@@ -28,7 +28,7 @@ pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
             Row {
                 number,
                 what: what(&listed.name),
-                rescue: Rescue::of(&listed.name, &reports),
+                rescue: Rescue::from_reports(&listed.name, &reports),
                 name: listed.name,
                 written: clock::wall_text(listed.written as f64),
                 bytes: std::fs::metadata(&listed.path).map_or(0, |metadata| metadata.len()),
@@ -78,7 +78,7 @@ struct Rescue {
 }
 
 impl Rescue {
-    fn of(name: &str, reports: &[ReportRecord]) -> Option<Self> {
+    fn from_reports(name: &str, reports: &[ReportRecord]) -> Option<Self> {
         let number: u64 = name.strip_prefix("rescue-")?.parse().ok()?;
         let mut reports = reports.iter().map(|kept| &kept.report);
         let report = reports.find(|report| report.number == number)?;

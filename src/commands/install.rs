@@ -67,19 +67,19 @@ struct Plan {
 }
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
-    let place = Place::of(&args.scope)?;
+    let place = UnitPaths::new(&args.scope)?;
     needs_root(&place, &args.scope)?;
     carry_out(&install(args, &place).await?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
-    let place = Place::of(&args.scope)?;
+    let place = UnitPaths::new(&args.scope)?;
     needs_root(&place, &args.scope)?;
     carry_out(&uninstall(&place), &args.scope)
 }
 
 /// Refuses a service of the computer without root, before any other obstacle is reported.
-fn needs_root(place: &Place, args: &ScopeArgs) -> Result<(), CommandFailure> {
+fn needs_root(place: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure> {
     if place.user || args.dry_run || rustix::process::geteuid().is_root() {
         return Ok(());
     }
@@ -91,14 +91,14 @@ fn needs_root(place: &Place, args: &ScopeArgs) -> Result<(), CommandFailure> {
 }
 
 /// Where the unit files go, and which systemd runs the service.
-struct Place {
+struct UnitPaths {
     /// Whether the service is a user's own, and not the system's.
     user: bool,
     units: PathBuf,
 }
 
-impl Place {
-    fn of(args: &ScopeArgs) -> Result<Self, CommandFailure> {
+impl UnitPaths {
+    fn new(args: &ScopeArgs) -> Result<Self, CommandFailure> {
         let (user, units) = (args.user, PathBuf::from("/etc/systemd/system"));
         if !user {
             return Ok(Self { user, units });
@@ -167,7 +167,7 @@ impl Place {
     }
 }
 
-async fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailure> {
+async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<Plan, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -299,7 +299,7 @@ async fn install(args: &InstallArgs, place: &Place) -> Result<Plan, CommandFailu
     Ok(plan)
 }
 
-fn uninstall(place: &Place) -> Plan {
+fn uninstall(place: &UnitPaths) -> Plan {
     let mut plan = Plan::default();
     let files = place.files();
     let dropin = fs::read_to_string(&files[2]).unwrap_or_default();
@@ -360,7 +360,11 @@ impl Plan {
 
     /// Handles other units that start a master or roslaunch. Returns those to disable, and those to start after
     /// rosrescue.
-    fn plan_other_units(&mut self, place: &Place, service: &Service) -> (Vec<String>, Vec<String>) {
+    fn plan_other_units(
+        &mut self,
+        place: &UnitPaths,
+        service: &Service,
+    ) -> (Vec<String>, Vec<String>) {
         let (mut disabled, mut before) = (Vec::new(), Vec::new());
         let all = place.other_units().into_iter();
         for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {
@@ -388,7 +392,7 @@ impl Plan {
         (disabled, before)
     }
 
-    fn start(&mut self, place: &Place, service: &Service, port_will_be_free: bool) {
+    fn start(&mut self, place: &UnitPaths, service: &Service, port_will_be_free: bool) {
         let mut options = place.now().to_vec();
         if !service.runs_rosmaster && place.systemd_runs() {
             // A proxy counts as started once it has a master, which can take long.
@@ -407,7 +411,7 @@ impl Plan {
     }
 
     /// Makes the running service use its new files.
-    fn renew(&mut self, place: &Place, restart: bool) {
+    fn renew(&mut self, place: &UnitPaths, restart: bool) {
         if restart {
             self.run(place.systemctl(&["stop", UNITS[1]]));
             self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
@@ -534,7 +538,7 @@ fn own_name() -> Result<String, CommandFailure> {
 /// The user that runs the service. `None` for a user's own service. A dry run needs no sudo.
 fn account(
     args: &InstallArgs,
-    place: &Place,
+    place: &UnitPaths,
     caller: &BTreeMap<String, String>,
 ) -> Result<Option<String>, CommandFailure> {
     if place.user {

@@ -27,7 +27,7 @@ const FILES_AT_ONCE: usize = 32;
 
 pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
     let path = files::present(&args.place).await;
-    let wanted = Wanted::of(args);
+    let wanted = Wanted::new(args);
     let mut reader = LogReader::new(args.hide.hide_values.clone());
     let mut rescues = rescues(&path, &wanted);
     let mut found = false;
@@ -124,7 +124,7 @@ struct Wanted<'a> {
 }
 
 impl<'a> Wanted<'a> {
-    fn of(args: &'a LogArgs) -> Self {
+    fn new(args: &'a LogArgs) -> Self {
         let now = clock::wall_millis();
         let subjects = [&args.param, &args.topic, &args.service, &args.node];
         Self {

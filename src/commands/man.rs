@@ -30,7 +30,9 @@ pub(super) async fn run(args: &ManArgs) -> Result<Exit, CommandFailure> {
             let mut page = Vec::new();
             let written = clap_mangen::Man::new(shown).render(&mut page);
             written.map_err(|error| CommandFailure::Failed(format!("no page: {error}")))?;
-            print_line(&Printable::own(String::from_utf8_lossy(&page).into_owned()))?;
+            print_line(&Printable::trusted(
+                String::from_utf8_lossy(&page).into_owned(),
+            ))?;
         }
         Some(folder) => {
             let written =

@@ -47,7 +47,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
             None => file.path.display().to_string(),
         },
         master: live.uri.clone(),
-        plan: Plan::of(&params, &args.hide.hide_values),
+        plan: ParamPlan::new(&params, &args.hide.hide_values),
         done: false,
         failed: Vec::new(),
     };
@@ -144,7 +144,7 @@ async fn set(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, Comm
 struct Restored {
     file: String,
     master: String,
-    plan: Plan,
+    plan: ParamPlan,
     /// Whether all parameters were set and read back.
     done: bool,
     /// Calls that were refused, and parameters that have changed again.
@@ -152,23 +152,26 @@ struct Restored {
 }
 
 #[derive(Serialize)]
-struct Plan {
+struct ParamPlan {
     set: Vec<Set>,
     delete: Vec<String>,
-    left_out: Vec<Left>,
+    left_out: Vec<SkippedParam>,
 }
 
-impl Plan {
-    fn of(params: &ParamChanges, hide: &Hide) -> Self {
+impl ParamPlan {
+    fn new(params: &ParamChanges, hide: &Hide) -> Self {
         let set = params.set.iter().map(|(name, was, is)| Set {
             name: name.clone(),
             from: was.as_ref().map(|was| shown(&hide.mask(name, was))),
             to: shown(&hide.mask(name, is)),
         });
-        let left_out = params.left_out.iter().map(|(what, why): &LeftOut| Left {
-            what: what.clone(),
-            why: why.clone(),
-        });
+        let left_out = params
+            .left_out
+            .iter()
+            .map(|(what, why): &LeftOut| SkippedParam {
+                what: what.clone(),
+                why: why.clone(),
+            });
         Self {
             set: set.collect(),
             delete: params.delete.clone(),
@@ -186,7 +189,7 @@ struct Set {
 }
 
 #[derive(Serialize)]
-struct Left {
+struct SkippedParam {
     what: String,
     why: String,
 }
@@ -206,7 +209,7 @@ impl Lines for Restored {
         plan.delete
             .iter()
             .try_for_each(|name| line!(f, "delete {name}"))?;
-        for Left { what, why } in &plan.left_out {
+        for SkippedParam { what, why } in &plan.left_out {
             line!(f, "left out: {what}: {why}")?;
         }
         let (set, delete) = (plan.set.len(), plan.delete.len());

@@ -78,7 +78,7 @@ struct Sample {
 }
 
 impl Sample {
-    fn of(status: &Status, at: Instant) -> Self {
+    fn new(status: &Status, at: Instant) -> Self {
         let clients = status.clients.iter();
         Self {
             at,
@@ -307,7 +307,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
         let now = Instant::now();
         let failed = match status {
             Ok(status) => {
-                let sample = Sample::of(&status, now);
+                let sample = Sample::new(&status, now);
                 let height = match terminal {
                     Some(_) => terminal::size().1,
                     None => usize::MAX,

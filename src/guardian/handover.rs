@@ -130,7 +130,7 @@ impl Sockets {
     }
 
     /// Wraps sockets that this process has bound itself.
-    pub fn own(listeners: Vec<TcpListener>) -> Self {
+    pub fn from_listeners(listeners: Vec<TcpListener>) -> Self {
         Self {
             listeners,
             guard: Guard::Nobody,

@@ -21,7 +21,7 @@ use super::{
 use crate::status::report::{HealthCheck, RecoveryOutcome};
 use rescue_core::{
     health::{
-        IdentityVerdict, Reach, Reconciliation, Refusal, RegisteredName, Registration, judge,
+        IdentityVerdict, Reach, Reconciliation, Refusal, RegisteredName, Registration, judge_node,
         judge_refusal, port_of,
     },
     replay::Token,
@@ -318,7 +318,7 @@ impl Asked {
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();
         nodes.ledger.with_activity(|mirror, activity| {
-            let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
+            let verdicts = judge_node(mirror, &self.names, *pid, claims.as_ref());
             let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
             for ((name, unregistered), verdict) in judged {
                 let last_calls = activity.last_calls(&name.node);

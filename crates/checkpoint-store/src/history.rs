@@ -40,7 +40,7 @@ impl KeepReason {
 
 /// A checkpoint that is kept beside the present one.
 #[derive(Clone, Debug)]
-pub struct Kept {
+pub struct SavedCheckpoint {
     pub kind: KeepReason,
     /// A number that grows with each file of the same kind.
     pub number: u64,
@@ -56,7 +56,7 @@ pub struct Kept {
 /// # Errors
 ///
 /// If the folder cannot be read.
-pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
+pub fn saved_checkpoints(path: &Path) -> io::Result<Vec<SavedCheckpoint>> {
     let names = names_of(path);
     let mut kept = Vec::new();
     for kind in [KeepReason::Session, KeepReason::Rescue] {
@@ -66,7 +66,7 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
             let Ok(metadata) = fs::symlink_metadata(&path) else {
                 continue;
             };
-            kept.push(Kept {
+            kept.push(SavedCheckpoint {
                 kind,
                 number,
                 path,
@@ -122,7 +122,7 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
 ///
 /// If the folder cannot be read.
 pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
-    let all = kept(path)?;
+    let all = saved_checkpoints(path)?;
     let (mut sessions, mut rescues): (Vec<_>, Vec<_>) = all
         .into_iter()
         .partition(|kept| kept.kind == KeepReason::Session);
@@ -170,7 +170,7 @@ mod tests {
     }
 
     fn listed(path: &Path) -> Vec<String> {
-        let kept = kept(path).unwrap().into_iter();
+        let kept = saved_checkpoints(path).unwrap().into_iter();
         kept.map(|kept| format!("{}-{}", kept.kind.name(), kept.number))
             .collect()
     }

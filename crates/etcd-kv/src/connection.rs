@@ -208,7 +208,9 @@ impl Endpoint {
         let body = Limited::new(response.into_body(), ANSWER_BYTES_MAX)
             .collect()
             .await;
-        let body = body.map_err(|error| self.lost(&*error))?.to_bytes();
+        let body = body
+            .map_err(|error| self.connection_lost(&*error))?
+            .to_bytes();
         let mut idle = lock(&self.idle);
         if idle.len() < IDLE_MOST {
             idle.push(connection);
@@ -243,7 +245,9 @@ impl Endpoint {
             Err(EtcdError::refused(
                 &self.url,
                 status,
-                &body.map_err(|error| self.lost(&*error))?.to_bytes(),
+                &body
+                    .map_err(|error| self.connection_lost(&*error))?
+                    .to_bytes(),
             ))
         };
         let opened = tokio::time::timeout(limit, open).await;
@@ -270,11 +274,11 @@ impl Endpoint {
         }
         let request = request
             .body(Full::new(body))
-            .map_err(|error| self.lost(&error))?;
+            .map_err(|error| self.connection_lost(&error))?;
         connection
             .send_request(request)
             .await
-            .map_err(|error| self.lost(&error))
+            .map_err(|error| self.connection_lost(&error))
     }
 
     async fn connect(&self) -> Result<Connection, EtcdError> {
@@ -283,7 +287,8 @@ impl Endpoint {
             return self.open(stream).await;
         };
         let stream = secured.connect(stream).await;
-        self.open(stream.map_err(|error| self.lost(&error))?).await
+        self.open(stream.map_err(|error| self.connection_lost(&error))?)
+            .await
     }
 
     async fn connect_tcp(&self) -> Result<TcpStream, EtcdError> {
@@ -314,13 +319,13 @@ impl Endpoint {
         stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
     ) -> Result<Connection, EtcdError> {
         let opened = http1::handshake(TokioIo::new(stream)).await;
-        let (connection, driver) = opened.map_err(|error| self.lost(&error))?;
+        let (connection, driver) = opened.map_err(|error| self.connection_lost(&error))?;
         // The task ends when the returned connection is dropped.
         tokio::spawn(driver);
         Ok(connection)
     }
 
-    pub(super) fn lost(&self, error: &(dyn std::error::Error + 'static)) -> EtcdError {
+    pub(super) fn connection_lost(&self, error: &(dyn std::error::Error + 'static)) -> EtcdError {
         let mut why = error.to_string();
         let mut source = error.source();
         while let Some(error) = source {

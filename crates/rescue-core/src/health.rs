@@ -136,7 +136,7 @@ pub struct RegisteredName {
 
 /// Judges each of `names`, which are all registered at the same port. `pid` and `claims` are the present answers from
 /// that port.
-pub fn judge(
+pub fn judge_node(
     mirror: &Master,
     names: &[RegisteredName],
     pid: Option<i32>,

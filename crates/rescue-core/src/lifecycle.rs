@@ -276,7 +276,7 @@ impl Lifecycle {
                 vec![Action::OpenGate]
             }
             Input::NotCaughtUp if self.phase == Phase::CatchingUp => {
-                self.lost(now, Cause::Late, vec![Action::Connect])
+                self.lose_master(now, Cause::Late, vec![Action::Connect])
             }
             Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
             Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
@@ -289,7 +289,7 @@ impl Lifecycle {
                     Input::ThreadEnded => Cause::ThreadEnded,
                     _ => Cause::ConnectionLost,
                 };
-                self.lost(now, cause, vec![Action::Connect])
+                self.lose_master(now, cause, vec![Action::Connect])
             }
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
@@ -327,7 +327,7 @@ impl Lifecycle {
                     true => self.spawn_elsewhere(now),
                     false => self.spawn(now),
                 };
-                self.lost(now, Cause::Exited, spawn)
+                self.lose_master(now, Cause::Exited, spawn)
             }
             Input::Wake if self.calm_at().is_some_and(|at| at <= now) => {
                 self.crash_loop = false;
@@ -389,7 +389,7 @@ impl Lifecycle {
     }
 
     /// Handles the loss of the master: lets no more calls pass to it, then takes the actions `then`.
-    fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
+    fn lose_master(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
         let was_serving = self.is_serving();
         self.seek(now);
@@ -431,7 +431,7 @@ impl Lifecycle {
 
     /// Kills the silent child if it [hangs](Evidence::judge). Connects again if it does not.
     fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
-        match self.evidence.judge(busy_limit) {
+        match self.evidence.judge_silence(busy_limit) {
             SilenceVerdict::Hung => self.give_up(now),
             verdict => {
                 let actions = self.connect_later(now, far);
@@ -477,13 +477,13 @@ impl Lifecycle {
             return vec![Action::Probe];
         }
         let then = match self.supervision {
-            Supervision::Ours => match self.evidence.judge(BUSY_LIMIT) {
+            Supervision::Ours => match self.evidence.judge_silence(BUSY_LIMIT) {
                 SilenceVerdict::Hung => vec![Action::Kill],
                 verdict => spare(verdict).into_iter().collect(),
             },
             Supervision::Theirs => Vec::new(),
         };
-        let actions = self.lost(now, Cause::Hung, then);
+        let actions = self.lose_master(now, Cause::Hung, then);
         // The end of a killed master arrives as [`Input::Exited`].
         self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
         actions

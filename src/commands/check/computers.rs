@@ -49,7 +49,7 @@ struct Entry {
 impl Cluster {
     /// Gathers the facts. `None` without `--cluster`. `usual` is the address where other computers reach this one by
     /// default.
-    pub(super) async fn look(
+    pub(super) async fn gather(
         args: &ClusterArgs,
         usual: &MasterUri,
         hostname: &str,

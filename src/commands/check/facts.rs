@@ -180,7 +180,7 @@ pub(super) struct Process {
 }
 
 impl Process {
-    fn of(pid: u32) -> Self {
+    fn read(pid: u32) -> Self {
         let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
         Self {
             pid,
@@ -246,10 +246,10 @@ impl SetupFacts {
             host: own.clone(),
             port: served,
         };
-        let cluster = Cluster::look(&args.cluster, &usual, &hostname).await;
+        let cluster = Cluster::gather(&args.cluster, &usual, &hostname).await;
         let checkpoint = config::checkpoint_path(args.checkpoint.as_deref(), served, &env);
         let port = match port {
-            Ok(number) => Ok(Port::look(number).await),
+            Ok(number) => Ok(Port::inspect(number).await),
             Err(error) => Err(error),
         };
         let (mut proxied, mut proxied_speaks) = (None, None);
@@ -321,7 +321,7 @@ impl SetupFacts {
             _ => (proxied.as_ref().map(|(uri, _)| uri.clone()), Vec::new()),
         };
         let behind = match behind {
-            Some(uri) => Some(UpstreamMaster::look(uri, known).await),
+            Some(uri) => Some(UpstreamMaster::inspect(uri, known).await),
             None => None,
         };
         let own = Host::find(&own).await;
@@ -333,7 +333,7 @@ impl SetupFacts {
         let local = far.filter_map(|address| reach::source_to(*address)).next();
         let home = env("HOME").unwrap_or_default();
         Self {
-            lease: Lease::of(&own).await,
+            lease: Lease::find_for_host(&own).await,
             local: local.or_else(listener::local_address),
             shell: shell::settings(Path::new(&home), &env("SHELL").unwrap_or_default()),
             reached,
@@ -363,7 +363,7 @@ impl SetupFacts {
             has_rosout: Rosout::find(&checkpoint).is_some(),
             strange_python: ros::strange_python().await,
             clock: Clock::read(&checkpoint),
-            disk: CheckpointDisk::look(checkpoint),
+            disk: CheckpointDisk::inspect(checkpoint),
             files: getrlimit(Resource::Nofile).maximum.unwrap_or(u64::MAX),
             units: units::find(),
             memory: free_memory(),
@@ -392,7 +392,7 @@ async fn hosts_of(nodes: &[(String, MasterUri)]) -> Vec<(Host, Vec<String>)> {
 }
 
 impl Port {
-    async fn look(number: u16) -> Self {
+    async fn inspect(number: u16) -> Self {
         let env = |name: &str| std::env::var(name).ok();
         let addresses: Vec<_> = ros_env::bind_addresses(&env)
             .into_iter()
@@ -411,7 +411,10 @@ impl Port {
                     port: number,
                 };
                 taken = Some(PortInUse {
-                    by: listeners::at(number).into_iter().map(Process::of).collect(),
+                    by: listeners::at(number)
+                        .into_iter()
+                        .map(Process::read)
+                        .collect(),
                     server: ros::Responder::ask(&at).await,
                 });
             }
@@ -436,8 +439,8 @@ pub(super) struct UpstreamMaster {
 }
 
 impl UpstreamMaster {
-    /// Looks for clients that bypass rosrescue. `known` are those that the running rosrescue has seen.
-    async fn look(uri: MasterUri, known: Vec<String>) -> Self {
+    /// Finds clients that bypass rosrescue. `known` are those that the running rosrescue has seen.
+    async fn inspect(uri: MasterUri, known: Vec<String>) -> Self {
         let place = timeout(LOOKUP_LIMIT, MasterAddresses::resolve(&uri))
             .await
             .ok()
@@ -456,7 +459,7 @@ impl UpstreamMaster {
 }
 
 impl CheckpointDisk {
-    fn look(checkpoint: PathBuf) -> Self {
+    fn inspect(checkpoint: PathBuf) -> Self {
         let whole = std::path::absolute(&checkpoint).unwrap_or_else(|_| checkpoint.clone());
         let mut above = whole.ancestors().skip(1);
         let folder = above.find(|folder| folder.is_dir());
@@ -541,7 +544,7 @@ fn masters() -> Vec<Process> {
     process::all()
         .filter(|pid| ["rosmaster", "roscore"].contains(&&*Process::of_name(*pid)))
         .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
-        .map(Process::of)
+        .map(Process::read)
         .collect()
 }
 
@@ -558,7 +561,7 @@ fn strays(own: &str) -> Vec<(Process, String)> {
         if !is_stray || !process::is_in_our_network(pid) || process::is_of_any(pid) {
             return None;
         }
-        let process = Process::of(pid);
+        let process = Process::read(pid);
         // Shells have the variable too, but they do not listen.
         (!process.ports.is_empty() && process.name != "rosrescue").then_some((process, uri))
     });
@@ -591,7 +594,7 @@ pub(super) struct Lease {
 
 impl Lease {
     /// The lease of an address of `host`, if one of them is leased or wireless.
-    async fn of(host: &Host) -> Option<Self> {
+    async fn find_for_host(host: &Host) -> Option<Self> {
         for address in host
             .addresses
             .iter()
@@ -678,11 +681,11 @@ mod tests {
     #[test]
     fn the_disk_of_a_checkpoint_that_is_not_there_yet_is_known() {
         let folder = tempfile::tempdir().unwrap();
-        let disk = CheckpointDisk::look(folder.path().join("a/b/checkpoint"));
+        let disk = CheckpointDisk::inspect(folder.path().join("a/b/checkpoint"));
         assert_eq!(disk.folder, folder.path().canonicalize().unwrap());
         assert!(disk.space.unwrap().0 > 0);
         assert!(disk.mount.is_some() && disk.holder.is_none() && disk.refused.is_none());
-        assert!(CheckpointDisk::look(folder.path().to_owned()).is_folder);
+        assert!(CheckpointDisk::inspect(folder.path().to_owned()).is_folder);
         let (of, source) = mount_of(Path::new("/proc/1")).unwrap();
         assert_eq!((&*of, &*source), ("proc", "proc"));
     }

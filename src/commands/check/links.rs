@@ -30,7 +30,7 @@ const AT_ONCE: usize = 64;
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
 /// Asks the nodes of the running robot.
-pub(super) async fn look(args: &CheckArgs) -> Result<Vec<Finding>, CommandFailure> {
+pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, CommandFailure> {
     let uri = std::env::var("ROSRESCUE_URI").ok();
     let mut running = Running::find(&TargetArgs { uri })?;
     running.address.port = args.port.unwrap_or(running.address.port);
@@ -261,7 +261,7 @@ mod tests {
         state
     }
 
-    fn says(connections: &[(&str, &str)]) -> Answer {
+    fn answer_with(connections: &[(&str, &str)]) -> Answer {
         let entry = |(peer, direction): &(&str, &str)| {
             let fields = ["1", peer, direction, "TCPROS", "/chatter", "1", "…"];
             Value::Array(fields.map(Value::from).to_vec())
@@ -285,17 +285,17 @@ mod tests {
 
     #[test]
     fn each_subscriber_is_compared_with_each_publisher_that_lives() {
-        let none = || says(&[]);
-        let both = says(&[
+        let none = || answer_with(&[]);
+        let both = answer_with(&[
             ("http://robot:1", "i"),
             ("http://robot:2/", "i"),
             ("/rosout", "o"),
         ]);
         assert_eq!(found(none(), none(), both), [2, 0, 0, 0]);
-        let one = || says(&[("http://robot:1/", "i")]);
+        let one = || answer_with(&[("http://robot:1/", "i")]);
         assert_eq!(found(none(), none(), one()), [1, 1, 0, 0]);
         // A publisher may still list a connection that its subscriber has closed.
-        let claims = || says(&[("/listener", "o")]);
+        let claims = || answer_with(&[("/listener", "o")]);
         assert_eq!(found(claims(), claims(), one()), [1, 1, 0, 0]);
         assert_eq!(found(claims(), none(), none()), [0, 1, 1, 0]);
         assert_eq!(found(none(), Answer::Silent, one()), [1, 0, 0, 1]);

@@ -7,7 +7,7 @@ use checkpoint_store::folder;
 use super::{Finding, Severity};
 
 /// The finding for the checkpoint at `path`. `None` if its folders are safe.
-pub(super) fn look(path: &Path) -> Option<Finding> {
+pub(super) fn find_unsafe_folder(path: &Path) -> Option<Finding> {
     let (folder, why) = folder::open_to_others(path)?;
     Some(Finding {
         severity: Severity::Warning,

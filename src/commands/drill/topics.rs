@@ -131,7 +131,7 @@ pub(super) struct TopicReport {
 
 impl TopicReport {
     /// Counts the failures, except those of publishers in `ended`, which ended by themselves.
-    pub(super) fn judge(&mut self, ended: &BTreeSet<String>) {
+    pub(super) fn count_failures(&mut self, ended: &BTreeSet<String>) {
         let found = self.found.iter();
         let failures = found.filter(|(publisher, _)| !ended.contains(publisher));
         self.failures = failures.map(|(_, failure)| failure.clone()).collect();
@@ -289,7 +289,7 @@ fn choose(published: Vec<(String, String)>) -> Vec<(String, Usefulness)> {
         .into_iter()
         .filter(|(topic, of)| !topic.starts_with("/rosout") && !is_heavy(of));
     let mut topics: Vec<_> = cheap
-        .map(|(topic, of)| (topic, Usefulness::of(&of)))
+        .map(|(topic, of)| (topic, Usefulness::for_type(&of)))
         .collect();
     topics.sort_by(|(a, a_is), (b, b_is)| (a_is, a).cmp(&(b_is, b)));
     topics.truncate(CANDIDATES);
@@ -308,7 +308,7 @@ pub(super) enum Usefulness {
 
 impl Usefulness {
     /// Judges a message type, such as `nav_msgs/Odometry`.
-    pub(super) fn of(message_type: &str) -> Self {
+    pub(super) fn for_type(message_type: &str) -> Self {
         const DRIVES: [&str; 8] = [
             "nav_msgs/Odometry",
             "sensor_msgs/LaserScan",

@@ -49,7 +49,7 @@ pub(super) struct DrillVerdict {
 
 impl DrillVerdict {
     /// Collects the failures.
-    pub(super) fn judge(
+    pub(super) fn collect_failures(
         &mut self,
         difference: DrillDifference,
         shutdown: Option<String>,
@@ -266,7 +266,7 @@ mod tests {
     #[test]
     fn it_has_passed_if_nothing_failed() {
         let mut passed = verdict();
-        passed.judge(DrillDifference::default(), None, 30);
+        passed.collect_failures(DrillDifference::default(), None, 30);
         assert!(passed.passed && passed.to_string().starts_with("PASSED: "));
         // The verdict also says what the drill could not see.
         assert!(passed.notes[0].contains("no topic carried messages"));
@@ -278,7 +278,7 @@ mod tests {
                      said: &str| {
             let mut failed = verdict();
             let (difference, shutdown) = spoil(&mut failed);
-            failed.judge(difference, shutdown, 30);
+            failed.collect_failures(difference, shutdown, 30);
             let text = failed.to_string();
             assert!(!failed.passed && text.starts_with("FAILED: "), "{text}");
             assert!(text.contains(said), "{text}");

@@ -45,7 +45,7 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<ClusterCondition>
                 "Calls wait: this computer does not know the others yet{}.",
                 etcd(of)
             ),
-            action: look_at_etcd(of, of.since),
+            action: check_etcd(of, of.since),
         },
     };
     Some(notice)
@@ -77,7 +77,7 @@ fn no_leader(of: &ClusterFacts) -> ClusterCondition {
             etcd(of),
             last.unwrap_or_default()
         ),
-        action: look_at_etcd(of, since),
+        action: check_etcd(of, since),
     }
 }
 
@@ -156,7 +156,7 @@ fn etcd(of: &ClusterFacts) -> String {
     why.unwrap_or_default()
 }
 
-fn look_at_etcd(of: &ClusterFacts, since: Instant) -> Option<String> {
+fn check_etcd(of: &ClusterFacts, since: Instant) -> Option<String> {
     (of.etcd.is_some() || since.elapsed() > PATIENCE).then(|| {
         "make sure that a majority of etcd runs, and that this computer reaches it at the addresses of --cluster."
             .to_owned()

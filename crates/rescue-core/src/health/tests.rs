@@ -38,7 +38,7 @@ fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<I
         publish(&mut master, node, "/rosout", "http://n:1/");
     }
     let names = [name("/a", known[0], 1), name("/b", known[1], 2)];
-    judge(&master, &names, Some(pid), claims)
+    judge_node(&master, &names, Some(pid), claims)
 }
 
 #[test]
@@ -75,23 +75,23 @@ fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
     publish(&mut master, "/a", "/more", "http://n:1/");
-    let judge = |names: &[RegisteredName], topics: &[&str]| {
-        judge(&master, names, Some(2), Some(&claims(topics, &[])))
+    let judge_node = |names: &[RegisteredName], topics: &[&str]| {
+        judge_node(&master, names, Some(2), Some(&claims(topics, &[])))
     };
     let a = name("/a", Some(1), 1);
     let all = ["/more", "/ta", "/other"];
     assert_eq!(
-        judge(std::slice::from_ref(&a), &all),
+        judge_node(std::slice::from_ref(&a), &all),
         [IdentityVerdict::Itself]
     );
     let some = ["/ta", "/other"];
     assert_eq!(
-        judge(std::slice::from_ref(&a), &some),
+        judge_node(std::slice::from_ref(&a), &some),
         [IdentityVerdict::Another]
     );
     // A later node at the port publishes the same topics.
     publish(&mut master.clone(), "/b", "/ta", "http://n:1/");
-    let verdicts = judge(&[a, name("/b", Some(2), 2)], &all);
+    let verdicts = judge_node(&[a, name("/b", Some(2), 2)], &all);
     assert_eq!(
         verdicts,
         [IdentityVerdict::Another, IdentityVerdict::Itself]
@@ -117,19 +117,19 @@ fn an_empty_report_is_no_evidence() {
 fn a_name_that_registered_again_may_be_another_process() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
-    let judge = |pid, topic: &str| {
+    let judge_node = |pid, topic: &str| {
         let mut name = name("/a", Some(1), 1);
         name.registered_since = true;
         let said = claims(&[topic], &[]);
-        judge(&master, &[name], Some(pid), Some(&said))
+        judge_node(&master, &[name], Some(pid), Some(&said))
     };
     assert_eq!(
-        judge(1, "/new"),
+        judge_node(1, "/new"),
         [IdentityVerdict::Itself],
         "the same process"
     );
-    assert_eq!(judge(2, "/ta"), [IdentityVerdict::Itself], "restarted");
-    assert_eq!(judge(2, "/new"), [IdentityVerdict::Another]);
+    assert_eq!(judge_node(2, "/ta"), [IdentityVerdict::Itself], "restarted");
+    assert_eq!(judge_node(2, "/new"), [IdentityVerdict::Another]);
 }
 
 #[test]
@@ -156,14 +156,18 @@ fn of_two_nodes_that_share_topics_the_one_that_matches_is_there() {
         publish(&mut master, node, topic, "http://n:1/");
         subscribe(&mut master, node, "/shared", "http://n:1/");
     }
-    let judge = |publications: &[&str]| {
+    let judge_node = |publications: &[&str]| {
         let names = [name("/a", None, 1), name("/b", None, 2)];
         let said = claims(publications, &["/shared"]);
-        judge(&master, &names, Some(1), Some(&said))
+        judge_node(&master, &names, Some(1), Some(&said))
     };
-    assert_eq!(judge(&["/tb"]), [Another, Itself]);
-    assert_eq!(judge(&["/ta", "/tb"]), [Itself, Itself], "two names");
-    assert_eq!(judge(&[]), [Itself, Itself], "who of them is not clear");
+    assert_eq!(judge_node(&["/tb"]), [Another, Itself]);
+    assert_eq!(judge_node(&["/ta", "/tb"]), [Itself, Itself], "two names");
+    assert_eq!(
+        judge_node(&[]),
+        [Itself, Itself],
+        "who of them is not clear"
+    );
 }
 
 #[test]
@@ -172,21 +176,21 @@ fn a_port_has_one_node_behind_it() {
     publish(&mut master, "/a", "/rosout", "http://n:1/");
     publish(&mut master, "/b", "/tb", "http://n:1/");
     let said = claims(&["/tb"], &[]);
-    let judge = |a, b| {
+    let judge_node = |a, b| {
         let names = [name("/a", None, a), name("/b", None, b)];
-        judge(&master, &names, Some(1), Some(&said))
+        judge_node(&master, &names, Some(1), Some(&said))
     };
     assert_eq!(
-        judge(1, 2),
+        judge_node(1, 2),
         [IdentityVerdict::Another, IdentityVerdict::Itself]
     );
     // A process took a second name, or the order of registrations is unknown: both nodes are kept.
     assert_eq!(
-        judge(2, 1),
+        judge_node(2, 1),
         [IdentityVerdict::Unknown, IdentityVerdict::Itself]
     );
     assert_eq!(
-        judge(0, 0),
+        judge_node(0, 0),
         [IdentityVerdict::Unknown, IdentityVerdict::Itself]
     );
 }

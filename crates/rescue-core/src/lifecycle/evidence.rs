@@ -115,7 +115,7 @@ impl Evidence {
     /// Judges a master that was silent during all samples. A master that has used the processor for `busy_limit`
     /// without an answer hangs. After any verdict but [`SilenceVerdict::Unknown`], the next judgement uses only the
     /// last sample and later ones.
-    pub fn judge(&mut self, busy_limit: Duration) -> SilenceVerdict {
+    pub fn judge_silence(&mut self, busy_limit: Duration) -> SilenceVerdict {
         let verdict = self.verdict(busy_limit);
         if verdict != SilenceVerdict::Unknown
             && let Some(last) = self.last
@@ -212,7 +212,7 @@ mod tests {
                 own_wait,
             });
         }
-        evidence.judge(BUSY_LIMIT)
+        evidence.judge_silence(BUSY_LIMIT)
     }
 
     fn is_unproved(verdict: SilenceVerdict, word: &str) {
@@ -288,7 +288,7 @@ mod tests {
                 master,
                 own_wait,
             });
-            verdicts.push(evidence.judge(BUSY_LIMIT));
+            verdicts.push(evidence.judge_silence(BUSY_LIMIT));
         }
         let hung = verdicts.iter().position(|it| *it == SilenceVerdict::Hung);
         assert_eq!(hung, Some(30));
@@ -297,21 +297,21 @@ mod tests {
     #[test]
     fn there_is_no_verdict_at_first_and_an_invisible_process_counts_as_hung() {
         let mut evidence = Evidence::default();
-        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
+        assert_eq!(evidence.judge_silence(BUSY_LIMIT), SilenceVerdict::Hung);
         let mut sample = Sample {
             at: Instant::now(),
             master: None,
             own_wait: Duration::ZERO,
         };
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
+        assert_eq!(evidence.judge_silence(BUSY_LIMIT), SilenceVerdict::Hung);
         evidence.clear();
         sample.master = Some(Effort::default());
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Unknown);
+        assert_eq!(evidence.judge_silence(BUSY_LIMIT), SilenceVerdict::Unknown);
         sample.at += IDLE_LEAST;
         evidence.add(sample);
-        assert_eq!(evidence.judge(BUSY_LIMIT), SilenceVerdict::Hung);
+        assert_eq!(evidence.judge_silence(BUSY_LIMIT), SilenceVerdict::Hung);
     }
 
     /// A start that is busy for five seconds and then waits forever.
@@ -330,7 +330,7 @@ mod tests {
                 master,
                 own_wait: Duration::ZERO,
             });
-            evidence.judge(BUSY_LIMIT)
+            evidence.judge_silence(BUSY_LIMIT)
         };
         assert_eq!(sample(&mut evidence, 0), SilenceVerdict::Unknown);
         is_unproved(sample(&mut evidence, 30), "busy");

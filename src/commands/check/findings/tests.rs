@@ -12,7 +12,7 @@ use super::{
         ros::{Program, Responder},
         units::{Unit, UnitKind},
     },
-    judge,
+    from_facts,
 };
 fn host(name: &str, address: &str, is_here: bool) -> Host {
     Host {
@@ -133,7 +133,7 @@ fn port(facts: &mut SetupFacts) -> &mut Port {
 fn said(spoil: impl FnOnce(&mut SetupFacts)) -> Vec<Finding> {
     let mut facts = robot();
     spoil(&mut facts);
-    let mut found = judge(&facts);
+    let mut found = from_facts(&facts);
     found.retain(|finding| finding.severity != Severity::Ok);
     found
 }

@@ -12,7 +12,7 @@ use super::{
 };
 
 /// Turns the facts into findings.
-pub(super) fn judge(facts: &SetupFacts) -> Vec<Finding> {
+pub(super) fn from_facts(facts: &SetupFacts) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
     if let (Some(Responder::Rosrescue { .. } | Responder::Master(_)), Some(uri)) =
         (&facts.elsewhere, &facts.env.master_uri)

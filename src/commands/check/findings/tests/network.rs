@@ -12,14 +12,14 @@ use super::{
         ros::Responder,
         shell::ShellSetting,
     },
-    host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
+    from_facts, host, nowhere, one, port, process, robot, rosrescue, said, taken,
 };
 use crate::ros_env::MasterUri;
 
 #[test]
 fn a_robot_without_problems_has_no_findings() {
     assert_eq!(said(|_| {}), []);
-    assert!(judge(&robot()).len() >= 8);
+    assert!(from_facts(&robot()).len() >= 8);
     // There is no finding either while rosrescue runs, with its own master and its checkpoint in use.
     let found = said(|facts| {
         port(facts).taken = taken(rosrescue(None));
