@@ -142,11 +142,13 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 57: etcd lost data again before a new journal had its leader's state, and the leader gave up its own.
 /// 118 and 1300: a merge sent a request that was judged by a lost journal, so outdated values replaced newer ones.
 /// 152 and 413: a computer led, and then read a journal that its leader had begun and not written. It took it for empty.
+/// 7135: a leader gave up leadership before the journal had its state, and gave up the state.
+/// 20404: a computer waited for the end of a lost journal, which the new one did not reach.
 /// 183: only the journal's last entry was gone. No transaction succeeded, and no computer noticed why.
 /// 1402: a computer began a journal before it had read etcd, and then took its own journal for an empty state.
 #[test]
 fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
-    for seed in [57, 118, 152, 183, 413, 1300, 1402] {
+    for seed in [57, 118, 152, 183, 413, 1300, 1402, 7135, 20_404] {
         play(seed).check();
     }
 }

@@ -77,6 +77,10 @@ impl Member {
         number: u64,
         answer: EtcdAnswer,
     ) -> EtcdAnswer {
+        if self.reading.is_doubtful {
+            // The request is sent again when the journal has been checked.
+            return EtcdAnswer::Silence;
+        }
         let EtcdAnswer::Is(view) = &answer else {
             return answer;
         };

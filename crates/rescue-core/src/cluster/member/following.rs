@@ -29,6 +29,9 @@ pub(super) struct Reading {
     check_due: bool,
     /// Whether the read under way checks the whole journal.
     checks: bool,
+    /// Whether the watch has shown that keys of the journal are gone, and the journal has not been checked since. Until
+    /// then nothing that etcd says counts.
+    pub(super) is_doubtful: bool,
     /// When the next read is due.
     load_at: Option<Instant>,
     /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
@@ -77,7 +80,7 @@ impl Reading {
     pub(super) fn forget(&mut self, view: &View) {
         (self.wanted, self.reported) = (None, 0);
         (self.watching, self.view) = (false, view.clone());
-        self.check_due = false;
+        (self.check_due, self.is_doubtful) = (false, false);
     }
 
     pub(super) fn view(&self) -> &View {
@@ -89,7 +92,8 @@ impl Member {
     /// Has the journal read if the machine waits for more of it than has been read.
     pub(super) fn catch_up(&mut self, now: Instant) {
         let seq = self.journal.progress.seq;
-        let wanted = self.reading.wanted;
+        // A new journal may be shorter than the lost one whose end the machine waits for.
+        let wanted = self.reading.wanted.map(|seq| seq.min(self.view().seq()));
         let news = wanted.is_some() || self.reading.reported != seq;
         let there = seq >= wanted.unwrap_or_default();
         if news && self.reading.loaded && !self.records() && there {
@@ -148,6 +152,10 @@ impl Member {
         let leads = self.published.role == Role::Leading && !Mutant::TrustsDeletedKeys.lives();
         if leads && deleted.is_some_and(|seq| seq > self.chores.replaced) {
             self.reading.check_all(now);
+            self.reading.is_doubtful = true;
+        }
+        if self.reading.is_doubtful {
+            return;
         }
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
         self.see(now, view);
@@ -267,6 +275,7 @@ impl Member {
         } else if checks {
             // The records are known.
             (read.state, read.records) = (None, Vec::new());
+            self.reading.is_doubtful = false;
         }
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);

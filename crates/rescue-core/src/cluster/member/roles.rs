@@ -118,6 +118,8 @@ impl Member {
     pub(super) fn give_up(&mut self) {
         if self.records() {
             self.chores.notifying.stop();
+            // Its own state is the only one, as long as it is not in the journal.
+            self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
         }
         // A computer that is cut off and serves has its own history.
         let binds = !self.keeps();

@@ -106,6 +106,8 @@ pub(super) struct Computer {
     pub(super) undisturbed_since: u64,
     /// The computer may not have been able to do its part when etcd lost data before this time.
     pub(super) disturbed_until: u64,
+    /// The origin of a journal of which the watch has shown this process that it can no longer be read.
+    pub(super) seen_unreadable: u64,
     /// Whether this process started while etcd had an older copy, which looks like any journal, and no new one has begun.
     pub(super) unaware: bool,
     /// By how much the computer's clock is too fast, in millionths.
@@ -180,6 +182,7 @@ impl Computer {
             hangs_until: 0,
             undisturbed_since: 0,
             disturbed_until: 0,
+            seen_unreadable: 0,
             unaware: false,
             drift,
             clock: Instant::now() + Duration::from_secs(1),
@@ -207,6 +210,7 @@ impl Computer {
     /// Starts a new process. The memory of the previous one is lost.
     pub(super) fn start(&mut self, index: usize, plan: &Plan) {
         self.life += 1;
+        self.seen_unreadable = 0;
         self.up = true;
         self.hangs_until = 0;
         self.disk.own.restored = true;

@@ -448,6 +448,10 @@ impl World {
         };
         let heard = self.etcd.heard(revision);
         let deleted = self.etcd.deleted(revision, view.revision);
+        let leads = computer.member.role() == Role::Leading;
+        if leads && deleted.is_some() && !self.etcd.is_readable() {
+            computer.seen_unreadable = self.etcd.view().origin;
+        }
         computer.watched = view.revision;
         let input = Input::Watched {
             view,

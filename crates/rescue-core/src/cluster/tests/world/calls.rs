@@ -108,6 +108,12 @@ impl World {
                     self.history.breaks("two leaders answer");
                 }
                 let always = self.plan.commit == Commit::Always;
+                let origin = self.etcd.view().origin;
+                let seen = origin > 0 && self.computers[at].seen_unreadable == origin;
+                if always && seen && !self.etcd.is_readable() {
+                    self.history
+                        .breaks("a leader answers although it has seen that keys are gone");
+                }
                 if !committed && always && !self.etcd.lost {
                     self.history
                         .breaks("a leader answers what no journal holds");
