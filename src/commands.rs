@@ -1,6 +1,8 @@
 //! The commands that do not serve nodes. Each asks a running rosrescue, reads a checkpoint or examines this computer,
 //! prints the result, and ends with an exit status for scripts.
 
+#![deny(clippy::print_stderr)]
+
 mod check;
 mod completions;
 mod diff;
@@ -138,7 +140,23 @@ fn json(value: &impl Serialize, pretty: bool) -> Result<Printable, CommandFailur
 
 /// Prints a sentence to standard error.
 fn note(sentence: &str) {
-    eprintln!("rosrescue: {}", Printable::line(sentence));
+    say(&format!("rosrescue: {sentence}"));
+}
+
+/// Prints a line to standard error. No command prints there in another way.
+#[expect(clippy::print_stderr, reason = "only printable text")]
+fn say(line: &str) {
+    eprintln!("{}", Printable::line(line));
+}
+
+/// Asks a question at the terminal. Returns whether the answer is yes.
+#[expect(clippy::print_stderr, reason = "only printable text")]
+fn agrees(question: &str) -> io::Result<bool> {
+    eprint!("{} [y/N] ", Printable::line(question));
+    io::stderr().flush()?;
+    let mut answer = String::new();
+    io::stdin().read_line(&mut answer)?;
+    Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
 }
 
 /// Prints `text` without empty lines at its end. Returns false if the reader has closed the pipe.

@@ -18,6 +18,7 @@ use crate::{
         handover::{Guard, Sockets},
     },
     log::Stderr,
+    printable::Printable,
     resolver,
     ros_env::MasterUri,
     server::{hosts::own_names, listener},
@@ -106,7 +107,8 @@ pub fn main() -> ExitCode {
     match start(config, sockets, common.no_guardian, hostname, words) {
         Ok(status) => ExitCode::from(u8::try_from(status).unwrap_or(1)),
         Err(error) => {
-            eprintln!("rosrescue: {error}");
+            // The name and address of another computer may be in it.
+            eprintln!("rosrescue: {}", Printable::line(&error.to_string()));
             ExitCode::FAILURE
         }
     }

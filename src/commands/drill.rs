@@ -10,7 +10,7 @@ mod topics;
 mod verdict;
 
 use std::{
-    io::{IsTerminal, Write},
+    io::IsTerminal,
     time::{Duration, Instant},
 };
 
@@ -31,7 +31,7 @@ use self::{
     topics::{Topic, Usefulness},
     verdict::{DrillVerdict, names},
 };
-use super::{CommandFailure, Exit, counted, print, running::Running};
+use super::{CommandFailure, Exit, agrees, counted, print, running::Running, say};
 use crate::{
     cli::{DrillArgs, Victim},
     process,
@@ -110,11 +110,11 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), CommandFailure> 
     let kill = if args.hang { Victim::Master } else { args.kill };
     let victims = names(&target.victims(kill).await?);
     let how = if args.hang { "SIGSTOP" } else { "SIGKILL" };
-    eprintln!(
+    say(&format!(
         "This sends {how} to {victims} of {}, {}.",
         target.running.address,
         counted(args.times as usize, "time")
-    );
+    ));
     if args.yes {
         return Ok(());
     }
@@ -124,11 +124,7 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), CommandFailure> 
                 .to_owned(),
         ));
     }
-    eprint!("Is the robot safe on the bench? Start the drill? [y/N] ");
-    let _ = std::io::stderr().flush();
-    let mut answer = String::new();
-    let read = std::io::stdin().read_line(&mut answer);
-    match read.is_ok() && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
+    match agrees("Is the robot safe on the bench? Start the drill?").unwrap_or(false) {
         true => Ok(()),
         false => Err(CommandFailure::Failed("killed nothing".to_owned())),
     }
@@ -165,7 +161,7 @@ impl Drill<'_> {
         stop: &CancellationToken,
     ) -> Result<DrillVerdict, CommandFailure> {
         let start = Instant::now();
-        eprintln!("watching normal operation, and finding topics with messages");
+        say("watching normal operation, and finding topics with messages");
         let api = self.target.api.clone();
         self.remove_left_behind().await?;
         let before = RobotState::read(&api)
@@ -192,7 +188,7 @@ impl Drill<'_> {
             topic.begin();
         }
         let kills = if self.args.no_kill {
-            eprintln!("watching for {} s", self.args.seconds);
+            say(&format!("watching for {} s", self.args.seconds));
             sleep(Duration::from_secs(self.args.seconds.into())).await;
             Vec::new()
         } else {
@@ -272,7 +268,7 @@ impl Drill<'_> {
             match Topic::subscribe(&api, &self.node, &name, usefulness).await {
                 Ok(topic) => found.push(topic),
                 Err(why) => {
-                    eprintln!("not watched: {why}");
+                    say(&format!("not watched: {why}"));
                     let _ = topics::unregister(&api, &self.node, &name).await;
                 }
             }

@@ -20,6 +20,7 @@ use ros1_master::master::{Master, Request};
 use super::{
     CommandFailure, note,
     running::{Running, is_here},
+    say,
 };
 use crate::{
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
@@ -156,7 +157,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
         return Err(CommandFailure::Usage(why));
     }
     if metadata.len() > LARGE && io::stderr().is_terminal() {
-        eprintln!("reading `{shown}`, {} …", size(metadata.len()));
+        say(&format!("reading `{shown}`, {} …", size(metadata.len())));
     }
     let loaded = checkpoint_store::read(path).map_err(|error| {
         CommandFailure::Usage(match error {

@@ -8,7 +8,7 @@ use serde::Serialize;
 use tokio::time::{Instant, sleep};
 
 use super::{
-    CommandFailure, Exit, print,
+    CommandFailure, Exit, note, print,
     running::{ANSWER_LIMIT, Running},
 };
 use crate::{
@@ -185,7 +185,9 @@ async fn next_leader(
             said = Instant::now();
             let leads = now.leads().map_or("nobody", |leader| &*leader.name);
             let seconds = start.elapsed().as_secs();
-            eprintln!("rosrescue: {leads} leads after {seconds} s, waiting for another computer");
+            note(&format!(
+                "{leads} leads after {seconds} s, waiting for another computer"
+            ));
         }
         sleep(PAUSE).await;
     }

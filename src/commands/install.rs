@@ -9,7 +9,7 @@ use std::{
     collections::BTreeMap,
     ffi::OsString,
     fmt, fs,
-    io::{self, IsTerminal, Write},
+    io::{self, IsTerminal},
     net::{SocketAddr, TcpListener},
     path::{Path, PathBuf},
     process::{self as system, Stdio},
@@ -21,9 +21,9 @@ use serde::Serialize;
 
 use self::units::{MARK, UnitSettings};
 use super::{
-    CommandFailure, Exit,
+    CommandFailure, Exit, agrees,
     check::units::{self as others, UnitKind},
-    print,
+    print, say,
 };
 use crate::{
     cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
@@ -339,11 +339,8 @@ fn carry_out(plan: &Plan, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
         let text = "cannot ask here: look at the changes with --dry-run, then make them with --yes";
         return Err(CommandFailure::Usage(text.to_owned()));
     } else {
-        eprint!("{plan}\nMake these changes? [y/N] ");
-        let _ = io::stderr().flush();
-        let mut answer = String::new();
-        let _ = io::stdin().read_line(&mut answer);
-        if !["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
+        plan.to_string().lines().for_each(say);
+        if !agrees("Make these changes?").unwrap_or(false) {
             return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
     }

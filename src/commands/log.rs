@@ -74,7 +74,7 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
         if found {
             return Ok(Exit::Good);
         }
-        eprintln!("rosrescue: {}", nothing_found(&path, &wanted));
+        note(&nothing_found(&path, &wanted));
         return Ok(Exit::Bad);
     }
     loop {

@@ -3,7 +3,7 @@
 
 use std::{
     fmt,
-    io::{self, IsTerminal, Write},
+    io::{self, IsTerminal},
     time::{Duration, Instant},
 };
 
@@ -20,7 +20,7 @@ use ros1_master::{
 };
 use serde::Serialize;
 
-use super::{CommandFailure, Exit, files, live::Live, print, running::Running};
+use super::{CommandFailure, Exit, agrees, files, live::Live, print, running::Running, say};
 use crate::{
     cli::RestoreArgs,
     printable::{Lines, Page, display_lines, line},
@@ -96,12 +96,8 @@ fn agreed(json: bool) -> Result<bool, CommandFailure> {
         let why = "cannot ask here: --plan shows the changes, --yes makes them";
         return Err(CommandFailure::Usage(why.to_owned()));
     }
-    eprint!("Set these parameters? [y/N] ");
-    let _ = io::stderr().flush();
-    let mut answer = String::new();
-    let read = io::stdin().read_line(&mut answer);
-    read.map_err(|error| CommandFailure::Failed(format!("no answer: {error}")))?;
-    Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
+    agrees("Set these parameters?")
+        .map_err(|error| CommandFailure::Failed(format!("no answer: {error}")))
 }
 
 /// Sets and deletes parameters. Returns the refused calls with their reasons.
@@ -133,7 +129,7 @@ async fn set(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, Comm
         let refused = texts.into_iter().zip(refused);
         failed.extend(refused.filter_map(|(text, why)| Some(format!("{text}: {}", why?))));
         if said.elapsed() >= Duration::from_secs(1) && io::stderr().is_terminal() {
-            eprintln!("{done} of {total} calls …");
+            say(&format!("{done} of {total} calls …"));
             said = Instant::now();
         }
     }

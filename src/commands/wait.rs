@@ -10,7 +10,7 @@ use serde::Serialize;
 use tokio::time::{Instant, sleep_until};
 
 use super::{
-    CommandFailure, Exit, print,
+    CommandFailure, Exit, note, print,
     running::{ANSWER_LIMIT, Running},
 };
 use crate::{
@@ -77,11 +77,11 @@ pub(super) async fn run(args: &WaitArgs) -> Result<Exit, CommandFailure> {
             });
         }
         if !std::mem::replace(&mut said, true) {
-            eprintln!(
-                "rosrescue: waiting for {} at {}",
+            note(&format!(
+                "waiting for {} at {}",
                 missing.join(", "),
                 running.address
-            );
+            ));
         }
         let next = Instant::now() + PAUSE;
         sleep_until(deadline.map_or(next, |deadline| deadline.min(next))).await;

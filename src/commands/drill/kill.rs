@@ -10,7 +10,11 @@ use super::{
     target::Stopped,
     verdict::{Kill, names},
 };
-use crate::{cli::Victim, commands::CommandFailure, process};
+use crate::{
+    cli::Victim,
+    commands::{CommandFailure, say},
+    process,
+};
 
 /// How long the drill watches after each recovery. Late notifications arrive in that time.
 const AFTER: Duration = Duration::from_millis(1500);
@@ -34,20 +38,20 @@ impl Drill<'_> {
             let fifth = times.iter().rev().nth(DEATHS - 1);
             let pause = fifth.map(|then| DEATHS_WITHIN.saturating_sub(then.elapsed()));
             if let Some(pause) = pause.filter(|pause| !pause.is_zero()) {
-                eprintln!(
+                say(&format!(
                     "waiting {} s, because more deaths now would be a crash loop",
                     pause.as_secs()
-                );
+                ));
                 sleep(pause).await;
             }
             // Each kill replaces the processes, so they are looked up again.
             let victims = self.target.victims(kill).await?;
             let signal = if self.args.hang { "SIGSTOP" } else { "SIGKILL" };
-            eprintln!(
+            say(&format!(
                 "{number} of {}: {signal} to {}",
                 self.args.times,
                 names(&victims)
-            );
+            ));
             let start = Instant::now();
             times.push(start);
             let mut stopped = None;
@@ -70,7 +74,7 @@ impl Drill<'_> {
                 recovered_ms,
             });
             if failed {
-                eprintln!("calls do not pass again: the drill stops");
+                say("calls do not pass again: the drill stops");
                 break;
             }
             sleep(AFTER).await;
