@@ -85,7 +85,7 @@ fn an_etcd_that_has_lost_its_data_gets_the_state_of_living_computers() {
 }
 
 /// Deletes all keys that begin with `prefix`, as `etcdctl del --prefix` does.
-fn delete_keys(fleet: &Fleet, prefix: &str) {
+pub(crate) fn delete_keys(fleet: &Fleet, prefix: &str) {
     let range = prefix.to_owned()..format!("{prefix}\u{7f}");
     fleet.computers[0].within(|| {
         let runtime = tokio::runtime::Runtime::new().unwrap();
