@@ -8,7 +8,3 @@
 pub mod etcd;
 pub mod replica;
 pub mod survey;
-
-pub use rescue_core::cluster::{
-    cut_off, displaced, journal, machine, member, merge, namesake, outgoing, sharing, standing,
-};

@@ -13,7 +13,7 @@ use tokio::{sync::watch, time::Instant};
 pub enum State {
     /// Calls pass to the master.
     Open {
-        /// Number of the incarnation, which is one life of a master process; see [`Token`](crate::replay::Token).
+        /// Number of the incarnation, which is one life of a master process; see [`Token`](rescue_core::replay::Token).
         incarnation: u64,
     },
     /// The mirror answers reads and writes, because the master is away.

@@ -25,6 +25,20 @@ use std::{
     time::Instant,
 };
 
+use checkpoint_store::Store;
+use rescue_core::{
+    checkpoint::format::{Label, Origin, Record, RecordContent, Session},
+    cluster::{
+        merge::Verdict,
+        sharing::{Change, Sharing, Source},
+    },
+    order::{Order, Subject},
+    replay::{self, Answered, Token},
+};
+use ros1_master::{
+    master::{Master, Method, Request, Write},
+    xmlrpc::{Python, Reply},
+};
 use tokio::sync::{Notify, watch};
 
 use self::activity::Activity;
@@ -34,23 +48,7 @@ use self::{
     late::{CatchUp, LateState, Missed, once},
     shared::{Agreement, LeaderLease, Shared},
 };
-use crate::{
-    checkpoint::{
-        format::{Label, Origin, Record, RecordContent, Session},
-        store::Store,
-    },
-    cli::SyncPolicy,
-    clock,
-    cluster::{
-        merge::Verdict,
-        sharing::{Change, Sharing, Source},
-    },
-    master::{Master, Method, Request, Write},
-    order::{Order, Subject},
-    replay::{self, Answered, Token},
-    status::stats::Stats,
-    xmlrpc::{Python, Reply},
-};
+use crate::{cli::SyncPolicy, clock, status::stats::Stats};
 
 /// Refuses an outdated result: another incarnation (see [`Token`]) has begun, the mirror has changed since, or the
 /// master is on another computer than the caller assumed.

@@ -3,30 +3,18 @@
 //!
 //! # Layout
 //!
-//! The *core* is pure: no runtime, no sockets, no files, no clock. Time is an argument and work is returned
-//! as values.
+//! What is decided without IO is in crates of its own: `ros1_master` (XML-RPC and the Master API as a state machine) and
+//! `rescue_core` (checkpoint format, recovery, node health, the order of notifications, several computers). The checkpoint
+//! on the disk is in `checkpoint_store`, etcd's client in `etcd_kv`.
 //!
-//! * [`xmlrpc`]: XML-RPC text to values and back; independent of ROS.
-//! * [`master`]: the Master API as a state machine.
-//! * [`hide`]: which parameter values are hidden.
-//! * [`replay`]: recognising a master, reading its state, and the one call that gives a master its state.
-//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
-//! * `health`: judging what a node reports; which nodes are unreachable.
-//! * `order`: the order of the notifications and answers that a node gets about a topic, a parameter or its own name.
-//! * [`checkpoint::session`]: whether a checkpoint's session continues, and the state that it holds.
-//! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
-//! * [`checkpoint::compare`], [`checkpoint::putback`]: how two states differ, and what brings a running master
-//!   nearer to a checkpoint.
-//!
-//! The *shell* does IO and decides as little as possible. From the bottom to the top:
+//! This crate does IO and decides as little as possible. From the bottom to the top:
 //!
 //! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
 //! * `clock`, `resolver`, `task`, `wait`: the wall clock; addresses of hosts; starting tasks; waiting for optional events.
 //! * `limit`, [`log`]: how often a line is logged; where the log goes.
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
-//! * [`checkpoint::store`]: the checkpoint on the disk.
-//! * [`cluster`]: several computers, of which one leads; its decisions are pure.
+//! * [`cluster`]: the robot's keys in etcd, for several computers.
 //! * `ledger`: mirror and journal under one lock.
 //! * `upstream`: connections to the master.
 //! * `write_queue`: writes on their way to the master, in order.
@@ -43,7 +31,6 @@
 //! `docs/architecture.md` names the functions that a call and a record pass on their way through these modules.
 
 pub mod app;
-pub mod checkpoint;
 pub mod cli;
 pub mod clock;
 pub mod cluster;
@@ -72,8 +59,9 @@ pub(crate) mod upstream;
 pub(crate) mod wait;
 pub(crate) mod write_queue;
 
-pub(crate) use checkpoint_store::regular_file;
-pub(crate) use rescue_core::{health, order};
-pub use rescue_core::{hide, lifecycle, replay};
-pub use ros1_master::{master, xmlrpc};
+// Two files of the write queue still import these from here.
+#[cfg(test)]
+use rescue_core::{checkpoint, health};
+use rescue_core::{lifecycle, order};
+use ros1_master::{master, xmlrpc};
 pub use server::listener;

@@ -1,4 +1,4 @@
-//! Watches the master and restores it after a failure. Carries out what [`crate::lifecycle`] decides.
+//! Watches the master and restores it after a failure. Carries out what [`rescue_core::lifecycle`] decides.
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
@@ -13,6 +13,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::{
+    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, evidence::Sample},
+    replay::RUN_ID_AFTER,
+};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
@@ -25,11 +29,9 @@ use self::{
 use crate::{
     gate::State,
     ledger::history::Rescues,
-    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, evidence::Sample},
     limit::{Pair, alarm, all_clear, rarely},
     nodes::{self, Nodes},
     process::{self, ProcessError, effort, listeners::Holder},
-    replay::RUN_ID_AFTER,
     status::{
         Board,
         report::{AWAY, RecoveryOutcome, STARTED},
@@ -72,7 +74,7 @@ enum News {
     Sent,
 }
 
-/// Carries out what the [lifecycle](crate::lifecycle) decides: starts and watches the master, gives it its state, and
+/// Carries out what the [lifecycle](rescue_core::lifecycle) decides: starts and watches the master, gives it its state, and
 /// lets calls pass to it.
 pub(crate) struct Driver {
     examiner: Examiner,

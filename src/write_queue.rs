@@ -14,6 +14,15 @@ mod round_trip;
 
 use std::{sync::Arc, time::Duration};
 
+use rescue_core::{
+    checkpoint::format::Origin,
+    cluster::merge::wire::{self, Ask},
+    lifecycle::Patience,
+};
+use ros1_master::{
+    master::Request,
+    xmlrpc::{self, Reply, Value},
+};
 use tokio::{
     sync::{Notify, mpsc, watch},
     time::Instant,
@@ -24,17 +33,7 @@ use self::{
     dispatcher::Dispatcher,
 };
 pub(crate) use self::{drain::Drain, evict::MoveJudge};
-use crate::{
-    checkpoint::format::Origin,
-    cluster::merge::wire::{self, Ask},
-    gate,
-    ledger::Ledger,
-    lifecycle::Patience,
-    master::Request,
-    status::stats::Stats,
-    upstream::Upstream,
-    xmlrpc::{self, Reply, Value},
-};
+use crate::{gate, ledger::Ledger, status::stats::Stats, upstream::Upstream};
 
 /// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
 const CHANNEL: usize = 64;

@@ -11,12 +11,11 @@ pub use etcd_kv::{
     Credentials, EtcdError, Found, KeyChange, Kv, MemberStatus, Options, Tls, Tried, Watch,
     WatchEnd,
 };
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
-
-use super::{
+use rescue_core::cluster::{
     journal::{Keys, Put},
     machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
 };
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 /// Maximum number of robots that [`Etcd::robots`] lists.
 const ROBOTS_MOST: usize = 16;

@@ -2,14 +2,16 @@
 
 use std::time::Duration;
 
-use rescue_core::checkpoint::format::{self, Checkpoint, Record};
+use rescue_core::{
+    checkpoint::format::{self, Checkpoint, Record},
+    cluster::{
+        journal::{self, JournalError, Keys, Manifest, Progress, Put},
+        machine::{EtcdAnswer, Op, Settings, View},
+    },
+};
 use thiserror::Error;
 
-use super::{
-    etcd::{self, Etcd, EtcdError, Found, Kv},
-    journal::{self, JournalError, Keys, Manifest, Progress, Put},
-    machine::{EtcdAnswer, Op, Settings, View},
-};
+use super::etcd::{self, Etcd, EtcdError, Found, Kv};
 
 /// How often a read starts over because etcd was compacted meanwhile.
 const ATTEMPTS: usize = 5;

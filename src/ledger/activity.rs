@@ -7,10 +7,9 @@ use std::{
 };
 
 use indexmap::{IndexMap, IndexSet};
-
-use crate::{
+use rescue_core::order::Subject;
+use ros1_master::{
     master::{self, Displaced, Effect, Master, NoticeSink, Request, Write},
-    order::Subject,
     xmlrpc::{Call, Value},
 };
 

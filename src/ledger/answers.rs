@@ -2,16 +2,19 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::{Ledger, Mark, delivery::Delivery};
-use crate::{
+use rescue_core::{
     checkpoint::format::{Label, Origin, RecordContent},
-    clock,
     cluster::sharing::Source,
-    master::{Kind, Method, Request, is_success},
     order::Concern,
     replay,
+};
+use ros1_master::{
+    master::{Kind, Method, Request, is_success},
     xmlrpc::{Reply, Value},
 };
+
+use super::{Ledger, Mark, delivery::Delivery};
+use crate::clock;
 
 /// An unregistration that changes nothing in the mirror is added to the pending writes only while there are fewer than
 /// this.

@@ -8,6 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use checkpoint_store::{CheckJob, Store, SyncJob};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
@@ -16,7 +17,6 @@ use super::{
     journal::{DISK_PATIENCE, StoreState},
 };
 use crate::{
-    checkpoint::store::{CheckJob, Store, SyncJob},
     cli::SyncPolicy,
     limit::{Pair, alarm, all_clear, rarely},
     status::Board,

@@ -1,10 +1,12 @@
 //! Tracks answers on their way to nodes, and wakes the calls and notifications that wait for them. The rules are in
-//! [`crate::order`].
+//! [`rescue_core::order`].
 
 use std::{sync::Arc, time::Instant};
 
+use rescue_core::order::heard_by_read;
+use ros1_master::master::Request;
+
 use super::Ledger;
-use crate::{master::Request, order::heard_by_read};
 
 /// An answer on its way to its caller. Drop this handle once the answer has been written or can no longer be written.
 pub(crate) struct Delivery {
@@ -20,7 +22,7 @@ impl std::fmt::Debug for Delivery {
 }
 
 impl Delivery {
-    /// Tracks the answer with this number in the [`Order`](crate::order::Order) of `ledger`. The handle must not be
+    /// Tracks the answer with this number in the [`Order`](rescue_core::order::Order) of `ledger`. The handle must not be
     /// dropped under the ledger's lock.
     pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
         let ledger = Some(ledger.clone());

@@ -5,16 +5,14 @@ use std::{
     sync::{Arc, atomic::Ordering},
 };
 
+use checkpoint_store::{Store, StoreError};
+use rescue_core::checkpoint::format::Checkpoint;
 use tokio::time::timeout;
 
 use super::{
     Ledger,
     journal::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
     shared::Agreed,
-};
-use crate::checkpoint::{
-    format::Checkpoint,
-    store::{Store, StoreError},
 };
 
 /// Identifies a record that an answer may have to wait for.

@@ -2,8 +2,10 @@
 
 use std::{sync::Arc, time::Instant};
 
+use checkpoint_store::history;
+
 use super::{Ledger, journal::StoreState};
-use crate::{checkpoint::store::history, limit::Limit};
+use crate::limit::Limit;
 
 pub(crate) struct Rescues {
     ledger: Arc<Ledger>,

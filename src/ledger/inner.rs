@@ -2,6 +2,17 @@
 
 use std::{sync::Arc, time::Instant};
 
+use rescue_core::{
+    checkpoint::format::{Checkpoint, Label, RecordContent, Session},
+    cluster::sharing::Source,
+    health::port_of,
+    order::Order,
+    replay::{self, Token},
+};
+use ros1_master::{
+    master::{Master, Request},
+    xmlrpc::Reply,
+};
 use tokio::sync::Notify;
 
 use super::{
@@ -13,16 +24,7 @@ use super::{
     shared::Shared,
     summary::Divergences,
 };
-use crate::{
-    checkpoint::format::{Checkpoint, Label, RecordContent, Session},
-    clock,
-    cluster::sharing::Source,
-    health::port_of,
-    master::{Master, Request},
-    order::Order,
-    replay::{self, Token},
-    xmlrpc::Reply,
-};
+use crate::clock;
 
 /// The mirror, the journal, and what keeps them consistent.
 pub(super) struct Inner {
@@ -298,7 +300,7 @@ impl Inner {
         }
     }
 
-    /// See [`Session::cluster_seq`](crate::checkpoint::format::Session::cluster_seq).
+    /// See [`Session::cluster_seq`](rescue_core::checkpoint::format::Session::cluster_seq).
     pub(super) fn cluster_seq(&self) -> u64 {
         let last = self.shared.last();
         last.map_or(self.session.cluster_seq, |last| last.seq)

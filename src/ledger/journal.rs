@@ -8,15 +8,11 @@ use std::{
     time::Duration,
 };
 
+use checkpoint_store::Store;
+use rescue_core::checkpoint::format::{Checkpoint, RecordContent};
 use tokio::sync::{oneshot, watch};
 
-use crate::{
-    checkpoint::{
-        format::{Checkpoint, RecordContent},
-        store::Store,
-    },
-    cli::SyncPolicy,
-};
+use crate::cli::SyncPolicy;
 
 /// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and several can queue
 /// up. The limit exists because a robot stops if calls are not answered.

@@ -1,9 +1,11 @@
 //! The writes that a late master has missed because the mirror answered them.
 
-use crate::{
-    master::{Master, NoticeSink, Request},
+use rescue_core::{
     order::{BySubject, Subject},
     replay::Token,
+};
+use ros1_master::{
+    master::{Master, NoticeSink, Request},
     xmlrpc::Value,
 };
 

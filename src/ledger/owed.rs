@@ -2,8 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use rescue_core::{health::port_of, order::Subject};
+use ros1_master::master::Displaced;
+
 use super::{Ledger, activity::Owed};
-use crate::{health::port_of, ledger::mutant::Mutant, master::Displaced, order::Subject};
+use crate::ledger::mutant::Mutant;
 
 /// How long a master that lives may still send old notifications after it has answered again, if nothing is known of its
 /// backlog.

@@ -1,6 +1,6 @@
 //! Writes that the mirror has answered and that the present master may not have run.
 
-use crate::{master::Request, xmlrpc::Value};
+use ros1_master::{master::Request, xmlrpc::Value};
 
 /// Maximum number of pending writes.
 const COUNT_MAX: usize = 10_000;
@@ -73,7 +73,7 @@ impl PendingWrites {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Method;
+    use ros1_master::master::Method;
 
     #[test]
     fn a_write_that_a_checkpoint_has_too_outlives_it() {

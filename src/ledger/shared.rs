@@ -3,9 +3,8 @@
 
 use std::time::Instant;
 
+use rescue_core::cluster::sharing::Sharing;
 use tokio::sync::watch;
-
-use crate::cluster::sharing::Sharing;
 
 /// Which computer's writes the ledger holds.
 #[derive(Debug)]
@@ -130,13 +129,17 @@ mod tests {
 
     use super::*;
     use crate::{
-        checkpoint::format::{Origin, Record, RecordContent, Session},
         cli::SyncPolicy,
+        ledger::{Ledger, Mark},
+    };
+    use rescue_core::{
+        checkpoint::format::{Origin, Record, RecordContent, Session},
         cluster::{
             merge::Verdict,
             sharing::{Change, Source},
         },
-        ledger::{Ledger, Mark},
+    };
+    use ros1_master::{
         master::{Master, Method, Request},
         xmlrpc::{Reply, Value},
     };

@@ -2,9 +2,9 @@
 
 use std::collections::HashSet;
 
-use crate::{
+use rescue_core::replay::Answered;
+use ros1_master::{
     master::Method,
-    replay::Answered,
     xmlrpc::{Reply, Value},
 };
 

@@ -1,13 +1,12 @@
 use std::{sync::Arc, time::Duration};
 
+use checkpoint_store::StoreError;
+use rescue_core::{checkpoint::format, order::NextNotification};
+use ros1_master::xmlrpc::{Call, Value};
+
 use super::activity::NOTICE_MEMORY;
 use super::answers::UNCHANGED_PENDING_MAX;
 use super::*;
-use crate::{
-    checkpoint::{format, store::StoreError},
-    order::NextNotification,
-    xmlrpc::{Call, Value},
-};
 
 fn ledger() -> Arc<Ledger> {
     let stats = Box::leak(Box::default());
@@ -486,7 +485,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     let encoded = format::encode_checkpoint(&checkpoint, 1).unwrap();
     let read = format::decode(&encoded.bytes).unwrap().checkpoint.unwrap();
     assert_eq!(read, checkpoint);
-    let rebuilt = crate::checkpoint::session::rebuild(Some(read), Vec::new());
+    let rebuilt = rescue_core::checkpoint::session::rebuild(Some(read), Vec::new());
     let apis: Vec<_> = rebuilt.displaced.iter().map(|it| &*it.api).collect();
     assert_eq!(apis, ["http://n:1/"]);
     // The displaced nodes are also in the next start's snapshot, until the master is examined.
@@ -522,10 +521,10 @@ impl Recorded {
     async fn found(&self) -> (Master, usize) {
         // Runs after all records.
         self.ledger.on_store(|_| ()).await.unwrap();
-        let loaded = crate::checkpoint::store::read(&self.folder.path().join("c"));
+        let loaded = checkpoint_store::read(&self.folder.path().join("c"));
         let loaded = loaded.unwrap().unwrap();
         let count = loaded.records.len();
-        let rebuilt = crate::checkpoint::session::rebuild(loaded.checkpoint, loaded.records);
+        let rebuilt = rescue_core::checkpoint::session::rebuild(loaded.checkpoint, loaded.records);
         (rebuilt.mirror, count)
     }
 

@@ -6,22 +6,24 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rescue_core::{
+    health::port_of,
+    lifecycle::{Input, Probing, Supervision},
+    replay::{
+        self, Authority, Bears, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
+        withheld_run_id,
+    },
+};
+use ros1_master::master::{self, Counts, Effect, Master, Request, Write};
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
 use crate::{
     gate::{State, Tx},
-    health::port_of,
     ledger::{Basis, Ledger, late::CatchUp},
-    lifecycle::{Input, Probing, Supervision},
     limit::rarely,
-    master::{self, Counts, Effect, Master, Request, Write},
     nodes::client::{self, Reaction},
     process::{self, listeners},
-    replay::{
-        self, Authority, Bears, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
-        withheld_run_id,
-    },
     status::{report::RecoveryOutcome, software, stats::Stats},
     upstream::{
         CallError, ConnectError, Connection, RawReply, Upstream,

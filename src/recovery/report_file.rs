@@ -9,12 +9,12 @@ use std::{
     time::Instant,
 };
 
+use checkpoint_store::regular_file;
 use serde::{Deserialize, Serialize};
 
 use crate::{
     clock,
     limit::Limit,
-    regular_file,
     status::{Board, Earlier, report::Report},
 };
 

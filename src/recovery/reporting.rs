@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use rescue_core::lifecycle::Cause;
 use tracing::Instrument;
 
 use super::{
@@ -10,7 +11,6 @@ use super::{
     master_process::MasterProcess,
     report_file::{self, ReportRecord},
 };
-use crate::lifecycle::Cause;
 use crate::{
     clock,
     limit::all_clear,

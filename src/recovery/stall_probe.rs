@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use ros1_master::master;
+
 use super::examine::Examiner;
-use crate::master;
 
 impl Examiner {
     /// Probes the master over separate connections until enough probes in a row are unanswered for it to count as hung.

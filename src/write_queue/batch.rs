@@ -3,17 +3,21 @@
 use std::{collections::VecDeque, sync::Arc, time::Instant};
 
 use bytes::Bytes;
+use rescue_core::{
+    checkpoint::format::Origin,
+    cluster::sharing::Source,
+    order::{BySubject, Concern, Order},
+};
+use ros1_master::{
+    master::{Entry, Kind, Method, Request, entry_reply},
+    xmlrpc::{self, Reply, Value},
+};
 use tokio::sync::oneshot;
 
 use super::merge::Merge;
 use crate::{
-    checkpoint::format::Origin,
-    cluster::sharing::Source,
     ledger::{activity::LastCalls, delivery::Delivery},
-    master::{Entry, Kind, Method, Request, entry_reply},
-    order::{BySubject, Concern, Order},
     upstream::{Head, RawReply},
-    xmlrpc::{self, Reply, Value},
 };
 
 /// Maximum number of calls in a batch. In a compact multicall the master needs some 40 µs per call, so a call waits a

@@ -7,12 +7,11 @@
 
 use std::sync::Arc;
 
+use rescue_core::health::Eviction;
+use ros1_master::master::{Master, Request};
+
 use super::batch::{Evicted, Item};
-use crate::{
-    health::Eviction,
-    ledger::Ledger,
-    master::{Master, Request},
-};
+use crate::ledger::Ledger;
 
 /// Judges calls that could make the master shut down an innocent node. By default, it objects to none.
 pub(crate) trait MoveJudge: Send + Sync {

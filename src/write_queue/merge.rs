@@ -3,10 +3,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use tokio::sync::oneshot;
-
-use super::batch::{self, AnswerAndDelivery, Item};
-use crate::{
+use rescue_core::{
     checkpoint::format::Origin,
     cluster::{
         merge::{
@@ -15,11 +12,15 @@ use crate::{
         },
         sharing::Source,
     },
-    ledger::Ledger,
+};
+use ros1_master::{
     master::Request,
-    upstream::Head,
     xmlrpc::{self, Reply, Value},
 };
+use tokio::sync::oneshot;
+
+use super::batch::{self, AnswerAndDelivery, Item};
+use crate::{ledger::Ledger, upstream::Head};
 
 /// Whether each write of an item conflicts with changes by other computers, as decided last.
 #[derive(Clone, Debug, Default)]

@@ -1,10 +1,9 @@
 //! Recognises calls by rosrescue that became wrong while they were queued.
 
+use ros1_master::master::Master;
+
 use super::batch::Item;
-use crate::{
-    ledger::{Ledger, activity::Activity},
-    master::Master,
-};
+use crate::ledger::{Ledger, activity::Activity};
 
 /// Whether a call made by rosrescue is no longer right. It is outdated if its
 /// [precondition](super::batch::Precondition) no longer holds, or if it would shut a node down that has registered at

@@ -3,11 +3,12 @@
 
 use std::{iter::Peekable, vec};
 
-use super::batch::{BYTES_MAX, CALLS_MAX};
-use crate::{
+use ros1_master::{
     master::{Entry, Kind, Method, Request},
     xmlrpc::Value,
 };
+
+use super::batch::{BYTES_MAX, CALLS_MAX};
 
 /// Maximum number of entries of a multicall that is sent whole, as the client's own bytes.
 const ENTRIES_WHOLE: usize = 2 * CALLS_MAX;
@@ -65,7 +66,7 @@ fn weight(entry: &Entry) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Malformed;
+    use ros1_master::master::Malformed;
 
     /// The multicall with a malformed entry added at its end.
     fn malformed(call: Request) -> Request {

@@ -1,23 +1,21 @@
 //! One request of the write queue to the master, and its reply.
 
 use bytes::Bytes;
+use rescue_core::replay::Token;
+use ros1_master::master::Master;
 use thiserror::Error;
 
 use super::Link;
-use crate::{
-    master::Master,
-    replay::Token,
-    upstream::{
-        CallError, Head, RawReply, VerifyError,
-        inspect::{self, InspectError},
-        next::NextConnection,
-        verify::{self, Verified},
-    },
+use crate::upstream::{
+    CallError, Head, RawReply, VerifyError,
+    inspect::{self, InspectError},
+    next::NextConnection,
+    verify::{self, Verified},
 };
 
 /// The result of a round trip.
 pub(super) struct RoundTripResult {
-    /// The next connection, if there is one already, with the number in the [token](crate::replay::Token) of its
+    /// The next connection, if there is one already, with the number in the [token](rescue_core::replay::Token) of its
     /// master.
     pub(super) connection: Option<(u64, NextConnection)>,
     pub(super) result: Result<Received, RoundTripError>,

@@ -1,5 +1,6 @@
+use ros1_master::master::Method;
+
 use super::*;
-use crate::master::Method;
 
 fn call(method: &str, params: &[&str]) -> Request {
     Request::new(Method::named(method), params.iter().copied())

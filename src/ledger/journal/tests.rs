@@ -1,8 +1,9 @@
-use super::*;
-use crate::{
+use ros1_master::{
     master::{Master, Method, Request, Snapshot},
     xmlrpc::Value,
 };
+
+use super::*;
 
 struct Disk {
     folder: tempfile::TempDir,
@@ -33,7 +34,7 @@ impl Disk {
         drop(journal);
         let path = self.folder.path().join("c");
         let loaded = Store::open(&path).unwrap().1.unwrap();
-        crate::checkpoint::session::rebuild(loaded.checkpoint, loaded.records)
+        rescue_core::checkpoint::session::rebuild(loaded.checkpoint, loaded.records)
             .mirror
             .snapshot()
     }

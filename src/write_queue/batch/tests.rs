@@ -1,7 +1,8 @@
+use rescue_core::checkpoint::format::Session;
+use ros1_master::{master::Master, xmlrpc::Struct};
+
 use super::*;
-use crate::{
-    checkpoint::format::Session, cli::SyncPolicy, ledger::Ledger, master::Master, xmlrpc::Struct,
-};
+use crate::{cli::SyncPolicy, ledger::Ledger};
 
 fn item(call: Request) -> Item {
     let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));

@@ -1,28 +1,31 @@
 //! The real queue, with a master that runs a call and dies.
 
 use bytes::Bytes;
+use rescue_core::{
+    checkpoint::format::Session,
+    health::port_of,
+    lifecycle::Patience,
+    order::{NextNotification as Notification, REPEAT_AFTER, Subject},
+};
+use ros1_master::{
+    master::{Master, Method, Request},
+    xmlrpc::{Reply, Value, encode_reply},
+};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 
 use super::*;
 use crate::{
-    checkpoint::format::Session,
     cli::SyncPolicy,
     gate::{State, gate},
-    health::port_of,
     ledger::Ledger,
-    lifecycle::Patience,
-    master::{Master, Method, Request},
-    order::{NextNotification as Notification, REPEAT_AFTER, Subject},
-    upstream::sentinel::Sentinel,
-    upstream::{Head, test_master, verify::Verification},
+    upstream::{Head, sentinel::Sentinel, test_master, verify::Verification},
     write_queue::{
         WriteQueue,
         batch::{AnswerAndDelivery, CallAnswer},
         write_queue,
     },
-    xmlrpc::{Reply, Value, encode_reply},
 };
 
 const SUBSCRIBER: &str = "http://a:1/";

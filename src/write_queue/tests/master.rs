@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use ros1_master::master::Notice;
+
 use super::*;
-use crate::master::Notice;
 
 /// A process of the master.
 pub(super) struct Process {

@@ -2,13 +2,14 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::{PARAMS, TOPICS, text};
-use crate::{
-    dice::Dice,
-    health::port_of,
+use rescue_core::health::port_of;
+use ros1_master::{
     master::{Master, Method, Request},
     xmlrpc::{Call, Reply, Struct, Value},
 };
+
+use super::{PARAMS, TOPICS, text};
+use crate::dice::Dice;
 
 /// When each parameter was first and last set to each value.
 pub(super) type Values = HashMap<(String, Option<i32>), (u64, u64)>;

@@ -1,11 +1,12 @@
 //! Carries out what the lifecycle of production decides, as `recovery::Driver` and `recovery::examine` do.
 
-use super::*;
-use crate::{
-    ledger::{Basis, late::CatchUp, owed::Telling},
+use rescue_core::{
     lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision},
     replay::{self, Bears, KnownMaster, Treatment},
 };
+
+use super::*;
+use crate::ledger::{Basis, late::CatchUp, owed::Telling};
 
 /// How long a probe may take, in microseconds.
 const PROBE_TIMEOUT: u64 = 200_000;
