@@ -10,12 +10,6 @@ pub(crate) enum Mutant {
     /// No state is told again.
     #[cfg(test)]
     NoRepeats,
-    /// A batch whose answer was lost is sent again before it is known whether its master lives.
-    SendsAfterLoss,
-    /// A request of a master that went away may still run while that master is examined.
-    KeepsConnection,
-    /// It is forgotten about what a late master notifies nodes once it goes on.
-    ForgetsLateNews,
     /// A living master that was silent is not expected to send old notifications.
     TellsOnce,
     /// What a lost master may not have told nodes is forgotten.

@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     gate::State,
-    ledger::{Ledger, Mark, delivery::Delivery, mutant::Mutant},
+    ledger::{Ledger, Mark, delivery::Delivery},
     lifecycle::Patience,
     limit::rarely,
     master::{Effect, Master, Request, Write},
@@ -559,10 +559,7 @@ impl Dispatcher {
         if failure == Failure::MayHaveRun {
             self.ledger.abandon_batch();
             // Whether the master ran the batch is known only when the master is back. Until then the mirror answers.
-            self.exchange = match Mutant::SendsAfterLoss.lives() {
-                true => Exchange::default(),
-                false => Exchange::Lost,
-            };
+            self.exchange = Exchange::Lost;
             self.actions.push(Action::Report(Report::Lost));
         } else {
             let not_before = Some(now + RETRY_PAUSE);
@@ -745,9 +742,7 @@ impl Dispatcher {
         }
         // A master that comes back is examined only when this connection has ended, because only then can no call of
         // this connection still be running.
-        if !Mutant::KeepsConnection.lives() {
-            self.actions.push(Action::Disconnect);
-        }
+        self.actions.push(Action::Disconnect);
         let answerable = |(item, _): &mut (Item, CallAnswer)| item.is_answerable();
         let opaque = self.opaque.answers.extract_if(.., answerable);
         let opaque = opaque.map(|(item, _)| item).collect();
@@ -787,9 +782,7 @@ impl Dispatcher {
         let mut tells = Vec::new();
         for mut item in items {
             item.delivery = None;
-            if !Mutant::ForgetsLateNews.lives() {
-                tells.extend_from_slice(item.concern().tells());
-            }
+            tells.extend_from_slice(item.concern().tells());
             if let Some(item) = answers.add(&self.ledger, now, item) {
                 self.queue.push_front(item);
             }
