@@ -59,9 +59,4 @@ pub(crate) mod upstream;
 pub(crate) mod wait;
 pub(crate) mod write_queue;
 
-// Two files of the write queue still import these from here.
-#[cfg(test)]
-use rescue_core::{checkpoint, health};
-use rescue_core::{lifecycle, order};
-use ros1_master::{master, xmlrpc};
 pub use server::listener;

@@ -18,16 +18,18 @@ use super::{
     resync::ResyncSchedule,
     round_trip::{Failure, Received},
 };
+use rescue_core::{lifecycle::Patience, order::Order};
+use ros1_master::{
+    master::{Effect, Master, Request, Write},
+    xmlrpc::{self, Reply},
+};
+
 use crate::{
     gate::State,
     ledger::{Ledger, Mark, delivery::Delivery},
-    lifecycle::Patience,
     limit::rarely,
-    master::{Effect, Master, Request, Write},
-    order::Order,
     status::stats::Stats,
     upstream::{Head, RawReply},
-    xmlrpc::{self, Reply},
 };
 
 /// Pause before an unsent batch is retried while calls still pass to the master.

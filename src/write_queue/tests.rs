@@ -30,20 +30,25 @@ use super::{
     dispatcher::{Action, Dispatcher, Input, Report, View},
     round_trip::{Failure, Received},
 };
-use crate::{
+use rescue_core::{
     checkpoint::format::Session,
+    health::port_of,
+    lifecycle::{self, Patience, Supervision},
+    order::NextNotification,
+};
+use ros1_master::{
+    master::{Kind, Master, Method, Request},
+    xmlrpc::{self, Call, Reply, Value},
+};
+
+use crate::{
     cli::SyncPolicy,
     clock,
     dice::Dice,
     gate::State,
-    health::port_of,
     ledger::{Ledger, delivery::Delivery, mutant::Mutant},
-    lifecycle::{self, Patience, Supervision},
-    master::{Kind, Master, Request},
-    order::NextNotification,
     status::stats::Stats,
     upstream::{Head, RawReply},
-    xmlrpc::{self, Call, Reply, Value},
 };
 
 const NODES: u64 = 4;
@@ -632,7 +637,7 @@ impl World {
                 .iter()
                 .filter(|done| done.call.text(1) == Some(&key));
             let sets: Vec<_> = sets
-                .filter(|done| *done.call.method() == crate::master::Method::SetParam)
+                .filter(|done| *done.call.method() == Method::SetParam)
                 .collect();
             let value = mirror.param_update(&format!("{key}/"));
             let value = value.and_then(|update| update.params.get(2).cloned());
