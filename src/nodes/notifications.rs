@@ -10,7 +10,7 @@ use std::{
 };
 
 use rescue_core::{
-    health::{Claims, port_of},
+    health::{self, port_of},
     order::{NextNotification, Order, Subject},
 };
 use ros1_master::master::{self, Displaced, Master};
@@ -208,7 +208,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                 Reaction::Alive => {}
             }
             let Displaced { node, api, .. } = &displaced;
-            if is_itself(&displaced, interview.pid, interview.claims.as_ref())
+            if health::is_displaced_node(&displaced, interview.pid, interview.claims.as_ref())
                 && !is_taken(&nodes, api)
             {
                 rarely!(
@@ -249,12 +249,4 @@ fn is_taken(nodes: &Nodes, api: &str) -> bool {
     nodes
         .ledger
         .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
-}
-
-/// Whether the node that answers is the displaced one. False if neither its process id nor its topics tell.
-fn is_itself(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
-    match (displaced.pid, pid) {
-        (Some(known), Some(pid)) => known == pid,
-        _ => claims.is_some_and(|claims| claims.shares(&displaced.topics)),
-    }
 }

@@ -31,7 +31,7 @@ pub use unreachable::Unreachable;
 use std::collections::BTreeMap;
 
 use crate::{
-    master::{self, Master, Method, Request},
+    master::{self, Displaced, Master, Method, Request},
     xmlrpc::Value,
 };
 
@@ -221,6 +221,23 @@ pub fn judge_refusal<C: PartialEq>(may_unregister: bool, before: Option<&C>, cal
         _ if !may_unregister => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
+    }
+}
+
+/// Whether the process that answers at the address of a displaced node is that node. It answers with the process id
+/// `pid` and reports `claims`.
+///
+/// False if neither its process id nor its topics tell. Its topics count for more than an equal process id: a node may
+/// have died, and another process have got its port, before rosrescue asked for the id.
+pub fn is_displaced_node(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
+    let shares = claims.is_some_and(|claims| claims.shares(&displaced.topics));
+    let has_topics = displaced
+        .topics
+        .iter()
+        .any(|topic| !COMMON.contains(&topic.as_str()));
+    match (displaced.pid, pid) {
+        (Some(known), Some(pid)) => known == pid && (claims.is_none() || !has_topics || shares),
+        _ => shares,
     }
 }
 

@@ -250,3 +250,32 @@ fn a_node_is_dead_if_its_port_refuses_twice_with_no_call_in_between() {
     assert_eq!(refused(true, Some(8), 8), Refusal::Dead);
     assert_eq!(refused(false, Some(8), 8), Refusal::Keep);
 }
+
+/// A node died, and another process got its port before rosrescue asked for the process id of the node.
+#[test]
+fn a_process_with_other_topics_is_not_the_displaced_node_whatever_its_process_id() {
+    let displaced = |pid, topics: &[&str]| Displaced {
+        node: "/a".to_owned(),
+        api: "http://n:1/".to_owned(),
+        pid,
+        topics: topics.iter().map(|&topic| topic.to_owned()).collect(),
+        from: None,
+    };
+    let (own, other) = (claims(&["/ta"], &[]), claims(&["/tb"], &["/rosout"]));
+    for (known, topics, pid, claims, is_it) in [
+        (Some(1), &["/ta"][..], Some(1), Some(&own), true),
+        (Some(1), &["/ta"], Some(1), Some(&other), false),
+        (Some(1), &["/ta"], Some(2), Some(&own), false),
+        (Some(1), &["/ta"], Some(1), None, true),
+        // Such topics do not tell nodes apart.
+        (Some(1), &["/rosout"], Some(1), Some(&other), true),
+        (Some(1), &[], Some(1), Some(&other), true),
+        (None, &["/ta"], Some(1), Some(&own), true),
+        (None, &["/ta"], Some(1), Some(&other), false),
+        (None, &["/ta"], Some(1), None, false),
+    ] {
+        let displaced = displaced(known, topics);
+        let found = is_displaced_node(&displaced, pid, claims);
+        assert_eq!(found, is_it, "{displaced:?} {pid:?} {claims:?}");
+    }
+}
