@@ -43,7 +43,6 @@ use ros1_master::{
 
 use crate::{
     cli::SyncPolicy,
-    clock,
     dice::Dice,
     gate::State,
     ledger::{Ledger, delivery::Delivery, mutant::Mutant},
@@ -667,7 +666,8 @@ fn mistake(mutant: Option<Mutant>, from: u64, schedules: u64) -> Option<(u64, Ve
 #[test]
 fn every_promise_holds_in_every_schedule() {
     let number = |name| std::env::var(name).ok().and_then(|text| text.parse().ok());
-    let seed = number("ROSRESCUE_SEED").unwrap_or_else(|| (clock::wall_time() * 1e6) as u64);
+    // The same schedules in each run, so that a failure comes from a change.
+    let seed = number("ROSRESCUE_SEED").unwrap_or(0);
     let schedules = number("ROSRESCUE_SCHEDULES").unwrap_or(500);
     println!("seeds from {seed} on, {schedules} schedules");
     let found = mistake(None, seed, schedules);
