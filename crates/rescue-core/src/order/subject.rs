@@ -30,7 +30,7 @@ impl Subject {
 }
 
 /// A [`Subject`] about which the node at a port is told, by an answer or a notification.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Heard {
     /// The node's port; see [`port_of`].
     pub port: String,

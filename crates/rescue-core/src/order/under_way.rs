@@ -15,6 +15,9 @@ pub(super) struct UnderWay {
     by_subject: BySubject<u64>,
     /// Written answers, oldest first.
     written: VecDeque<(Instant, u64)>,
+    /// The last written answer about each subject to each port. Earlier ones no longer count, so a node that makes many
+    /// calls does not make each of them slower.
+    newest: HashMap<Heard, u64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,8 +63,11 @@ impl UnderWay {
         limit: Option<Instant>,
     ) -> u64 {
         self.last += 1;
-        for heard in &heard {
-            self.by_subject.add(&heard.subject, self.last);
+        for (index, one) in heard.iter().enumerate() {
+            let mut before = heard.iter().take(index);
+            if !before.any(|other| other.subject == one.subject) {
+                self.by_subject.add(&one.subject, self.last);
+            }
         }
         let entry = Entry {
             kind,
@@ -81,9 +87,32 @@ impl UnderWay {
 
     /// Notes that the answer has been written to its caller.
     pub(super) fn written(&mut self, now: Instant, number: u64) {
-        if let Some(entry) = self.entries.get_mut(&number) {
-            entry.written = Some(now);
-            self.written.push_back((now, number));
+        let Some(entry) = self.entries.get_mut(&number) else {
+            return;
+        };
+        entry.written = Some(now);
+        self.written.push_back((now, number));
+        for heard in entry.heard.clone() {
+            if let Some(before) = self.newest.insert(heard.clone(), number)
+                && before != number
+            {
+                self.leave_out(before, &heard);
+            }
+        }
+    }
+
+    /// Removes one of the things that an answer is about.
+    fn leave_out(&mut self, number: u64, heard: &Heard) {
+        let Some(entry) = self.entries.get_mut(&number) else {
+            return;
+        };
+        entry.heard.retain(|other| other != heard);
+        let mut others = entry.heard.iter();
+        if !others.any(|other| other.subject == heard.subject) {
+            self.by_subject.remove(&heard.subject, number);
+        }
+        if entry.heard.is_empty() {
+            self.entries.remove(&number);
         }
     }
 
@@ -96,6 +125,9 @@ impl UnderWay {
             .flat_map(|entry| entry.heard)
         {
             self.by_subject.remove(&heard.subject, number);
+            if self.newest.get(&heard) == Some(&number) {
+                self.newest.remove(&heard);
+            }
         }
     }
 
@@ -158,11 +190,53 @@ impl UnderWay {
         &'a self,
         subject: &'a Subject,
     ) -> impl Iterator<Item = (u64, &'a Entry, &'a Heard)> {
-        self.by_subject.about(subject).filter_map(move |number| {
-            let entry = self.entries.get(&number)?;
-            let mut heard = entry.heard.iter();
-            let heard = heard.find(|heard| heard.subject.concerns(subject))?;
-            Some((number, entry, heard))
+        let entries = self.by_subject.about(subject);
+        let entries = entries.filter_map(|number| Some((number, self.entries.get(&number)?)));
+        entries.flat_map(move |(number, entry)| {
+            let heard = entry.heard.iter();
+            let heard = heard.filter(|heard| heard.subject.concerns(subject));
+            heard.map(move |heard| (number, entry, heard))
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn heard(port: &str, topic: &str) -> Heard {
+        Heard {
+            port: port.to_owned(),
+            subject: Subject::Topic(topic.to_owned()),
+        }
+    }
+
+    /// The test's answers go to two ports and are about two topics.
+    #[test]
+    fn only_the_last_written_answer_to_a_port_about_a_subject_is_remembered() {
+        let (mut under_way, start) = (UnderWay::default(), Instant::now());
+        let both = vec![heard("a", "/t"), heard("b", "/t"), heard("a", "/u")];
+        let first = under_way.add(DeliveryKind::Answer, both, None);
+        let second = under_way.add(DeliveryKind::Answer, vec![heard("a", "/t")], None);
+        let later = start + Duration::from_millis(1);
+        under_way.written(start, first);
+        under_way.written(later, second);
+        let topic = Subject::Topic("/t".to_owned());
+        let mut about = under_way.about(later, &topic);
+        about.sort();
+        assert_eq!(about, [(first, "b".to_owned()), (second, "a".to_owned())]);
+        let to = |port| under_way.answer_to(later, port, &topic);
+        assert_eq!(to("a"), Some(Answer::Written { at: later }));
+        assert_eq!(to("b"), Some(Answer::Written { at: start }));
+        for _ in 0..1_000 {
+            let next = under_way.add(DeliveryKind::Answer, vec![heard("a", "/u")], None);
+            under_way.written(later, next);
+        }
+        assert_eq!(under_way.entries.len(), 3);
+        under_way.forget(later + RECENT);
+        assert!(under_way.entries.is_empty() && under_way.newest.is_empty());
+        assert!(under_way.by_subject.is_empty());
     }
 }
