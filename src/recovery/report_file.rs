@@ -67,20 +67,25 @@ fn write(checkpoint: &Path, kept: &ReportRecord) -> io::Result<()> {
     let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(());
     };
+    let checkpoint_name = checkpoint.file_name().unwrap_or_default();
     let report = &kept.report;
     let at = clock::wall_text(report.detected_at).replace(':', "-");
     let path = folder.join(format!("{prefix}{at}-{}.txt", report.number));
+    // The file gets its name when it is whole: a report cut off by a death of rosrescue would count as no rescue.
+    let fresh = folder.join(format!("{}.report.new", checkpoint_name.to_string_lossy()));
+    let _ = fs::remove_file(&fresh);
     let mut file = OpenOptions::new()
         .write(true)
         .create_new(true)
         .mode(0o600)
-        .open(&path)?;
+        .open(&fresh)?;
     let json = serde_json::to_string(kept)?;
     write!(
         file,
         "rosrescue {}\n{report}{json}\n",
         env!("CARGO_PKG_VERSION")
     )?;
+    fs::rename(&fresh, &path)?;
     let mut others = files(checkpoint)?;
     // The new report always stays. If the clock was set back, its name would make it the oldest.
     others.retain(|other| *other != path);
@@ -208,6 +213,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("chkpt.yaml");
         fs::write(&checkpoint, "").unwrap();
+        // An earlier process died while it wrote a report.
+        fs::write(folder.path().join("chkpt.yaml.report.new"), "rosre").unwrap();
         for number in 1..=25 {
             write(&checkpoint, &kept("a", number)).unwrap();
         }
