@@ -152,6 +152,8 @@ struct World {
     time: u64,
     /// When each parameter was first and last set to each value.
     values: node::Values,
+    /// Calls that a client has sent more than once.
+    sent_again: Vec<Request>,
     caught_up: u64,
     /// Whether the connections to a living master broke, or a master was taken for hung. It may go on and notify nodes of
     /// what it knows after the mirror has told them newer news. Nobody can see that, so values may go back before the
@@ -205,6 +207,7 @@ impl World {
             value: 0,
             time: 0,
             values: HashMap::new(),
+            sent_again: Vec::new(),
             caught_up: 0,
             may_go_back: false,
             broken: Vec::new(),
@@ -550,6 +553,7 @@ impl World {
                     (Some(call), _) => self.after(20, Event::Arrives(node, call)),
                     // A client that lost its connection sends the call again.
                     (None, Some(call)) if call.kind() != Kind::Read && self.dice.one_in(8) => {
+                        self.sent_again.push(call.clone());
                         self.after(20, Event::Arrives(node, call));
                     }
                     (None, Some(_)) => self.call(node),

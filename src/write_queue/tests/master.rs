@@ -79,8 +79,9 @@ impl World {
     pub(super) fn run(&mut self, call: &Request) -> Reply {
         self.print(|| format!("the master runs {call:?}"));
         for call in call.calls() {
-            // The mirror has run the other ones already.
-            if self.waiting.iter().any(|waiting| waiting.call == *call) {
+            // The mirror has run the other ones already, unless it has answered a call because it changed nothing.
+            let waits = self.waiting.iter().any(|waiting| waiting.call == *call);
+            if waits || self.sent_again.contains(call) {
                 self.note_value(call);
             }
         }
