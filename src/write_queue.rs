@@ -32,7 +32,7 @@ use self::{
     batch::{CallAnswer, Item, Precondition},
     dispatcher::Dispatcher,
 };
-pub(crate) use self::{drain::Drain, evict::MoveJudge};
+pub(crate) use self::{dispatcher::PATIENCE, drain::Drain, evict::MoveJudge};
 use crate::{gate, ledger::Ledger, status::stats::Stats, upstream::Upstream};
 
 /// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.

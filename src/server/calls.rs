@@ -34,7 +34,7 @@ use crate::{
     status::stats::Stats,
     upstream::{Head, pool::Pool},
     write_queue::{
-        WriteQueue,
+        PATIENCE, WriteQueue,
         batch::{self, AnswerAndDelivery, CallAnswer, Item},
         parts::Parts,
     },
@@ -46,9 +46,6 @@ use crate::{
 #[error("closed without an answer: {0}")]
 pub(crate) struct Closed(pub(super) &'static str);
 
-/// Time after which the mirror answers in place of a master that has not answered. A rosmaster answers within a
-/// millisecond, or within some ten milliseconds if another call keeps its Python interpreter busy.
-pub(super) const PATIENCE: Duration = Duration::from_millis(100);
 /// Values larger than this, in bytes, take more than a millisecond to encode.
 const LARGE: usize = 64 << 10;
 /// Largest encoded answer that is kept for the next call, in bytes.

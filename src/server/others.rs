@@ -35,7 +35,7 @@ use self::control::Control;
 pub(crate) use self::control::HANDOVER;
 pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
 use super::{
-    calls::{Calls, Closed, Incoming, NOT_IN_TIME, PATIENCE, Unanswered},
+    calls::{Calls, Closed, Incoming, NOT_IN_TIME, Unanswered},
     hold::Hold,
     listener,
     replies::{HttpReply, UntilWritten, forwarded, no_such_page, text, xml},
@@ -47,6 +47,7 @@ use crate::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
     },
+    write_queue::PATIENCE,
 };
 
 /// Pause before a call is sent to the same leader again.

@@ -37,9 +37,9 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// How long a batch may continue after calls no longer pass to the master, before the mirror answers it. A killed
 /// master closes its connections within milliseconds. A master that only closed an idle connection still answers.
 const GRACE: Duration = Duration::from_millis(5);
-/// How long a write that changes nothing waits again if no calls pass to the master when its patience ends: the gate may
-/// open later, and the master behind it may hang.
-const PATIENCE: Duration = Duration::from_millis(100);
+/// Time after which the mirror answers in place of a master that has not answered. A rosmaster answers within a
+/// millisecond, or within some ten milliseconds if another call keeps its Python interpreter busy.
+pub(crate) const PATIENCE: Duration = Duration::from_millis(100);
 
 /// What the dispatcher must know of the rest of rosrescue.
 #[derive(Clone, Copy, Debug)]
@@ -334,6 +334,7 @@ impl Dispatcher {
                 continue;
             }
             if !view.gate.is_open() {
+                // The gate may open later, and the master behind it may hang.
                 item.patience = Some(view.now + PATIENCE);
                 continue;
             }
