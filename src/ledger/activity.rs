@@ -130,9 +130,9 @@ pub(super) struct Noticed {
     params: IndexSet<(String, Arc<str>)>,
     /// Whether the mirror answers in a master's place, so that rosrescue sends the notifications.
     standing_in: bool,
-    /// Whether the master is only late. Then notifications may have to wait for its own, and may not be sent before the
-    /// master dies.
-    pub(super) late: bool,
+    /// Whether a master that lives may send these notifications itself. Then rosrescue's own wait for them, and may not
+    /// be sent before that master dies.
+    pub(super) left_to_master: bool,
     /// The notifications to send while the mirror answers in a master's place.
     calls: Vec<Unsent>,
     pub(super) displaced: Vec<Displaced>,
@@ -213,7 +213,7 @@ impl Activity {
         let notifying = self.notifying && !standing_in;
         let noted = Noted {
             at: now,
-            told: standing_in && !noticed.late,
+            told: standing_in && !noticed.left_to_master,
         };
         let outbox = &mut self.outbox;
         let before = outbox.len();

@@ -100,7 +100,7 @@ impl Inner {
         outbox_changed: &Notify,
     ) -> Reply {
         let mut noticed = Noticed::new(standing_in.is_some());
-        noticed.late = self.order.is_late();
+        noticed.left_to_master = self.order.is_left_to_master();
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
         self.activity.note_lost(&self.mirror, call);
         let reply = self.mirror.apply_telling(call, &mut noticed);

@@ -1,11 +1,15 @@
 use std::{sync::Arc, time::Duration};
 
 use checkpoint_store::StoreError;
-use rescue_core::{checkpoint::format, order::NextNotification};
+use rescue_core::{
+    checkpoint::format,
+    order::{Concern, NextNotification},
+};
 use ros1_master::xmlrpc::{Call, Value};
 
 use super::activity::NOTICE_MEMORY;
 use super::answers::UNCHANGED_PENDING_MAX;
+use super::owed::Telling;
 use super::*;
 
 fn ledger() -> Arc<Ledger> {
@@ -253,6 +257,26 @@ fn a_write_that_changes_nothing_tells_nodes_nothing_before_the_master_has() {
 }
 
 /// Loggers repeat parameter subscriptions all the time, so these use no memory and do not outdate a prepared injection.
+/// Otherwise nobody tells the subscribers if that master dies before it does.
+#[test]
+fn what_is_left_to_a_late_master_is_owed_until_the_next_one_serves() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let subscriber = ["/s", "/t", "std_msgs/String", "http://s:1/"];
+    ledger.stand_in(now, &call("registerSubscriber", &subscriber));
+    ledger.delivered();
+    let publish = publish("/t");
+    let concern = Concern::of(Some(&publish));
+    ledger.with_order(|order, _| order.sent(concern.tells(), Vec::new()));
+    // The master is late with the call, so the mirror answers it. Then the master answers, and dies.
+    ledger.stand_in(now, &publish);
+    ledger.fall_behind(now, concern.tells().to_vec());
+    ledger.late_answered(now);
+    ledger.abandon_batch();
+    let queued = ledger.queue_owed(now, now, Telling::Now);
+    assert_eq!(queued.topics, ["/t"]);
+}
+
 #[test]
 fn what_changes_nothing_leaves_no_trace() {
     let ledger = ledger();

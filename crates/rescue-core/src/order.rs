@@ -209,8 +209,15 @@ impl Order {
         (self.is_late, self.told.stopped) = (false, None);
     }
 
+    /// Whether the master, and not rosrescue, may notify nodes of what the mirror answers now: it is late, or is still
+    /// being examined since it was, or it has not answered its calls. It may die before it sends these notifications.
+    pub fn is_left_to_master(&self) -> bool {
+        self.is_late || !self.in_flight.tells.is_empty()
+    }
+
     /// Whether the master is late, or is still being examined since it was.
-    pub fn is_late(&self) -> bool {
+    #[cfg(test)]
+    fn is_late(&self) -> bool {
         self.is_late
     }
 
