@@ -1,6 +1,7 @@
 //! Watches the master and restores it after a failure. Carries out what [`rescue_core::lifecycle`] decides.
 
 pub(crate) mod examine;
+pub(crate) mod live_master;
 pub(crate) mod master_process;
 pub(crate) mod report_file;
 mod reporting;
@@ -23,6 +24,7 @@ use tracing::Instrument;
 
 use self::{
     examine::{Examination, ExamineError, Examiner, Manner, Prepared},
+    live_master::Reach,
     master_process::MasterProcess,
     reporting::{LastMessage, Outage},
 };
@@ -36,7 +38,11 @@ use crate::{
         Board,
         report::{AWAY, RecoveryOutcome, STARTED},
     },
-    upstream::{ConnectError, VerifyError, sentinel::Sentinel, verify},
+    upstream::{
+        ConnectError, VerifyError,
+        sentinel::Sentinel,
+        verify::{self, Verification},
+    },
     wait,
     write_queue::WriteQueue,
 };
@@ -56,9 +62,18 @@ enum Done {
     /// Another program listens at the port of the master that was just started, with its process id
     /// if known.
     PortTaken(Option<u32>),
-    Examined(Arc<Sentinel>, Result<Examination, ExamineError>),
+    Examined(Arc<Sentinel>, Result<Examined, ExamineError>),
     Probed(Result<(), VerifyError>),
     CaughtUp(Arc<Sentinel>, Result<bool, ExamineError>),
+}
+
+/// An examined master.
+struct Examined {
+    examination: Examination,
+    /// HTTP version and Python version of the master, as text.
+    speaks: String,
+    /// How rosrescue makes sure that calls reach this master.
+    verification: Verification,
 }
 
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
@@ -78,6 +93,7 @@ enum News {
 /// lets calls pass to it.
 pub(crate) struct Driver {
     examiner: Examiner,
+    reach: Reach,
     write_queue: WriteQueue,
     nodes: Arc<Nodes>,
     board: Arc<Board>,
@@ -106,9 +122,10 @@ pub(crate) struct Driver {
 }
 
 impl Driver {
-    /// Creates a driver that examines masters with `examiner` and starts them with `process`.
+    /// Creates a driver that reaches masters with `reach`, examines them with `examiner`, and starts them with `process`.
     pub(crate) fn new(
         examiner: Examiner,
+        reach: Reach,
         write_queue: WriteQueue,
         nodes: Arc<Nodes>,
         board: Arc<Board>,
@@ -120,9 +137,10 @@ impl Driver {
             None => Supervision::Theirs,
         };
         Self {
-            lifecycle: Lifecycle::new(supervision, examiner.probing),
+            lifecycle: Lifecycle::new(supervision, reach.probing),
             outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
             examiner,
+            reach,
             write_queue,
             nodes,
             board,
@@ -282,7 +300,7 @@ impl Driver {
                 () = stop.cancelled() => return Input::Stop,
                 () = wait::for_some(self.ended.as_mut()) => {
                     if !self.examiner.gate.state().is_open() {
-                        let master = self.examiner.upstream.address();
+                        let master = self.reach.upstream.address();
                         self.log_waiting(&format!("{master} closes the connection without a reason"), false);
                     }
                     return Input::ConnectionLost;
@@ -320,8 +338,8 @@ impl Driver {
                 // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
-                    .get_or_insert_with(|| examine::prepare(ledger.clone()));
-                let upstream = self.examiner.upstream.clone();
+                    .get_or_insert_with(|| live_master::prepare(ledger.clone()));
+                let upstream = self.reach.upstream.clone();
                 let new = self.process.as_ref().and_then(MasterProcess::new_one);
                 self.step = Some(Box::pin(async move {
                     let sentinel = match upstream.connect_sentinel().await {
@@ -344,25 +362,24 @@ impl Driver {
                     known: examiner.known(new),
                     prepared: self.prepared.take(),
                 };
-                let master = examiner.upstream.address();
+                let reach = self.reach.clone();
+                let master = reach.upstream.address();
                 let span = tracing::debug_span!("recovery", %master, cause = self.outage.cause);
                 let examined = async move {
-                    let examined = examiner.examine(&sentinel, manner);
-                    let examined = sentinel.during(&examiner.upstream, examined).await;
+                    let examined = examine(&examiner, &reach, &sentinel, manner);
+                    let examined = sentinel.during(&reach.upstream, examined).await;
                     Done::Examined(sentinel, examined)
                 };
                 self.step = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
                 // A late probe continues, and its answer counts when it arrives.
-                self.probe_deadline =
-                    Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
+                self.probe_deadline = Some(tokio::time::Instant::now() + self.reach.probe_timeout);
                 if self.step.is_none()
                     && let Some(sentinel) = self.sentinel.clone()
                 {
-                    let Examiner {
-                        upstream, ledger, ..
-                    } = self.examiner.clone();
+                    let (upstream, ledger) =
+                        (self.reach.upstream.clone(), self.examiner.ledger.clone());
                     self.step = Some(Box::pin(async move {
                         Done::Probed(verify::probe(&upstream, &ledger.token(), &sentinel).await)
                     }));
@@ -379,9 +396,13 @@ impl Driver {
             Action::CatchUp => {
                 self.probe_deadline = None;
                 let sentinel = self.sentinel.clone()?;
-                let examiner = self.examiner.clone();
+                let (examiner, reach) = (self.examiner.clone(), self.reach.clone());
                 self.step = Some(Box::pin(async move {
-                    let caught_up = examiner.catch_up().await;
+                    let caught_up = async {
+                        let mut master = reach.to_catch_up(&sentinel).await?;
+                        examiner.catch_up(&mut master).await
+                    };
+                    let caught_up = caught_up.await;
                     Done::CaughtUp(sentinel, caught_up)
                 }));
             }
@@ -465,23 +486,24 @@ impl Driver {
             }
             // The data that was read and written may belong to two different masters.
             Done::Examined(sentinel, Ok(_)) if !sentinel.is_open() => Some(Input::ConnectionLost),
-            Done::Examined(sentinel, Ok(examination)) => {
+            Done::Examined(sentinel, Ok(examined)) => {
+                let Examined {
+                    examination,
+                    speaks,
+                    verification,
+                } = examined;
                 let outcome = examination.outcome;
-                if outcome == RecoveryOutcome::Resumed {
-                    // Another program may have written to the master directly.
-                    self.examiner.ledger.doubt();
-                } else {
+                if outcome != RecoveryOutcome::Resumed {
                     self.thread_ended = thread_of(&sentinel, examination.pid);
                 }
-                let verification = Some(examination.verification.clone());
-                self.examiner.upstream.set_verification(verification);
-                self.report(examination);
+                self.reach.upstream.set_verification(Some(verification));
+                self.report(examination, speaks);
                 Some(Input::Examined {
                     new: outcome.is_new(),
                 })
             }
             Done::Examined(_, Err(error)) => {
-                let master = self.examiner.upstream.address();
+                let master = self.reach.upstream.address();
                 let input = error.as_input();
                 if input == Input::NotAMaster {
                     self.log_once(format!(
@@ -523,7 +545,7 @@ impl Driver {
         if !self.examiner.gate.state().is_open() {
             self.keep_shut();
         }
-        self.examiner.upstream.set_verification(None);
+        self.reach.upstream.set_verification(None);
         self.sentinel = None;
         self.ended = None;
         self.step = None;
@@ -591,11 +613,12 @@ impl Driver {
         if self.examiner.lock_run_id().is_none() {
             return;
         }
-        let (examiner, write_queue) = (self.examiner.clone(), self.write_queue.clone());
+        let (examiner, reach) = (self.examiner.clone(), self.reach.clone());
+        let write_queue = self.write_queue.clone();
         let incarnation = examiner.ledger.incarnation();
         crate::task::spawn(async move {
             let until = Instant::now() + RUN_ID_AFTER;
-            while Instant::now() < until && !examiner.has_run_id().await {
+            while Instant::now() < until && !reach.has_run_id().await {
                 tokio::time::sleep(RUN_ID_PAUSE).await;
             }
             // The next master gets the run id in the same way.
@@ -609,9 +632,7 @@ impl Driver {
 
     async fn spawn(&mut self) -> Option<Input> {
         self.board.update(|facts| facts.starts_master = true);
-        let Examiner {
-            ledger, upstream, ..
-        } = &self.examiner;
+        let (ledger, upstream) = (&self.examiner.ledger, &self.reach.upstream);
         match self.process.as_mut()?.spawn(ledger, upstream).await {
             Ok(()) => Some(Input::Spawned),
             Err(error) => {
@@ -621,6 +642,22 @@ impl Driver {
             }
         }
     }
+}
+
+/// Examines the master that `sentinel` is connected to.
+async fn examine(
+    examiner: &Examiner,
+    reach: &Reach,
+    sentinel: &Arc<Sentinel>,
+    manner: Manner,
+) -> Result<Examined, ExamineError> {
+    let mut master = reach.to_examine(sentinel).await?;
+    let examination = examiner.examine(&mut master, manner).await?;
+    Ok(Examined {
+        speaks: master.speaks(),
+        verification: master.verification(examination.pid).await,
+        examination,
+    })
 }
 
 /// Completes when a thread of the master `pid` ends. `None` if the master runs on another computer. Never completes if

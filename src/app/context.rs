@@ -15,7 +15,7 @@ use crate::{
     ledger::{Ledger, history::Rescues},
     nodes::{Nodes, served::Served},
     process::{ProcessError, Rosmaster},
-    recovery::{Driver, examine::Examiner, master_process::MasterProcess},
+    recovery::{Driver, examine::Examiner, live_master::Reach, master_process::MasterProcess},
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
     upstream::Upstream,
@@ -48,13 +48,16 @@ impl Context {
         Driver::new(
             Examiner {
                 ledger: self.ledger.clone(),
-                upstream: self.upstream.clone(),
                 gate: self.gate_tx.clone(),
+                supervision: self.supervision,
+                run_id: Arc::default(),
+                stats: self.stats,
+            },
+            Reach {
+                upstream: self.upstream.clone(),
                 supervision: self.supervision,
                 probing: self.probing,
                 probe_timeout: self.probe_timeout,
-                run_id: Arc::default(),
-                stats: self.stats,
             },
             self.write_queue.clone(),
             self.nodes.clone(),

@@ -6,7 +6,7 @@ use rescue_core::{health::port_of, order::Subject};
 use ros1_master::master::Displaced;
 
 use super::{Ledger, activity::Owed};
-use crate::ledger::mutant::Mutant;
+use crate::{ledger::mutant::Mutant, status::report::RecoveryOutcome};
 
 /// How long a master that lives may still send old notifications after it has answered again, if nothing is known of its
 /// backlog.
@@ -22,6 +22,24 @@ pub(crate) enum Telling {
     Twice,
     /// After [`BACKLOG`]. A living master is probably sending them.
     Later,
+}
+
+impl Telling {
+    /// When nodes get the notifications that they may lack after a recovery with this outcome. `None` if they lack none,
+    /// because the same master has gone on. `restarted` says whether an earlier rosrescue of this session may still have
+    /// notifications on their way.
+    pub(crate) fn after(outcome: RecoveryOutcome, restarted: bool) -> Option<Self> {
+        match outcome {
+            RecoveryOutcome::Resumed => None,
+            // This master notifies nodes itself, but the previous rosrescue may have died while it stood in for another
+            // master.
+            RecoveryOutcome::Adopted => Some(Self::Later),
+            // The master may send outdated notifications now.
+            RecoveryOutcome::Reconciled => Some(Self::Twice),
+            RecoveryOutcome::Begun | RecoveryOutcome::Injected if restarted => Some(Self::Twice),
+            RecoveryOutcome::Begun | RecoveryOutcome::Injected => Some(Self::Now),
+        }
+    }
 }
 
 /// The notifications that have been queued.
@@ -41,7 +59,12 @@ impl Ledger {
             mut topics,
             params,
             displaced,
-        } = self.with_activity(|_, activity| activity.take_owed(outage));
+        } = self.with_activity(|_, activity| {
+            if telling == Telling::Twice {
+                activity.tell_again();
+            }
+            activity.take_owed(outage)
+        });
         if Mutant::OwesNothing.lives() {
             return Queued::default();
         }

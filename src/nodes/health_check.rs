@@ -18,7 +18,7 @@ use super::{
     client::{self, Interview, Reaction},
     notifications,
 };
-use crate::status::report::{HealthCheck, RecoveryOutcome};
+use crate::status::report::HealthCheck;
 use rescue_core::{
     health::{
         IdentityVerdict, Reach, Reconciliation, Refusal, RegisteredName, Registration, judge_node,
@@ -60,7 +60,7 @@ pub(crate) struct CheckResult {
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
-    outcome: RecoveryOutcome,
+    telling: Telling,
 ) -> Option<HealthCheck> {
     let under_way = Nodes::begin_check(&nodes);
     // Counts as an unanswered question until the nodes are asked.
@@ -72,19 +72,6 @@ pub(crate) async fn after_recovery(
     let incarnation = nodes.ledger.incarnation();
     // Queued calls come first, because they are newer than a node's answers.
     barrier(&nodes).await;
-    let telling = match outcome {
-        // This master notifies nodes itself, but the previous rosrescue may have died while it
-        // stood in for another master.
-        RecoveryOutcome::Adopted => Telling::Later,
-        // The master may send outdated notifications now.
-        RecoveryOutcome::Reconciled | RecoveryOutcome::Resumed => {
-            nodes
-                .ledger
-                .with_activity(|_, activity| activity.tell_again());
-            Telling::Twice
-        }
-        RecoveryOutcome::Begun | RecoveryOutcome::Injected => Telling::Now,
-    };
     let mut notified = super::notify_owed(&nodes, outage, telling);
     notified.sort();
     let visits = begin_visits(&nodes);

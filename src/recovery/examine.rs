@@ -1,20 +1,23 @@
-//! Brings a connected master to the mirror's state, or the mirror to the master's.
+//! Decides how a master gets the mirror's state, or the mirror the master's. Reaches the master only through a
+//! [`Contact`]: in production a connection, in the simulation of the write queue a simulated master.
 
 use std::{
-    net::SocketAddr,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
 use rescue_core::{
     health::port_of,
-    lifecycle::{Input, Probing, Supervision},
+    lifecycle::{Input, Supervision},
     replay::{
         self, Authority, Bears, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
         withheld_run_id,
     },
 };
-use ros1_master::master::{self, Counts, Effect, Master, Request, Write};
+use ros1_master::{
+    master::{Counts, Effect, Master, Request, Write},
+    xmlrpc::{Python, Reply},
+};
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
@@ -22,30 +25,12 @@ use crate::{
     gate::{State, Tx},
     ledger::{Basis, Ledger, late::CatchUp},
     limit::rarely,
-    nodes::client::{self, Reaction},
-    process::{self, listeners},
-    status::{report::RecoveryOutcome, software, stats::Stats},
-    upstream::{
-        CallError, ConnectError, Connection, RawReply, Upstream,
-        inspect::{self, InspectError},
-        sentinel::Sentinel,
-        sockets,
-        verify::Verification,
-    },
+    status::{report::RecoveryOutcome, stats::Stats},
+    upstream::{CallError, ConnectError, RawReply, inspect::InspectError},
 };
 
-/// Time limit for an injection. 1,000 nodes take 0.3 s on a Xeon.
-const INJECTION_LIMIT: Duration = Duration::from_secs(60);
-/// Time limit for each step in which a late master catches up. Writes wait meanwhile.
-const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
-/// Longest time for rosout to show that it lives. Calls wait meanwhile.
-const ROSOUT_LIMIT: Duration = Duration::from_millis(100);
 /// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
-/// Time limit for calls of closed connections to end. A `setParam` of 60,000 keys takes some 10 s.
-const SETTLE_LIMIT: Duration = Duration::from_secs(60);
-/// Pause between two checks whether calls of closed connections have ended. No event reports their end.
-const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a master could not be examined.
 #[derive(Debug, Error)]
@@ -91,10 +76,6 @@ pub(crate) struct Examination {
     pub outcome: RecoveryOutcome,
     /// Process id of the master.
     pub pid: i32,
-    /// HTTP version and Python version of the master, as text.
-    pub speaks: String,
-    /// How rosrescue makes sure that calls reach this master.
-    pub verification: Verification,
     pub counts: Counts,
     /// Parts of the state that the master was not given, with the reasons.
     pub skipped: Vec<String>,
@@ -125,17 +106,61 @@ pub(crate) struct Prepared {
     complete: bool,
 }
 
-/// Prepares the injection into an empty master, in a thread of its own.
-pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
-    crate::task::spawn_blocking(move || {
+impl Prepared {
+    /// Prepares the injection of the mirror's present state into an empty master. Takes long for a large state.
+    pub(super) fn in_advance(ledger: &Ledger) -> Self {
         let (version, target, token) = ledger.next();
         let plan = Plan::new(&target, &Master::default(), &token);
-        Prepared {
+        Self {
             complete: plan.expected() == &target,
             basis: Some((version, token)),
             plan,
         }
-    })
+    }
+}
+
+/// What an examination asks of a master, and of the processes around it. Each request fails if the master does not
+/// answer in time.
+pub(crate) trait Contact: Send {
+    /// Waits until the master runs no more calls of closed connections. Before that, its state can still change.
+    fn settle(&mut self) -> impl Future<Output = Result<(), ExamineError>> + Send;
+
+    /// Makes the first of the two requests that read the master, and compares its token with `token`.
+    fn first_look(
+        &mut self,
+        token: &Token,
+    ) -> impl Future<Output = Result<Inspection, ExamineError>> + Send;
+
+    /// Makes the second request, and returns the master's state. `previous` has what cannot be read.
+    fn second_look(
+        &mut self,
+        first: Inspection,
+        previous: &Master,
+    ) -> impl Future<Output = Result<Master, ExamineError>> + Send;
+
+    /// Makes a call.
+    fn call(&mut self, call: Request) -> impl Future<Output = Result<Reply, ExamineError>> + Send;
+
+    /// Sends the multicall of `plan`.
+    fn inject(
+        &mut self,
+        plan: &Plan,
+    ) -> impl Future<Output = Result<RawReply, ExamineError>> + Send;
+
+    /// Whether no process listens at the local `port` of a node.
+    fn is_dead(&mut self, port: &str) -> impl Future<Output = bool> + Send;
+
+    /// Whether a roscore may have started the master, whose process id is `pid`.
+    fn may_be_of_roscore(&mut self, pid: i32) -> impl Future<Output = bool> + Send;
+
+    /// The version of Python on which the master runs, according to its last answer.
+    fn python(&self) -> Python;
+
+    /// The present time.
+    fn now(&self) -> Instant;
+
+    /// Frees the memory of a plan that is not needed any more, which takes time, without making calls wait.
+    fn discard(&self, plan: Plan);
 }
 
 /// The state that a master must get, and the state that it has now.
@@ -169,13 +194,8 @@ impl Change {
 #[derive(Clone)]
 pub(crate) struct Examiner {
     pub ledger: Arc<Ledger>,
-    pub upstream: Arc<Upstream>,
     pub gate: Tx,
     pub supervision: Supervision,
-    /// How to tell a hung master from a slow one.
-    pub probing: Probing,
-    /// Longest time for the master to answer a probe.
-    pub probe_timeout: Duration,
     /// The call that sets `/run_id` in the present master, if the master gets it later ([`withheld_run_id`]).
     pub run_id: Arc<Mutex<Option<Request>>>,
     pub stats: &'static Stats,
@@ -184,7 +204,7 @@ pub(crate) struct Examiner {
 impl Examiner {
     /// The facts about the present master. `new` is the process id of a master that was just started and has not been
     /// called yet.
-    pub(super) fn known(&self, new: Option<i32>) -> KnownMaster {
+    pub(crate) fn known(&self, new: Option<i32>) -> KnownMaster {
         match (self.ledger.has_served_present(), new) {
             (None, _) => KnownMaster::Nothing,
             (_, Some(pid)) => KnownMaster::New { pid },
@@ -202,63 +222,51 @@ impl Examiner {
         self.lock_run_id().take()
     }
 
-    /// Whether the present master has a run id. False if it does not answer.
-    pub(super) async fn has_run_id(&self) -> bool {
-        let asked = async {
-            let mut connection = self.upstream.connect().await?;
-            let reply = connection.call(&replay::has_run_id().into()).await?;
-            Ok::<_, ExamineError>(reply)
-        };
-        let reply = within(self.probe_timeout, asked).await;
-        reply.is_ok_and(|reply| replay::says_run_id(&reply))
-    }
-
     /// Lets calls pass to the present master.
-    pub(super) fn open_gate(&self) {
+    pub(crate) fn open_gate(&self) {
         let incarnation = self.ledger.serve();
         self.gate.set(State::Open { incarnation });
     }
 
-    /// Examines the master that `sentinel` is connected to. If the sentinel is still open afterwards, the whole result
-    /// concerns that one master.
+    /// Examines the master that `master` reaches, and brings it to the mirror's state, or the mirror to its state.
     pub(crate) async fn examine(
         &self,
-        sentinel: &Arc<Sentinel>,
+        master: &mut impl Contact,
         manner: Manner,
     ) -> Result<Examination, ExamineError> {
-        let start = Instant::now();
-        let connection = &mut self.while_alive(self.upstream.connect()).await?;
+        let start = master.now();
         let served = matches!(manner.known, KnownMaster::ServedIfPresent);
         let resumes =
             |first: &Inspection| served && first.bears() == Bears::Present && self.ledger.resume();
         let is_new = matches!(manner.known, KnownMaster::New { .. });
         let mut first = match manner.known {
             KnownMaster::New { pid } => Inspection::at_new(pid),
-            _ => self.first_look(connection).await?,
+            _ => self.first_look(master).await?,
         };
         let mut resumed = resumes(&first);
         if !is_new && !resumed {
-            self.settle(sentinel.peer()).await?;
+            master.settle().await?;
             self.ledger.settled();
-            first = self.first_look(connection).await?;
+            first = self.first_look(master).await?;
             resumed = resumes(&first);
         }
         let mut examination = Examination {
             outcome: RecoveryOutcome::Resumed,
             pid: first.pid(),
-            speaks: String::new(),
-            verification: Verification::TokenFirst,
             counts: Counts::default(),
             skipped: Vec::new(),
             mismatches: Vec::new(),
-            look: start.elapsed(),
+            look: master.now() - start,
             injection: Duration::ZERO,
         };
-        if !resumed {
+        if resumed {
+            // Another program may have written to the master directly.
+            self.ledger.doubt();
+        } else {
             let may_be_roscores = self.supervision == Supervision::Theirs
-                && may_be_of_roscore(examination.pid, sentinel).await;
+                && master.may_be_of_roscore(examination.pid).await;
             self.inject(
-                connection,
+                master,
                 first,
                 manner,
                 may_be_roscores,
@@ -269,29 +277,21 @@ impl Examiner {
         }
         // All masters that rosrescue starts have the same version.
         if !is_new || self.ledger.with_mirror(Master::is_old).is_none() {
-            let ask = Master::ask_if_old().into();
-            let reply = self.while_alive(connection.call(&ask)).await?;
+            let reply = master.call(Master::ask_if_old()).await?;
             self.ledger.set_old(Master::shows_old(&reply));
         }
-        self.ledger.set_python(connection.python());
-        let keeps_alive = connection.keeps_alive() != Some(false);
-        examination.speaks = software::speaks(keeps_alive, connection.server());
-        let sees_master =
-            !keeps_alive && sentinel.is_local() && listens(examination.pid, sentinel.peer()).await;
-        examination.verification = Verification::of(keeps_alive, sees_master, sentinel);
-        examination.injection = start.elapsed().saturating_sub(examination.look);
+        self.ledger.set_python(master.python());
+        examination.injection = (master.now() - start).saturating_sub(examination.look);
         examination.counts = self.ledger.with_mirror(Master::counts);
         Ok(examination)
     }
 
     /// Brings a late master, which has answered by now, up to date with the writes that the mirror has answered.
     /// Returns whether the master then holds the mirror's state. If not, the master must be examined.
-    pub(super) async fn catch_up(&self) -> Result<bool, ExamineError> {
-        let connect = self.upstream.connect();
-        let mut connection = within(CATCH_UP_LIMIT, connect).await?;
+    pub(crate) async fn catch_up(&self, master: &mut impl Contact) -> Result<bool, ExamineError> {
         // From here until the gate opens the mirror must not change, and writes wait.
         self.gate.set(State::Injecting);
-        let missed = match self.ledger.begin_catch_up(Instant::now()) {
+        let missed = match self.ledger.begin_catch_up(master.now()) {
             None => return Ok(false),
             Some(CatchUp::Nothing) => return Ok(true),
             Some(CatchUp::Run(missed)) => *missed,
@@ -303,8 +303,7 @@ impl Examiner {
         if plan.expected() != mirror {
             return Ok(false);
         }
-        let reply = connection.predicted(plan.request().clone(), plan.answer());
-        let raw = within(CATCH_UP_LIMIT, reply).await?;
+        let raw = master.inject(&plan).await?;
         let verdict = verdict(&plan, &raw)?;
         tracing::debug!(
             writes = count,
@@ -317,35 +316,9 @@ impl Examiner {
         Ok(verdict.is_ok())
     }
 
-    /// Waits until the master runs no more calls of closed connections. Before that, its state can still change.
-    async fn settle(&self, master: SocketAddr) -> Result<(), ExamineError> {
-        let settled = async {
-            self.upstream.no_writers().await;
-            while may_run_a_call(master).await {
-                tokio::time::sleep(SETTLE_PAUSE).await;
-            }
-        };
-        if tokio::time::timeout(SETTLE_LIMIT, settled).await.is_ok() {
-            return Ok(());
-        }
-        match self.supervision {
-            // rosrescue replaces this master, as it replaces a master that hangs.
-            Supervision::Ours => Err(ExamineError::Silent {
-                limit: SETTLE_LIMIT,
-            }),
-            Supervision::Theirs => {
-                rarely!(
-                    warn,
-                    "the master may still be running calls of closed connections after {SETTLE_LIMIT:?}; changes that these calls still make may be lost. Restart the master if this happens again"
-                );
-                Ok(())
-            }
-        }
-    }
-
     async fn inject(
         &self,
-        connection: &mut Connection,
+        master: &mut impl Contact,
         first: Inspection,
         manner: Manner,
         may_be_roscores: bool,
@@ -370,13 +343,12 @@ impl Examiner {
                     Bears::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
                 };
-                self.while_alive(inspect::second(first, connection, &previous))
-                    .await?
+                master.second_look(first, &previous).await?
             }
         };
-        self.remove_dead_rosout(may_be_roscores, bears, &found)
+        self.remove_dead_rosout(master, may_be_roscores, bears, &found)
             .await;
-        examination.look = start.elapsed();
+        examination.look = master.now() - start;
         // From here until the gate opens the mirror must not change, because the master is compared
         // with the mirror.
         self.gate.set(State::Injecting);
@@ -455,12 +427,18 @@ impl Examiner {
             change,
         };
         let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
-        self.bring(connection, &target, &token, ready, examination)
+        self.bring(master, &target, &token, ready, examination)
             .await
     }
 
     /// Removes a rosout from the mirror that must not be restored in a master with this state, because it has ended.
-    async fn remove_dead_rosout(&self, may_be_roscores: bool, bears: Bears, found: &Master) {
+    async fn remove_dead_rosout(
+        &self,
+        master: &mut impl Contact,
+        may_be_roscores: bool,
+        bears: Bears,
+        found: &Master,
+    ) {
         let to_ask = |mirror: &Master| {
             let api = replay::rosout_to_ask(may_be_roscores, bears, mirror, found)?;
             Some(port_of(api).to_owned())
@@ -468,7 +446,7 @@ impl Examiner {
         let Some(port) = self.ledger.with_mirror(to_ask) else {
             return;
         };
-        if client::ask(&port, &master::get_pid(), ROSOUT_LIMIT).await == Reaction::Dead {
+        if master.is_dead(&port).await {
             for call in self
                 .ledger
                 .with_mirror(|mirror| mirror.unregister_calls(ROSOUT))
@@ -481,7 +459,7 @@ impl Examiner {
     /// Brings the master to `target`, reads it back, and sets `token` in it.
     async fn bring(
         &self,
-        connection: &mut Connection,
+        master: &mut impl Contact,
         target: &Target,
         token: &Token,
         ready: Option<Prepared>,
@@ -504,8 +482,7 @@ impl Examiner {
         for round in 1..=ROUNDS {
             let Prepared { plan, complete, .. } = next;
             tracing::debug!(round, bytes = plan.request().len(), complete, "injecting");
-            let reply = connection.predicted(plan.request().clone(), plan.answer());
-            let raw = self.while_alive(reply).await?;
+            let raw = master.inject(&plan).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
             let Err(mut deviation) = verdict(&plan, &raw)? else {
                 examination.mismatches.clear();
@@ -513,17 +490,15 @@ impl Examiner {
                     self.ledger.adopt(plan.expected().clone());
                 }
                 self.injected(&plan, change, round);
-                // Freeing thousands of small allocations takes time, so another thread does it.
-                crate::task::spawn_blocking(move || drop(plan));
+                master.discard(plan);
                 return Ok(());
             };
             // What the master holds now replaces what was expected, and the missing part is injected again.
-            let first = self.first_look(connection).await?;
+            let first = self.first_look(master).await?;
             if first.bears() != Bears::Present && deviation.failed.is_empty() {
                 deviation.failed.push("the token is missing".to_owned());
             }
-            let now = inspect::second(first, connection, plan.expected());
-            let now = self.while_alive(now).await?;
+            let now = master.second_look(first, plan.expected()).await?;
             if deviation.failed.is_empty() {
                 rarely!(
                     info,
@@ -575,25 +550,12 @@ impl Examiner {
         }
     }
 
-    async fn first_look(&self, connection: &mut Connection) -> Result<Inspection, ExamineError> {
-        let mut first = self
-            .while_alive(inspect::first(connection, &self.ledger.token()))
-            .await?;
-        if !connection.keeps_order() {
+    async fn first_look(&self, master: &mut impl Contact) -> Result<Inspection, ExamineError> {
+        let mut first = master.first_look(&self.ledger.token()).await?;
+        if !master.python().keeps_order() {
             self.ledger.with_mirror(|mirror| first.arrange_like(mirror));
         }
         Ok(first)
-    }
-
-    /// Waits for slow `work` while the master answers probes.
-    async fn while_alive<T, E: Into<ExamineError>>(
-        &self,
-        work: impl Future<Output = Result<T, E>>,
-    ) -> Result<T, ExamineError> {
-        tokio::select! {
-            done = within(INJECTION_LIMIT, work) => done,
-            limit = self.silence() => Err(ExamineError::Silent { limit }),
-        }
     }
 }
 
@@ -605,35 +567,6 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Deviation>, Examine
         false if raw.keeps_order() => plan.verify(&raw.decode()?),
         false => plan.verify_in_any_order(&raw.decode()?),
     })
-}
-
-/// Runs [`sockets::may_run_a_call`] in another thread: it takes 100 ms with 15,000 sockets, where a sandbox allows only
-/// the table in /proc.
-async fn may_run_a_call(master: SocketAddr) -> bool {
-    let looked = crate::task::spawn_blocking(move || sockets::may_run_a_call(master));
-    looked.await.unwrap_or(false)
-}
-
-/// Whether the process `pid` seems to listen at the port of `master`.
-async fn listens(pid: i32, master: SocketAddr) -> bool {
-    let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
-    crate::task::spawn_blocking(look).await.unwrap_or(false)
-}
-
-/// Whether a roscore, or a roslaunch, may have started the master `pid`. A master whose process is hidden, in a
-/// container or on another computer, may be a roscore's.
-async fn may_be_of_roscore(pid: i32, sentinel: &Sentinel) -> bool {
-    let (local, master) = (sentinel.is_local(), sentinel.peer());
-    let look = move || {
-        let pid = u32::try_from(pid).ok().filter(|_| local)?;
-        let sockets = sockets::accepting(&sockets::listening(), master);
-        let open = listeners::open_sockets(pid);
-        let is_master = sockets.iter().any(|socket| open.contains(socket));
-        let parent = process::parent_of(pid).filter(|_| is_master)?;
-        Some(process::runs(parent, "roscore") || process::runs(parent, "roslaunch"))
-    };
-    let seen = crate::task::spawn_blocking(look).await;
-    seen.ok().flatten().unwrap_or(true)
 }
 
 /// Logs the differences between the master and the mirror.
@@ -655,15 +588,5 @@ fn say_older(difference: &[String]) {
             ?difference,
             "the master's state is newer than the checkpoint, so it is kept; possible reasons: the disk was full, the checkpoint is an old copy, or the master was changed directly"
         );
-    }
-}
-
-async fn within<T, E: Into<ExamineError>>(
-    limit: Duration,
-    work: impl Future<Output = Result<T, E>>,
-) -> Result<T, ExamineError> {
-    match tokio::time::timeout(limit, work).await {
-        Ok(result) => result.map_err(Into::into),
-        Err(_) => Err(ExamineError::Silent { limit }),
     }
 }

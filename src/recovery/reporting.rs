@@ -13,6 +13,7 @@ use super::{
 };
 use crate::{
     clock,
+    ledger::owed::Telling,
     limit::all_clear,
     nodes::health_check,
     status::{
@@ -65,7 +66,7 @@ impl Outage {
     }
 
     /// The report of an outage that ends at `now` with this `examination`.
-    pub(super) fn report(&self, now: Instant, examination: Examination) -> Report {
+    pub(super) fn report(&self, now: Instant, examination: Examination, speaks: String) -> Report {
         let total = now.duration_since(self.since);
         let absence = self
             .port_open
@@ -81,7 +82,7 @@ impl Outage {
             outcome: examination.outcome,
             master_pid: examination.pid,
             same_master: false,
-            master_speaks: examination.speaks,
+            master_speaks: speaks,
             phases: Phases {
                 absence_ms: ms(absence),
                 inspection_ms: ms(examination.look),
@@ -111,13 +112,13 @@ pub(super) struct LastMessage {
 impl Driver {
     /// Reports what an examination of a master found and did, in the log, the status and the recovery report. The
     /// health check adds its results when it ends.
-    pub(super) fn report(&mut self, mut examination: Examination) {
+    pub(super) fn report(&mut self, mut examination: Examination, speaks: String) {
         if self.lifecycle.begins() && examination.outcome == RecoveryOutcome::Injected {
             // The master holds only the session's initial state.
             examination.outcome = RecoveryOutcome::Begun;
         }
         let (cause, since) = (self.outage.cause, self.outage.since);
-        let mut report = self.outage.report(Instant::now(), examination);
+        let mut report = self.outage.report(Instant::now(), examination, speaks);
         report.ended = self.process.as_mut().and_then(MasterProcess::take_end);
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
@@ -160,10 +161,10 @@ impl Driver {
         let Report {
             number, outcome, ..
         } = report;
-        if outcome != RecoveryOutcome::Resumed {
+        if let Some(telling) = Telling::after(outcome, news == News::Owed) {
             let (nodes, board) = (self.nodes.clone(), self.board.clone());
             let check = async move {
-                let check = health_check::after_recovery(nodes, since, outcome).await;
+                let check = health_check::after_recovery(nodes, since, telling).await;
                 let Some(check) = check else { return };
                 if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
                     report.log_check();

@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use ros1_master::master;
 
-use super::examine::Examiner;
+use super::live_master::Reach;
 
-impl Examiner {
+impl Reach {
     /// Probes the master over separate connections until enough probes in a row are unanswered for it to count as hung.
     /// Returns how long the master has been silent. rosmaster serves each connection in a thread of its own, so a busy
     /// master still answers.
