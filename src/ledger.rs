@@ -97,6 +97,9 @@ pub struct Ledger {
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
     order_changed: watch::Sender<()>,
+    /// Whether a simulation decides when the disk writes.
+    #[cfg(test)]
+    writes_by_hand: AtomicBool,
 }
 
 impl Ledger {
@@ -124,6 +127,8 @@ impl Ledger {
             shared: Notify::new(),
             outbox_changed: Notify::new(),
             order_changed: watch::channel(()).0,
+            #[cfg(test)]
+            writes_by_hand: AtomicBool::default(),
         };
         if let Some(store) = store {
             ledger.set_store(store);

@@ -90,9 +90,47 @@ impl Ledger {
 
     /// Writes the queued records to the checkpoint, in another thread.
     pub(super) fn write(&self) {
+        #[cfg(test)]
+        if self.writes_by_hand.load(Ordering::Relaxed) {
+            return;
+        }
         if let Some(worker) = self.worker() {
             crate::task::spawn_blocking(move || worker.work());
         }
+    }
+
+    /// Leaves the queued records to [`Self::run_jobs`], for a simulation.
+    #[cfg(test)]
+    pub(crate) fn write_by_hand(&self) {
+        self.writes_by_hand.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether records wait for the disk.
+    #[cfg(test)]
+    pub(crate) fn has_jobs(&self) -> bool {
+        self.worker().is_some_and(|worker| worker.has_jobs())
+    }
+
+    /// Writes the queued records.
+    #[cfg(test)]
+    pub(crate) fn run_jobs(&self) {
+        if let Some(worker) = self.worker() {
+            worker.work();
+        }
+    }
+
+    /// Drops the queued records, as a death of the process does.
+    #[cfg(test)]
+    pub(crate) fn drop_jobs(&self) {
+        if let Some(worker) = self.worker() {
+            worker.drop_jobs();
+        }
+    }
+
+    /// Whether a complete checkpoint of this or a later version has been written or has failed.
+    #[cfg(test)]
+    pub(crate) fn has_attempted(&self, version: u64) -> bool {
+        *self.attempted.borrow() >= version
     }
 
     fn worker(&self) -> Option<Arc<journal::StoreQueue>> {

@@ -85,6 +85,16 @@ impl StoreQueue {
         }
     }
 
+    #[cfg(test)]
+    pub(super) fn has_jobs(&self) -> bool {
+        !self.jobs().is_empty()
+    }
+
+    #[cfg(test)]
+    pub(super) fn drop_jobs(&self) {
+        self.jobs().clear();
+    }
+
     fn next(&self) -> Option<Job> {
         self.jobs().pop_front()
     }

@@ -8,10 +8,11 @@
 mod master;
 mod node;
 mod recovery;
+mod worker;
 
 use std::{
     cmp::Reverse,
-    collections::{BTreeMap, BinaryHeap, HashMap},
+    collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -24,6 +25,7 @@ use self::{
     master::Process,
     node::{Library, Node, Thread},
     recovery::Recovery,
+    worker::{Disk, Parts},
 };
 use super::{
     batch::{AnswerAndDelivery, CallAnswer, Item},
@@ -35,6 +37,7 @@ use rescue_core::{
     health::port_of,
     lifecycle::{self, Patience, Supervision},
     order::NextNotification,
+    replay::{self, Token},
 };
 use ros1_master::{
     master::{Kind, Master, Method, Request},
@@ -44,8 +47,9 @@ use ros1_master::{
 use crate::{
     cli::SyncPolicy,
     dice::Dice,
-    gate::State,
+    gate::{self, State},
     ledger::{Ledger, delivery::Delivery, mutant::Mutant},
+    recovery::examine::Examiner,
     status::stats::Stats,
     upstream::{Head, RawReply},
 };
@@ -54,6 +58,10 @@ const NODES: u64 = 4;
 const TOPICS: u64 = 3;
 const PARAMS: u64 = 3;
 const CALLS: u64 = 30;
+/// A parameter that a client sets directly at the master.
+const BYPASSED: &str = "bypassed";
+/// The longest time until the write queue compares the master with the mirror, in microseconds.
+const COMPARE_WITHIN: u64 = 1_000_000;
 /// How long a write waits for the master, in microseconds.
 const PATIENCE: u64 = 100_000;
 /// When notifications that a dead master may not have sent are sent, in microseconds.
@@ -65,14 +73,23 @@ const QUIET_AFTER: u64 = 15_000_000;
 /// has gone on, and is found to hang only after some probes.
 const ANSWERED_WITHIN: u64 = 6_000_000;
 
+/// Who sent a request to the master.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Asked {
+    /// The write queue, with the number of the request.
+    Queue(u64),
+    /// The examination, with the number of its step and of its question.
+    Examination(u64, u64),
+}
+
 #[derive(Debug)]
 enum Event {
     /// The node's call reaches rosrescue.
     Arrives(usize, Request),
-    /// The master with this number gets the request with this number.
-    MasterGets(u64, u64, Bytes),
-    /// The answer to the request with this number arrives.
-    Replied(u64, Received),
+    /// The master with this number gets a request.
+    MasterGets(u64, Asked, Option<Request>),
+    /// The answer to a request arrives.
+    Replied(Asked, Received),
     /// The connection of the request with this number has ended.
     Broken(u64, Failure),
     /// The answer to this call has been written.
@@ -88,7 +105,17 @@ enum Event {
     Dies,
     /// All connections to the master break, although it lives.
     Breaks,
+    /// A client sets a parameter directly at the master.
+    Bypasses,
+    /// The write queue compares the master with the mirror.
+    Compares,
     Recovery(recovery::Event),
+    /// The process of rosrescue is killed.
+    WorkerDies,
+    /// The next one starts.
+    WorkerStarts,
+    /// The disk has done what was waiting for it.
+    DiskWrites,
     /// A deadline has passed.
     Tick,
 }
@@ -130,10 +157,16 @@ struct World {
     ledger: Arc<Ledger>,
     dispatcher: Dispatcher,
     recovery: Recovery,
-    gate: State,
-    gate_changed: bool,
+    gate: gate::Rx,
+    stats: &'static Stats,
+    /// The disk. Without one, nothing is recorded, and the process of rosrescue does not die.
+    disk: Option<Disk>,
+    /// Whether there is no process of rosrescue.
+    is_down: bool,
+    /// How often the process of rosrescue has died.
+    deaths: u64,
     waiting: Vec<Waiting>,
-    unwritten: HashMap<u64, Unwritten>,
+    unwritten: BTreeMap<u64, Unwritten>,
     done: Vec<Done>,
     /// The number of the request in flight. Earlier requests have lost their connection.
     in_flight: Option<u64>,
@@ -155,6 +188,8 @@ struct World {
     /// Calls that a client has sent more than once.
     sent_again: Vec<Request>,
     caught_up: u64,
+    /// The last value that a client has set directly at a master, and the number of that master.
+    bypassed: Option<(i32, u64)>,
     /// Whether the connections to a living master broke, or a master was taken for hung. It may go on and notify nodes of
     /// what it knows after the mirror has told them newer news. Nobody can see that, so values may go back before the
     /// last one comes.
@@ -165,9 +200,6 @@ struct World {
 
 impl World {
     fn new(seed: u64, stats: &'static Stats) -> Self {
-        let (session, sync) = (Session::default(), SyncPolicy::Interval);
-        let ledger = Ledger::new(Master::default(), session, Vec::new(), None, sync, stats);
-        let ledger = Arc::new(ledger);
         let mut dice = Dice(seed);
         let library = |dice: &mut Dice| match dice.one_in(2) {
             true => Library::Rospy,
@@ -175,11 +207,18 @@ impl World {
         };
         let nodes = (0..NODES).map(|number| Node::new(number, library(&mut dice)));
         let nodes = nodes.collect();
-        let patience = Patience::new(Duration::from_micros(PATIENCE));
         let supervision = match dice.one_in(2) {
             true => Supervision::Ours,
             false => Supervision::Theirs,
         };
+        let disk = dice.one_in(2).then(Disk::new);
+        let Parts {
+            ledger,
+            dispatcher,
+            gate,
+            recovery,
+            ..
+        } = Parts::begin(disk.as_ref(), supervision, stats);
         let mut world = Self {
             dice,
             start: Instant::now(),
@@ -188,13 +227,16 @@ impl World {
             bodies: HashMap::new(),
             next: 0,
             next_tick: None,
-            dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, patience),
+            dispatcher,
             ledger,
-            recovery: Recovery::new(supervision),
-            gate: State::Unknown,
-            gate_changed: false,
+            recovery,
+            gate,
+            stats,
+            disk,
+            is_down: false,
+            deaths: 0,
             waiting: Vec::new(),
-            unwritten: HashMap::new(),
+            unwritten: BTreeMap::new(),
             done: Vec::new(),
             in_flight: None,
             requests: 0,
@@ -209,14 +251,12 @@ impl World {
             values: HashMap::new(),
             sent_again: Vec::new(),
             caught_up: 0,
+            bypassed: None,
             may_go_back: false,
             broken: Vec::new(),
             prints: std::env::var_os("ROSRESCUE_STEPS").is_some(),
         };
-        world.recover(lifecycle::Input::Start {
-            left: false,
-            restored: false,
-        });
+        world.begin_worker(false);
         if supervision == Supervision::Theirs {
             world.start_master();
         }
@@ -224,11 +264,13 @@ impl World {
             world.call(node);
         }
         // Most masters die or lose their connections while calls are under way, some more than once.
-        for _ in 0..world.dice.below(3) {
+        for _ in 0..world.dice.below(4) {
             let time = 5_000 + world.dice.below(60_000);
-            let event = match world.dice.one_in(3) {
-                true => Event::Breaks,
-                false => Event::Dies,
+            let event = match world.dice.below(10) {
+                0..2 => Event::Breaks,
+                2..5 => Event::WorkerDies,
+                5 => Event::Bypasses,
+                _ => Event::Dies,
             };
             world.after(time, event);
         }
@@ -270,10 +312,14 @@ impl World {
         }
     }
 
-    fn set_gate(&mut self, state: State) {
-        if self.gate != state {
+    fn gate(&self) -> State {
+        self.gate.state()
+    }
+
+    fn set_gate(&self, state: State) {
+        if self.gate() != state {
             self.print(|| format!("gate: {state:?}"));
-            (self.gate, self.gate_changed) = (state, true);
+            self.recovery.set_gate(state);
         }
     }
 
@@ -296,6 +342,10 @@ impl World {
     }
 
     fn arrives(&mut self, node: usize, call: Request) {
+        if self.is_down {
+            // The listening socket stays open meanwhile.
+            return self.after(5_000, Event::Arrives(node, call));
+        }
         self.print(|| format!("/n{node} calls {call:?}"));
         if call.kind() == Kind::Read {
             let begun = match Mutant::NoOrder.lives() {
@@ -330,10 +380,14 @@ impl World {
 
     /// Gives the dispatcher an input, and carries out its actions, as `Drain::run` does.
     fn dispatch(&mut self, input: Input) {
+        if self.is_down {
+            return;
+        }
+        let (gate, gate_changed) = self.gate.look_changed();
         let view = View {
             now: self.instant(),
-            gate: self.gate,
-            gate_changed: std::mem::take(&mut self.gate_changed),
+            gate,
+            gate_changed,
             leads: true,
             silent_since: None,
         };
@@ -342,10 +396,13 @@ impl World {
                 Action::Send {
                     incarnation,
                     request: (_, body),
-                } => self.send(incarnation, Some(body)),
+                } => {
+                    let call = Request::from(xmlrpc::decode_call(&body).unwrap());
+                    self.send(incarnation, Some(call));
+                }
                 Action::Inspect { incarnation } => self.send(incarnation, None),
                 Action::Disconnect => self.in_flight = None,
-                Action::Answer(answers) => answers.give(true),
+                Action::Answer(answers) => self.give(answers),
                 Action::Report(report) => {
                     self.print(|| format!("the queue reports {report:?}"));
                     self.recover(match report {
@@ -361,12 +418,14 @@ impl World {
     }
 
     /// Sends a request to the master with this number, or without one reads its state.
-    fn send(&mut self, incarnation: u64, body: Option<Bytes>) {
+    fn send(&mut self, incarnation: u64, request: Option<Request>) {
         self.requests += 1;
         self.in_flight = Some(self.requests);
         let number = self.requests;
-        let master = self.master.as_mut();
-        let Some(master) = master.filter(|master| master.incarnation == Some(incarnation)) else {
+        let token = Token::new(&self.ledger.session().mark, incarnation);
+        let mut master = self.master.as_mut();
+        let master = master.take_if(|master| master.has(&token));
+        let Some(master) = master else {
             let time = self.dice.below(200);
             return self.after(time, Event::Broken(number, Failure::NotConnected));
         };
@@ -381,9 +440,8 @@ impl World {
             self.stop_master(time);
         }
         let time = 20 + self.dice.below(200);
-        // An empty request reads the state.
-        let body = body.unwrap_or_default();
-        self.after(time, Event::MasterGets(self.life, number, body));
+        let asked = Asked::Queue(number);
+        self.after(time, Event::MasterGets(self.life, asked, request));
     }
 
     /// Readies an answer, which its task writes as soon as the task runs.
@@ -459,6 +517,9 @@ impl World {
 
     /// Sends the notifications that are due, as `notifications::deliver` does.
     fn notify(&mut self) {
+        if self.is_down {
+            return;
+        }
         let now = self.instant();
         let idle = self.ledger.with_order(|order, _| {
             if order.next_repeat().is_some_and(|at| at <= now) && !Mutant::NoRepeats.lives() {
@@ -502,6 +563,16 @@ impl World {
 
     /// A notification arrives at the node at `port`, and one of its threads reads it.
     fn tell(&mut self, call: &Call, port: &str, late: u64) -> u64 {
+        // The answer to the call that has set this value may still wait for the disk.
+        let key = call.params.get(1).map(text).unwrap_or_default();
+        let sets = |waiting: &&Waiting| {
+            waiting.call.text(1) == Some(key.trim_end_matches('/'))
+                && waiting.call.params().get(2) == call.params.get(2)
+        };
+        if let Some(set) = self.waiting.iter().find(sets) {
+            let set = set.call.clone();
+            self.note_value(&set);
+        }
         let time = 100 + late + self.scheduled();
         let at = self.nodes.iter().position(|node| node.port() == port);
         if let Some(node) = at {
@@ -515,8 +586,11 @@ impl World {
         let mut input = Input::Wake;
         match event {
             Event::Arrives(node, call) => return self.arrives(node, call),
-            Event::MasterGets(life, number, body) => self.master_gets(life, number, body),
-            Event::Replied(number, received) if self.in_flight == Some(number) => {
+            Event::MasterGets(life, asked, request) => self.master_gets(life, asked, request),
+            Event::Replied(Asked::Examination(step, number), Received::Reply(raw)) => {
+                self.answer_examination(step, number, Ok(raw.decode().unwrap()));
+            }
+            Event::Replied(Asked::Queue(number), received) if self.in_flight == Some(number) => {
                 self.in_flight = None;
                 input = Input::Ended(Ok(received));
             }
@@ -571,6 +645,11 @@ impl World {
             Event::Dies => self.dies(),
             Event::Breaks => self.breaks(),
             Event::Recovery(event) => self.recovers(event),
+            Event::Bypasses => self.bypasses(),
+            Event::Compares => input = Input::Compare,
+            Event::WorkerDies => self.worker_dies(),
+            Event::WorkerStarts => self.worker_starts(),
+            Event::DiskWrites => self.disk_writes(),
             Event::Tick => self.next_tick = None,
             Event::Replied(..)
             | Event::Broken(..)
@@ -589,22 +668,29 @@ impl World {
     fn play(mut self) -> (Vec<String>, u64) {
         let mut last_work = 0;
         while let Some(Reverse((time, number))) = self.events.pop() {
-            if self.calls_left > 0 || !self.waiting.is_empty() || !self.unwritten.is_empty() {
+            let is_busy = !self.waiting.is_empty() || !self.unwritten.is_empty();
+            if self.calls_left > 0 || is_busy || self.is_down {
                 last_work = time;
             }
             if time > last_work + QUIET_AFTER || time > 100 * QUIET_AFTER {
                 break;
             }
             self.now = time;
-            let event = self.bodies.remove(&number).unwrap();
+            // A process that has died leaves some of its events.
+            let Some(event) = self.bodies.remove(&number) else {
+                continue;
+            };
             self.step(event);
             self.dispatch(Input::Wake);
             self.wake_recovery();
             // What the recovery has changed may let calls go on.
             self.dispatch(Input::Wake);
+            self.wake_disk();
             self.notify();
-            let deadlines = [self.dispatcher.deadline(), self.recovery.deadline()];
-            deadlines.into_iter().flatten().for_each(|at| self.at(at));
+            if !self.is_down {
+                let deadlines = [self.dispatcher.deadline(), self.recovery.deadline()];
+                deadlines.into_iter().flatten().for_each(|at| self.at(at));
+            }
         }
         self.check();
         (self.broken, self.caught_up)
@@ -625,12 +711,31 @@ impl World {
             self.broken.extend(gone_back);
         }
         match &self.master {
-            Some(master) if master.state == mirror => {}
-            Some(_) => self.broken.push("master and mirror differ".to_owned()),
+            Some(master) if master.state() == mirror => {}
+            Some(master) => {
+                let state = master.state();
+                let mut difference = replay::difference(&mirror, &state);
+                let subscribers = |state: &Master| BTreeSet::from_iter(state.param_subscribers());
+                if self.deaths > 0 && subscribers(&mirror) == subscribers(&state) {
+                    // Their order cannot be read from a master, and the process that knew it has died.
+                    difference.retain(|what| !what.starts_with("the parameter subscribers"));
+                }
+                if !difference.is_empty() {
+                    let mistake = format!("master and mirror differ: {difference:?}");
+                    self.broken.push(mistake);
+                }
+            }
             None => self.broken.push("there is no master".to_owned()),
         }
         for node in &self.nodes {
             self.broken.extend(node.lost_registrations(&mirror));
+        }
+        if let Some((value, life)) = self.bypassed.filter(|(_, life)| *life == self.life) {
+            let held = mirror.params().get(BYPASSED).and_then(Value::as_int);
+            if held != Some(value) {
+                let mistake = format!("master {life} had {BYPASSED} {value}, and has {held:?}");
+                self.broken.push(mistake);
+            }
         }
         // The last value of a parameter is that of a write that no other one has followed.
         for number in 0..PARAMS {
@@ -700,6 +805,17 @@ fn each_rule_is_needed() {
         println!("{mutant:?}: found in schedule {seed}: {broken:?}");
         let alone = mistake(None, seed, 1);
         assert!(alone.is_none(), "also without {mutant:?}: {alone:?}");
+    }
+}
+
+/// The master's answer, as it comes.
+fn raw(reply: &Reply) -> RawReply {
+    RawReply {
+        keeps_alive: true,
+        status: StatusCode::OK,
+        reason: None,
+        headers: HeaderMap::new(),
+        body: xmlrpc::encode_reply(reply).into(),
     }
 }
 

@@ -2,15 +2,14 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use rescue_core::replay::{Inspection, Token};
 use ros1_master::master::Notice;
 
 use super::*;
 
 /// A process of the master.
 pub(super) struct Process {
-    pub(super) state: Master,
-    /// The number in the token that rosrescue has set. `None` in a new master.
-    pub(super) incarnation: Option<u64>,
+    state: Master,
     /// When it begins to listen.
     pub(super) listens: u64,
     /// Until when it does nothing.
@@ -25,12 +24,34 @@ impl Process {
     pub(super) fn new(listens: u64) -> Self {
         Self {
             state: Master::default(),
-            incarnation: None,
             listens,
             stopped: 0,
             running: 0,
             notices: BTreeMap::new(),
         }
+    }
+
+    /// Whether the master has this token.
+    pub(super) fn has(&mut self, token: &Token) -> bool {
+        Token::is_found(&self.state.apply(&token.lookup()).reply)
+    }
+
+    /// The state without rosrescue's tokens.
+    pub(super) fn state(&self) -> Master {
+        let mut state = self.state.clone();
+        for (name, api) in self.state.nodes().filter(|(name, _)| Token::is_ours(name)) {
+            state.apply(&Request::new(Method::UnsubscribeParam, [name, api, "~"]));
+        }
+        state
+    }
+
+    /// The state as rosrescue reads it.
+    fn read(&mut self, token: &Token, previous: &Master) -> Master {
+        let reply = self.state.apply(&Inspection::call(token)).reply;
+        let first = Inspection::decode(&reply, token).unwrap();
+        let second = first.second_call(previous);
+        let second = second.map(|call| self.state.apply(&call).reply);
+        first.into_master(second.as_ref(), previous).unwrap()
     }
 }
 
@@ -43,8 +64,8 @@ impl World {
         self.print(|| format!("the master stops for {time} µs"));
     }
 
-    /// The master runs a request, as soon as it goes on.
-    pub(super) fn master_gets(&mut self, life: u64, number: u64, body: Bytes) {
+    /// The master runs a request, as soon as it goes on. Without one, the write queue reads its state.
+    pub(super) fn master_gets(&mut self, life: u64, asked: Asked, request: Option<Request>) {
         if !self.is_master(life) {
             return;
         }
@@ -54,25 +75,18 @@ impl World {
         };
         if now < master.stopped {
             let time = master.stopped - now;
-            return self.after(time, Event::MasterGets(life, number, body));
+            return self.after(time, Event::MasterGets(life, asked, request));
         }
         master.running -= 1;
-        let received = match body.is_empty() {
-            true => Received::Held(Box::new(master.state.clone())),
-            false => {
-                let call = Request::from(xmlrpc::decode_call(&body).unwrap());
-                let reply = self.run(&call);
-                Received::Reply(RawReply {
-                    keeps_alive: true,
-                    status: StatusCode::OK,
-                    reason: None,
-                    headers: HeaderMap::new(),
-                    body: xmlrpc::encode_reply(&reply).into(),
-                })
+        let received = match request {
+            None => {
+                let previous = self.ledger.with_mirror(Clone::clone);
+                Received::Held(master.read(&self.ledger.token(), &previous).into())
             }
+            Some(call) => Received::Reply(raw(&self.run(&call))),
         };
         let time = 50 + self.dice.below(1_000);
-        self.after(time, Event::Replied(number, received));
+        self.after(time, Event::Replied(asked, received));
     }
 
     /// Lets the master run a call and notify nodes.
@@ -161,6 +175,26 @@ impl World {
             let time = self.dice.below(3_000);
             self.after(time, Event::Broken(number, Failure::MayHaveRun));
         }
+    }
+
+    /// A client sets a parameter directly at the master.
+    pub(super) fn bypasses(&mut self) {
+        let now = self.now;
+        let Some(master) = &mut self.master else {
+            return;
+        };
+        if now < master.stopped || now < master.listens {
+            return;
+        }
+        self.value += 1;
+        let (value, life) = (self.value, self.life);
+        let key = format!("/{BYPASSED}");
+        let params = [Value::from("/direct"), key.as_str().into(), value.into()];
+        master.state.apply(&Request::new(Method::SetParam, params));
+        self.print(|| format!("a client sets {key} to {value} at the master"));
+        self.bypassed = Some((value, life));
+        let time = self.dice.below(COMPARE_WITHIN);
+        self.after(time, Event::Compares);
     }
 
     pub(super) fn breaks(&mut self) {

@@ -1,17 +1,32 @@
-//! Carries out what the lifecycle of production decides, as `recovery::Driver` and `recovery::examine` do.
+//! Carries out what the lifecycle of production decides, as `recovery::Driver` does, with the examination of production.
+
+use std::{
+    pin::Pin,
+    sync::Mutex,
+    task::{Context, Poll, Waker},
+};
 
 use rescue_core::{
     lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision},
-    replay::{self, Bears, KnownMaster, Treatment},
+    replay::{Inspection, Plan, Token},
 };
+use ros1_master::xmlrpc::Python;
 
 use super::*;
-use crate::ledger::{Basis, late::CatchUp, owed::Telling};
+use crate::{
+    ledger::owed::Telling,
+    recovery::examine::{Contact, Examination, ExamineError, Examiner, Manner},
+    status::report::RecoveryOutcome,
+};
 
 /// How long a probe may take, in microseconds.
 const PROBE_TIMEOUT: u64 = 200_000;
 /// How long a master may be silent while it is examined, in microseconds.
 const SILENT_MOST: u64 = 3 * PROBE_TIMEOUT;
+/// How long each step may take while a late master catches up, in microseconds.
+const CATCH_UP_MOST: u64 = 1_000_000;
+/// Pause between two questions whether calls of closed connections have ended, in microseconds.
+const SETTLE_PAUSE: u64 = 5_000;
 const PROBING: Probing = Probing {
     interval: Duration::from_secs(1),
     count: 3,
@@ -30,14 +45,12 @@ pub(super) enum Event {
     Started,
     /// A connection attempt has ended.
     Connects(u64),
-    /// The master has been read.
-    Inspects(u64),
-    /// The master has got its state.
-    Injects(u64),
-    /// The master has been silent for too long while it was examined.
-    Silent(u64),
-    /// The late master has got the writes that it missed.
-    CatchesUp(u64),
+    /// The examination begins.
+    Begins(u64),
+    /// The master has not answered this question in time.
+    Silent(u64, u64),
+    /// The examination asks again whether calls of closed connections have ended.
+    Settles(u64),
     ProbeAnswered(u64),
     ProbeMissed(u64),
     /// The notifications that a dead master may not have sent are due, and nobody serves.
@@ -46,42 +59,178 @@ pub(super) enum Event {
     Checks,
 }
 
+/// What an examination waits for.
+enum Question {
+    /// That calls of closed connections have ended.
+    Settle,
+    /// The answer to a call.
+    Call(Request),
+}
+
+/// The connection between an examination and the simulated master.
+#[derive(Default)]
+struct Line {
+    now: Option<Instant>,
+    question: Option<Question>,
+    answer: Option<Result<Reply, ExamineError>>,
+}
+
+/// The simulated master, for an examination.
+struct SimulatedMaster(Arc<Mutex<Line>>);
+
+impl SimulatedMaster {
+    async fn ask(&self, question: Question) -> Result<Reply, ExamineError> {
+        self.0.lock().unwrap().question = Some(question);
+        std::future::poll_fn(|_| match self.0.lock().unwrap().answer.take() {
+            Some(answer) => Poll::Ready(answer),
+            None => Poll::Pending,
+        })
+        .await
+    }
+}
+
+impl Contact for SimulatedMaster {
+    async fn settle(&mut self) -> Result<(), ExamineError> {
+        self.ask(Question::Settle).await.map(|_| ())
+    }
+
+    async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
+        let reply = self.call(Inspection::call(token)).await?;
+        Ok(Inspection::decode(&reply, token).unwrap())
+    }
+
+    async fn second_look(
+        &mut self,
+        first: Inspection,
+        previous: &Master,
+    ) -> Result<Master, ExamineError> {
+        let second = match first.second_call(previous) {
+            Some(call) => Some(self.call(call).await?),
+            None => None,
+        };
+        Ok(first.into_master(second.as_ref(), previous).unwrap())
+    }
+
+    async fn call(&mut self, call: Request) -> Result<Reply, ExamineError> {
+        self.ask(Question::Call(call)).await
+    }
+
+    async fn inject(&mut self, plan: &Plan) -> Result<RawReply, ExamineError> {
+        let call = Request::decode(plan.request()).unwrap();
+        let reply = self.call(call).await?;
+        Ok(raw(&reply))
+    }
+
+    async fn is_dead(&mut self, _: &str) -> bool {
+        false
+    }
+
+    async fn may_be_of_roscore(&mut self, _: i32) -> bool {
+        false
+    }
+
+    fn python(&self) -> Python {
+        Python::default()
+    }
+
+    fn now(&self) -> Instant {
+        self.0.lock().unwrap().now.unwrap()
+    }
+
+    fn discard(&self, _: Plan) {}
+}
+
+/// The end of a step.
+enum Outcome {
+    Examined(Result<Examination, ExamineError>),
+    CaughtUp(Result<bool, ExamineError>),
+}
+
+/// The notifications that an earlier process may have owed to nodes, as in `recovery::News`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum News {
+    Owed,
+    SentFirst,
+    Sent,
+}
+
 /// The recovery's part of the world.
 pub(super) struct Recovery {
     pub(super) supervision: Supervision,
     lifecycle: Lifecycle,
+    examiner: Examiner,
     /// The last step that began. An earlier one has been dropped.
     step: u64,
-    /// Whether the step is under way.
+    /// Whether a step without a future is under way.
     is_busy: bool,
+    /// The examination that is under way.
+    examination: Option<Pin<Box<dyn Future<Output = Outcome>>>>,
+    line: Arc<Mutex<Line>>,
+    /// Number of the last question of an examination.
+    questions: u64,
+    /// How long the examination waits for an answer, in microseconds.
+    silent_most: u64,
+    /// Whether the master has just been started by rosrescue, and has not been called yet.
+    is_unused: bool,
     /// The master that the connection belongs to.
     connected: Option<u64>,
     /// The last probe, if it is awaited.
     probe: Option<u64>,
     probes: u64,
-    /// The state that the master gets at the end of the injection, unless it keeps its own.
-    target: Option<Master>,
-    writes: Vec<Request>,
-    is_new: bool,
+    /// When calls last ceased to pass to the master.
+    outage: Instant,
+    /// When nodes get the notifications that they may lack.
+    telling: Option<Telling>,
+    /// Whether nodes lack notifications of a process of rosrescue that has ended.
+    news: News,
     /// When the mirror's own notifications are due in an outage.
     owed_told: bool,
 }
 
 impl Recovery {
-    pub(super) fn new(supervision: Supervision) -> Self {
+    pub(super) fn new(examiner: Examiner, is_restored: bool) -> Self {
+        let supervision = examiner.supervision;
         Self {
             supervision,
             lifecycle: Lifecycle::new(supervision, PROBING),
+            examiner,
             step: 0,
             is_busy: false,
+            examination: None,
+            line: Arc::default(),
+            questions: 0,
+            silent_most: SILENT_MOST,
+            is_unused: false,
             connected: None,
             probe: None,
             probes: 0,
-            target: None,
-            writes: Vec::new(),
-            is_new: false,
+            outage: Instant::now(),
+            telling: None,
+            news: match is_restored {
+                true => News::Owed,
+                false => News::Sent,
+            },
             owed_told: false,
         }
+    }
+
+    pub(super) fn set_gate(&self, state: State) {
+        self.examiner.gate.set(state);
+    }
+
+    /// A new connection for an examination.
+    fn contact(&mut self) -> SimulatedMaster {
+        self.line = Arc::default();
+        SimulatedMaster(self.line.clone())
+    }
+
+    /// The numbers that the next process must not use again.
+    pub(super) fn numbers(&self) -> (u64, u64, u64) {
+        (self.step, self.questions, self.probes)
+    }
+
+    pub(super) fn go_on_from(&mut self, (step, questions, probes): (u64, u64, u64)) {
+        (self.step, self.questions, self.probes) = (step + 1, questions + 1, probes + 1);
     }
 
     pub(super) fn deadline(&self) -> Option<Instant> {
@@ -93,11 +242,14 @@ impl World {
     /// Passes `input` to the lifecycle and carries out what follows.
     pub(super) fn recover(&mut self, input: Input) {
         self.print(|| format!("recovery: {input:?}"));
+        if matches!(input, Input::Refused | Input::Unreachable) {
+            self.send_news();
+        }
         if matches!(
             input,
             Input::ConnectionLost | Input::Exited | Input::Unreachable
         ) {
-            if self.gate == State::Injecting {
+            if self.gate() == State::Injecting {
                 let now = self.instant();
                 self.recovery.lifecycle.on(now, Input::Answered);
             }
@@ -119,6 +271,9 @@ impl World {
     }
 
     pub(super) fn wake_recovery(&mut self) {
+        if self.is_down {
+            return;
+        }
         if self
             .recovery
             .deadline()
@@ -136,21 +291,31 @@ impl World {
                 self.begin(time, Event::Connects);
             }
             Action::Examine => {
-                let time = 300 + self.dice.below(3_000);
-                self.begin(time, Event::Inspects);
+                let examiner = self.recovery.examiner.clone();
+                let is_unused = std::mem::take(&mut self.recovery.is_unused);
+                let manner = Manner {
+                    known: examiner.known(is_unused.then_some(1)),
+                    prepared: None,
+                };
+                let mut master = self.recovery.contact();
+                self.examine(SILENT_MOST, async move {
+                    Outcome::Examined(examiner.examine(&mut master, manner).await)
+                });
             }
             Action::Probe => {
                 self.recovery.probes += 1;
                 let probe = self.recovery.probes;
                 self.recovery.probe = Some(probe);
                 self.then(PROBE_TIMEOUT, Event::ProbeMissed(probe));
-                if !self.recovery.is_busy && self.master.is_some() {
+                let is_idle = !self.recovery.is_busy && self.recovery.examination.is_none();
+                if is_idle && self.master.is_some() {
                     let time = self.awake_in() + 200;
                     self.begin(time, Event::ProbeAnswered);
                 }
             }
             Action::ShutGate(cause) => {
                 self.keep_shut();
+                self.recovery.outage = self.instant();
                 if cause == Cause::Hung {
                     self.disconnect();
                     self.may_go_back = true;
@@ -159,30 +324,20 @@ impl World {
             Action::StandIn => self.set_gate(State::Late),
             Action::CatchUp => {
                 self.recovery.probe = None;
-                self.set_gate(State::Injecting);
-                let now = self.instant();
-                match self.ledger.begin_catch_up(now) {
-                    None => return self.recover(Input::NotCaughtUp),
-                    Some(CatchUp::Nothing) => return self.recover(Input::CaughtUp),
-                    Some(CatchUp::Run(missed)) => {
-                        let held = self.master.as_ref().map(|master| &master.state);
-                        if held.is_some_and(|held| *held != missed.behind) {
-                            self.broken
-                                .push("a late master is not where it should be".to_owned());
-                        }
-                        self.recovery.writes = missed.writes;
-                    }
-                }
-                let time = self.awake_in() + 300 + self.dice.below(1_000);
-                self.begin(time, Event::CatchesUp);
+                let examiner = self.recovery.examiner.clone();
+                let mut master = self.recovery.contact();
+                self.examine(CATCH_UP_MOST, async move {
+                    Outcome::CaughtUp(examiner.catch_up(&mut master).await)
+                });
             }
             Action::OpenGate => {
-                let incarnation = self.ledger.serve();
+                self.recovery.examiner.open_gate();
                 self.recovery.owed_told = false;
-                self.set_gate(State::Open { incarnation });
             }
             Action::Spawn => {
+                self.send_news();
                 self.start_master();
+                self.recovery.is_unused = true;
                 self.recover(Input::Spawned);
             }
             Action::Kill => {
@@ -211,13 +366,118 @@ impl World {
         self.after(time, super::Event::Recovery(event));
     }
 
+    /// Begins an examination, and drops the step that is under way.
+    fn examine(&mut self, silent_most: u64, examination: impl Future<Output = Outcome> + 'static) {
+        let time = 20 + self.dice.below(200);
+        self.begin(time, Event::Begins);
+        let recovery = &mut self.recovery;
+        recovery.is_busy = false;
+        recovery.silent_most = silent_most;
+        recovery.examination = Some(Box::pin(examination));
+    }
+
+    /// Lets the examination go on until it waits for the master, and asks the master.
+    fn go_on(&mut self) {
+        let now = self.instant();
+        let Some(examination) = &mut self.recovery.examination else {
+            return;
+        };
+        self.recovery.line.lock().unwrap().now = Some(now);
+        let context = &mut Context::from_waker(Waker::noop());
+        if let Poll::Ready(outcome) = examination.as_mut().poll(context) {
+            self.recovery.examination = None;
+            return self.ends(outcome);
+        }
+        let question = self.recovery.line.lock().unwrap().question.take();
+        let step = self.recovery.step;
+        match question {
+            Some(Question::Settle) => self.settles(step),
+            Some(Question::Call(call)) => {
+                self.recovery.questions += 1;
+                let number = self.recovery.questions;
+                if let Some(master) = &mut self.master {
+                    master.running += 1;
+                    let time = 20 + self.dice.below(200);
+                    let of = Asked::Examination(step, number);
+                    self.after(time, super::Event::MasterGets(self.life, of, Some(call)));
+                }
+                self.then(self.recovery.silent_most, Event::Silent(step, number));
+            }
+            None => {}
+        }
+    }
+
+    fn settles(&mut self, step: u64) {
+        match self
+            .master
+            .as_ref()
+            .is_some_and(|master| master.running > 0)
+        {
+            true => self.then(SETTLE_PAUSE, Event::Settles(step)),
+            false => {
+                let nothing = Reply::Value(Value::Bool(true));
+                self.answer_examination(step, self.recovery.questions, Ok(nothing));
+            }
+        }
+    }
+
+    /// Answers the question `number` of an examination, if it still waits for that.
+    pub(super) fn answer_examination(
+        &mut self,
+        step: u64,
+        number: u64,
+        answer: Result<Reply, ExamineError>,
+    ) {
+        if (self.recovery.step, self.recovery.questions) == (step, number) {
+            self.recovery.questions += 1;
+            self.recovery.line.lock().unwrap().answer = Some(answer);
+            self.go_on();
+        }
+    }
+
+    fn ends(&mut self, outcome: Outcome) {
+        self.print(|| match &outcome {
+            Outcome::Examined(Ok(examination)) => format!("examined: {:?}", examination.outcome),
+            Outcome::Examined(Err(error)) => format!("not examined: {error}"),
+            Outcome::CaughtUp(result) => format!("caught up: {result:?}"),
+        });
+        match outcome {
+            Outcome::Examined(Ok(examination)) => {
+                if !examination.mismatches.is_empty() {
+                    let mistake = format!("mismatches: {:?}", examination.mismatches);
+                    self.broken.push(mistake);
+                }
+                let outcome = examination.outcome;
+                let news = std::mem::replace(&mut self.recovery.news, News::Sent);
+                let sent = news == News::SentFirst && outcome == RecoveryOutcome::Injected;
+                if !self.recovery.lifecycle.has_served() && !sent {
+                    let now = self.instant();
+                    self.ledger
+                        .with_activity(|mirror, activity| activity.notice_all(mirror, now));
+                }
+                self.recovery.telling = Telling::after(outcome, news == News::Owed);
+                let new = outcome.is_new();
+                self.recover(Input::Examined { new });
+                let time = self.dice.below(20_000);
+                self.then(time, Event::Checks);
+            }
+            Outcome::Examined(Err(error)) => self.recover(error.as_input()),
+            Outcome::CaughtUp(Ok(true)) => {
+                self.caught_up += 1;
+                self.recover(Input::CaughtUp);
+            }
+            Outcome::CaughtUp(_) => self.recover(Input::NotCaughtUp),
+        }
+    }
+
     fn disconnect(&mut self) {
-        if !self.gate.is_open() {
+        if !self.gate().is_open() {
             self.keep_shut();
         }
         let recovery = &mut self.recovery;
         recovery.step += 1;
         (recovery.is_busy, recovery.connected, recovery.probe) = (false, None, None);
+        recovery.examination = None;
     }
 
     fn keep_shut(&mut self) {
@@ -226,12 +486,15 @@ impl World {
             true => State::StandingIn,
             false => State::Unknown,
         });
-        if self.gate == State::StandingIn && !self.recovery.owed_told {
+        if self.gate() == State::StandingIn && !self.recovery.owed_told {
             self.then(OWED_AFTER, Event::OwesInOutage);
         }
     }
 
     pub(super) fn recovers(&mut self, event: Event) {
+        if self.is_down && !matches!(event, Event::Started) {
+            return;
+        }
         let is_step = |world: &Self, step| world.recovery.step == step;
         match event {
             Event::ConnectionEnds(life) if self.recovery.connected == Some(life) => {
@@ -251,24 +514,11 @@ impl World {
                     self.recover(Input::Refused);
                 }
             }
-            Event::Inspects(step) if is_step(self, step) => self.inspects(),
-            Event::Injects(step) if is_step(self, step) && self.master.is_some() => {
-                self.injects();
-            }
-            Event::Silent(step) if is_step(self, step) => {
-                self.recovery.is_busy = false;
-                self.recover(Input::Unreachable);
-            }
-            Event::CatchesUp(step) if is_step(self, step) && self.master.is_some() => {
-                self.recovery.is_busy = false;
-                for write in std::mem::take(&mut self.recovery.writes) {
-                    self.run(&write);
-                }
-                self.ledger.delivered();
-                let master = self.master.as_mut().unwrap();
-                master.incarnation = Some(self.ledger.incarnation());
-                self.caught_up += 1;
-                self.recover(Input::CaughtUp);
+            Event::Begins(step) if is_step(self, step) => self.go_on(),
+            Event::Settles(step) if is_step(self, step) => self.settles(step),
+            Event::Silent(step, number) => {
+                let limit = Duration::from_micros(self.recovery.silent_most);
+                self.answer_examination(step, number, Err(ExamineError::Silent { limit }));
             }
             Event::ProbeAnswered(step) if is_step(self, step) && self.master.is_some() => {
                 self.recovery.is_busy = false;
@@ -283,7 +533,7 @@ impl World {
                 self.recovery.probe = None;
                 self.recover(Input::ProbeMissed);
             }
-            Event::OwesInOutage if self.gate == State::StandingIn => {
+            Event::OwesInOutage if self.gate() == State::StandingIn => {
                 let now = self.instant();
                 let again = self.ledger.with_order(|order, _| order.master_is_away(now));
                 match again {
@@ -294,112 +544,18 @@ impl World {
                     }
                     None => {
                         self.recovery.owed_told = true;
-                        self.queue_owed(Telling::Now);
+                        self.ledger.queue_owed(now, now, Telling::Now);
                     }
                 }
             }
-            Event::Checks if self.gate.is_open() => {
-                let telling = match self.recovery.is_new {
-                    true => Telling::Now,
-                    false => {
-                        self.ledger
-                            .with_activity(|_, activity| activity.tell_again());
-                        Telling::Twice
-                    }
-                };
-                self.queue_owed(telling);
+            Event::Checks if self.gate().is_open() => {
+                if let Some(telling) = self.recovery.telling {
+                    let (now, outage) = (self.instant(), self.recovery.outage);
+                    self.ledger.queue_owed(now, outage, telling);
+                }
             }
             Event::Checks => self.then(1_000, Event::Checks),
             _ => {}
-        }
-    }
-
-    /// The master has been read, and gets the mirror's state if it does not hold it.
-    fn inspects(&mut self) {
-        self.recovery.is_busy = false;
-        let wait = self.awake_in();
-        let Some(master) = &self.master else { return };
-        let bears = match master.incarnation {
-            None => Bears::Nothing,
-            Some(number) if number == self.ledger.incarnation() => Bears::Present,
-            Some(number) if number < self.ledger.incarnation() => Bears::Earlier,
-            Some(number) => Bears::Later(number),
-        };
-        let (found, running) = (master.state.clone(), master.running);
-        let known = match (self.ledger.has_served_present(), bears) {
-            (_, Bears::Nothing) => KnownMaster::New { pid: 1 },
-            (None, _) => KnownMaster::Nothing,
-            (Some(true), _) => KnownMaster::ServedIfPresent,
-            (Some(false), _) => KnownMaster::InjectedIfPresent,
-        };
-        if wait > 0 {
-            return self.wait_silently(wait, Event::Inspects);
-        }
-        let serves = known == KnownMaster::ServedIfPresent && bears == Bears::Present;
-        if serves && self.ledger.resume() {
-            self.ledger.doubt();
-            return self.is_examined(false);
-        }
-        if running > 0 {
-            // Calls of closed connections still run.
-            return self.begin(5_000, Event::Inspects);
-        }
-        self.ledger.settled();
-        self.set_gate(State::Injecting);
-        if let Bears::Later(number) = bears {
-            self.ledger.catch_up(number);
-        }
-        let Basis {
-            mirror, pending, ..
-        } = self.ledger.begin_injection();
-        let treatment = replay::treatment(bears, known, mirror.is_empty(), found.is_empty());
-        let (state, replaces) = match treatment {
-            Treatment::Reconcile(authority) => {
-                let state = replay::reconcile(&mirror, &found, &pending, authority);
-                let replaces = state != found;
-                if !replaces && pending.is_empty() {
-                    self.ledger.delivered();
-                    self.ledger.adopt(found);
-                    return self.is_examined(false);
-                }
-                (state, replaces)
-            }
-            _ => (mirror.clone(), true),
-        };
-        if state != mirror {
-            self.ledger.adopt(state.clone());
-        }
-        if bears == Bears::Nothing {
-            self.ledger.with_order(|order, _| order.master_is_gone());
-        }
-        self.ledger.succeed();
-        self.recovery.is_new = bears == Bears::Nothing;
-        self.recovery.target = replaces.then_some(state);
-        let time = 300 + self.dice.below(5_000);
-        self.begin(time, Event::Injects);
-    }
-
-    fn injects(&mut self) {
-        let wait = self.awake_in();
-        if wait > 0 {
-            return self.wait_silently(wait, Event::Injects);
-        }
-        self.recovery.is_busy = false;
-        let incarnation = self.ledger.incarnation();
-        let master = self.master.as_mut().unwrap();
-        if let Some(state) = self.recovery.target.take() {
-            master.state = state;
-        }
-        master.incarnation = Some(incarnation);
-        self.ledger.delivered();
-        self.is_examined(self.recovery.is_new);
-    }
-
-    /// Waits for a master that does nothing for `time`, or gives up.
-    fn wait_silently(&mut self, time: u64, then: impl FnOnce(u64) -> Event) {
-        match time < SILENT_MOST {
-            true => self.begin(time + 100, then),
-            false => self.begin(SILENT_MOST, Event::Silent),
         }
     }
 
@@ -409,16 +565,14 @@ impl World {
         self.master = Some(Process::new(listens));
     }
 
-    fn is_examined(&mut self, new: bool) {
-        self.recovery.is_new = new;
-        self.recover(Input::Examined { new });
-        let time = self.dice.below(20_000);
-        self.then(time, Event::Checks);
-    }
-
-    /// Queues owed notifications, as `nodes::notify_owed` does.
-    fn queue_owed(&mut self, telling: Telling) {
-        let now = self.instant();
-        self.ledger.queue_owed(now, now, telling);
+    /// Sends the notifications that an earlier process may have owed, as `Driver::send_news` does.
+    fn send_news(&mut self) {
+        if self.recovery.news == News::Owed {
+            self.recovery.news = News::SentFirst;
+            let now = self.instant();
+            self.ledger
+                .with_activity(|mirror, activity| activity.notice_all(mirror, now));
+            self.ledger.queue_owed(now, now, Telling::Twice);
+        }
     }
 }

@@ -1,0 +1,264 @@
+//! The process of rosrescue. It dies, and the next one goes on with what the last one has written to the disk.
+
+use std::{
+    pin::Pin,
+    task::{Context, Poll, Waker},
+};
+
+use checkpoint_store::{Store, StoreError};
+use rescue_core::checkpoint::session::{self, Rebuilt};
+use tempfile::TempDir;
+
+use super::*;
+use crate::write_queue::dispatcher::Answers;
+
+type Writing = Pin<Box<dyn Future<Output = Option<Result<(), StoreError>>>>>;
+
+/// The disk with the checkpoint.
+pub(super) struct Disk {
+    folder: TempDir,
+    is_writing: bool,
+    /// A complete checkpoint that is being written.
+    whole: Option<Writing>,
+    /// Answers that wait for the disk.
+    answers: Vec<Answers>,
+}
+
+impl Disk {
+    pub(super) fn new() -> Self {
+        // A disk in memory, if there is one: each schedule has its own folder.
+        let folder = TempDir::new_in("/dev/shm").or_else(|_| TempDir::new());
+        Self {
+            folder: folder.unwrap(),
+            is_writing: false,
+            whole: None,
+            answers: Vec::new(),
+        }
+    }
+}
+
+/// The parts of rosrescue that end with its process.
+pub(super) struct Parts {
+    pub(super) ledger: Arc<Ledger>,
+    pub(super) dispatcher: Dispatcher,
+    pub(super) gate: gate::Rx,
+    pub(super) recovery: Recovery,
+    is_restored: bool,
+}
+
+impl Parts {
+    /// Begins with what is on the disk.
+    pub(super) fn begin(
+        disk: Option<&Disk>,
+        supervision: Supervision,
+        stats: &'static Stats,
+    ) -> Self {
+        let opened = disk.map(|disk| Store::open(&disk.folder.path().join("chkpt.yaml")).unwrap());
+        let (store, loaded) = opened.unzip();
+        let rebuilt = loaded
+            .flatten()
+            .map(|it| session::rebuild(it.checkpoint, it.records));
+        let Rebuilt {
+            mirror,
+            session,
+            pending,
+            displaced,
+            ..
+        } = rebuilt.unwrap_or_default();
+        let is_restored = session.is_some();
+        let session = session.unwrap_or_else(|| Session {
+            mark: "robot".to_owned(),
+            ..Session::default()
+        });
+        let sync = SyncPolicy::Interval;
+        let ledger = Arc::new(Ledger::new(mirror, session, pending, store, sync, stats));
+        ledger.write_by_hand();
+        if is_restored {
+            ledger.set_unconfirmed();
+            ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
+        }
+        let patience = Patience::new(Duration::from_micros(PATIENCE));
+        let (gate_tx, gate) = gate::gate();
+        let examiner = Examiner {
+            ledger: ledger.clone(),
+            gate: gate_tx,
+            supervision,
+            run_id: Arc::default(),
+            stats,
+        };
+        Self {
+            dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, patience),
+            ledger,
+            gate,
+            recovery: Recovery::new(examiner, is_restored),
+            is_restored,
+        }
+    }
+}
+
+impl World {
+    /// Lets the worker, whose parts are new, begin.
+    pub(super) fn begin_worker(&mut self, is_restored: bool) {
+        if self.disk.is_some() {
+            // Before the first complete checkpoint nothing is answered.
+            self.begin_checkpoint();
+            self.disk_writes();
+        }
+        let is_ours = self.recovery.supervision == Supervision::Ours;
+        self.recover(lifecycle::Input::Start {
+            left: is_ours && self.master.is_some(),
+            restored: is_restored,
+        });
+    }
+
+    /// The worker is killed.
+    pub(super) fn worker_dies(&mut self) {
+        let Some(disk) = self.disk.as_mut().filter(|_| !self.is_down) else {
+            return;
+        };
+        disk.answers.clear();
+        (disk.whole, disk.is_writing, self.is_down) = (None, false, true);
+        self.print(|| "rosrescue dies".to_owned());
+        self.may_go_back = true;
+        self.deaths += 1;
+        // Clients send again what was not answered.
+        let waiting = std::mem::take(&mut self.waiting).into_iter();
+        let unwritten = std::mem::take(&mut self.unwritten).into_values();
+        let calls = waiting.map(|it| (it.node, it.call));
+        let calls: Vec<_> = calls
+            .chain(unwritten.map(|it| (it.node, it.call)))
+            .collect();
+        for (node, call) in calls {
+            if call.kind() != Kind::Read {
+                self.sent_again.push(call.clone());
+            }
+            let time = 1_000 + self.dice.below(3_000);
+            self.after(time, Event::Arrives(node, call));
+        }
+        self.bodies.retain(|_, event| {
+            matches!(
+                event,
+                Event::Arrives(..)
+                    | Event::MasterGets(..)
+                    | Event::Heard(..)
+                    | Event::MasterNotifies(..)
+                    | Event::TakenFromMaster(..)
+                    | Event::Dies
+                    | Event::Breaks
+                    | Event::Bypasses
+                    | Event::Compares
+                    | Event::WorkerDies
+                    | Event::Recovery(recovery::Event::Started | recovery::Event::Exits(_))
+            )
+        });
+        (self.in_flight, self.next_tick) = (None, None);
+        // The store must release its lock.
+        self.ledger.drop_jobs();
+        self.replace(false);
+        self.ports.clear();
+        let time = 3_000 + self.dice.below(80_000);
+        self.after(time, Event::WorkerStarts);
+    }
+
+    /// Replaces the parts that end with the process, with those of a process that reads the disk or does not. Returns
+    /// whether there was a state.
+    fn replace(&mut self, reads: bool) -> bool {
+        let disk = self.disk.as_ref().filter(|_| reads);
+        let (supervision, numbers) = (self.recovery.supervision, self.recovery.numbers());
+        let parts = Parts::begin(disk, supervision, self.stats);
+        self.ledger = parts.ledger;
+        (self.dispatcher, self.gate) = (parts.dispatcher, parts.gate);
+        self.recovery = parts.recovery;
+        self.recovery.go_on_from(numbers);
+        parts.is_restored
+    }
+
+    /// The next worker starts.
+    pub(super) fn worker_starts(&mut self) {
+        self.print(|| "rosrescue starts".to_owned());
+        let is_restored = self.replace(true);
+        self.is_down = false;
+        self.begin_worker(is_restored);
+    }
+
+    /// Gives answers once the disk has what they need.
+    pub(super) fn give(&mut self, answers: Answers) {
+        match &mut self.disk {
+            Some(disk) if (answers.mark, answers.version) != (None, None) => {
+                disk.answers.push(answers);
+            }
+            _ => answers.give(true),
+        }
+    }
+
+    /// Lets the disk begin what is due.
+    pub(super) fn wake_disk(&mut self) {
+        let Some(disk) = &self.disk else { return };
+        if disk.whole.is_none() && self.ledger.checkpoint_due() {
+            self.begin_checkpoint();
+        }
+        let Some(disk) = &mut self.disk else { return };
+        if !disk.is_writing && self.ledger.has_jobs() {
+            disk.is_writing = true;
+            let time = match self.dice.below(30) {
+                0 => self.dice.below(200_000),
+                1..4 => self.dice.below(10_000),
+                _ => 10 + self.dice.below(100),
+            };
+            self.after(time, Event::DiskWrites);
+        }
+        self.give_safe();
+    }
+
+    pub(super) fn disk_writes(&mut self) {
+        self.ledger.run_jobs();
+        let Some(disk) = &mut self.disk else { return };
+        disk.is_writing = false;
+        self.poll_checkpoint();
+        self.give_safe();
+    }
+
+    fn begin_checkpoint(&mut self) {
+        let ledger = self.ledger.clone();
+        let write = async move {
+            ledger
+                .on_store_whole(|store, checkpoint| store.begin(&checkpoint))
+                .await
+        };
+        if let Some(disk) = &mut self.disk {
+            disk.whole = Some(Box::pin(write));
+        }
+        self.poll_checkpoint();
+    }
+
+    fn poll_checkpoint(&mut self) {
+        let disk = self.disk.as_mut();
+        let Some(whole) = disk.and_then(|disk| disk.whole.as_mut()) else {
+            return;
+        };
+        let context = &mut Context::from_waker(Waker::noop());
+        if let Poll::Ready(result) = whole.as_mut().poll(context) {
+            let result = result.expect("there is a store");
+            self.ledger.set_attempted(result.as_ref().map(|_| ()));
+            if let Some(disk) = &mut self.disk {
+                disk.whole = None;
+            }
+        }
+    }
+
+    fn give_safe(&mut self) {
+        let Some(disk) = &mut self.disk else { return };
+        let (safe, waiting): (Vec<_>, Vec<_>) = std::mem::take(&mut disk.answers)
+            .into_iter()
+            .partition(|answers| {
+                let waits = answers.mark.and_then(|mark| self.ledger.to_await(mark));
+                let is_written = |version| self.ledger.has_attempted(version);
+                waits.is_none() && answers.version.is_none_or(is_written)
+            });
+        disk.answers = waiting;
+        for answers in safe {
+            answers.give(true);
+        }
+        self.collect();
+    }
+}
