@@ -568,7 +568,7 @@ async fn merge(
     };
     let uri = MasterUri::parse(&uri).ok()?;
     let leader = peers.at(&uri);
-    let body = Bytes::from(xmlrpc::encode_call(&ask.to_request().into()));
+    let body = Bytes::from(ask.to_request().encode());
     let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
     let reply = xmlrpc::decode_reply(&raw.body).ok()?;
     wire::MergeAnswer::read(&reply, ask.calls.len())

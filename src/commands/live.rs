@@ -88,7 +88,7 @@ impl Live {
         let failed = |why: String| {
             CommandFailure::Failed(format!("the calls to {} failed: {why}", self.uri))
         };
-        let call = Request::multicall(calls).into();
+        let call = Request::multicall(calls);
         let reply = timeout(ANSWER_LIMIT, self.connection.call(&call)).await;
         let reply =
             reply.map_err(|_| failed(format!("no answer in {} s", ANSWER_LIMIT.as_secs())))?;

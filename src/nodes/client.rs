@@ -116,7 +116,7 @@ async fn connect(address: &MasterUri, limit: Duration) -> Result<Connection, Rea
 }
 
 async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Value>) {
-    match connection.call(call).await {
+    match connection.call_node(call).await {
         Ok(Reply::Value(Value::Array(answer))) => {
             let mut answer = answer.into_iter();
             let success = answer.next() == Some(Value::Int(1));

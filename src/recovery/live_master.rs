@@ -96,7 +96,7 @@ impl Reach {
     pub(super) async fn has_run_id(&self) -> bool {
         let asked = async {
             let mut connection = self.upstream.connect().await?;
-            let reply = connection.call(&replay::has_run_id().into()).await?;
+            let reply = connection.call(&replay::has_run_id()).await?;
             Ok::<_, ExamineError>(reply)
         };
         let reply = within(self.probe_timeout, asked).await;
@@ -176,7 +176,6 @@ impl Contact for LiveMaster {
     }
 
     async fn call(&mut self, call: Request) -> Result<Reply, ExamineError> {
-        let call = call.into();
         let reply = self.connection.call(&call);
         self.reach.while_alive(reply).await
     }

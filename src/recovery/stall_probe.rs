@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use ros1_master::master;
+use ros1_master::master::{CALLER_ID, Method, Request};
 
 use super::live_master::Reach;
 
@@ -12,7 +12,7 @@ impl Reach {
     /// master still answers.
     pub(super) async fn silence(&self) -> Duration {
         let (probing, patience) = (self.probing, self.probe_timeout);
-        let sign_of_life = master::get_pid();
+        let sign_of_life = Request::new(Method::GetPid, [CALLER_ID]);
         let mut missed = 0;
         while missed < probing.count {
             if missed == 0 {

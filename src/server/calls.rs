@@ -441,7 +441,7 @@ impl Calls {
         let mut whole = ListWriter::answer();
         for part in parts {
             let part = Arc::new(part);
-            let body = xmlrpc::encode_call(&Request::clone(&part).into());
+            let body = part.encode();
             // Each part's answer counts as written when it arrives. That is safe, because no node makes so many calls
             // at once about something of which it is also notified.
             let (answer, delivery) = self

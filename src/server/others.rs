@@ -19,7 +19,7 @@ use rescue_core::{
 };
 use ros1_master::{
     master::{Kind, Request},
-    xmlrpc::{self, Reply},
+    xmlrpc::Reply,
 };
 use tokio::{
     runtime::Handle,
@@ -166,7 +166,7 @@ impl Drop for PassOn {
         };
         let (leader, term) = (self.leader.clone(), self.term);
         let call = Control::answer_passed_on(&self.number);
-        let body = Bytes::from(xmlrpc::encode_call(&call.into()));
+        let body = Bytes::from(call.encode());
         runtime.spawn(async move {
             if let Err(error) = leader.forward(term, &Head::default(), &body).await {
                 tracing::debug!(%error, "could not tell the leader that an answer was passed on");

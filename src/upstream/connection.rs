@@ -19,7 +19,10 @@ use hyper::{
     },
 };
 use hyper_util::rt::TokioIo;
-use ros1_master::xmlrpc::{self, Call, Python, Reply};
+use ros1_master::{
+    master,
+    xmlrpc::{self, Python, Reply},
+};
 use tokio::{net::TcpStream, time::timeout};
 
 use super::{
@@ -233,9 +236,19 @@ impl Connection {
         Ok(reply)
     }
 
-    pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
-        let body = Bytes::from(xmlrpc::encode_call(call));
-        let reply = self.forward(&Head::default(), body).await?;
+    /// Makes a call to a master.
+    pub async fn call(&mut self, call: &master::Request) -> Result<Reply, CallError> {
+        self.decoded(call.encode()).await
+    }
+
+    /// Like [`Self::call`], for a call of a node's slave API.
+    pub async fn call_node(&mut self, call: &xmlrpc::Call) -> Result<Reply, CallError> {
+        self.decoded(xmlrpc::encode_call(call)).await
+    }
+
+    /// Sends `body` and decodes the reply.
+    async fn decoded(&mut self, body: Vec<u8>) -> Result<Reply, CallError> {
+        let reply = self.forward(&Head::default(), Bytes::from(body)).await?;
         match reply.body.len() > LONG {
             true => tokio::task::block_in_place(|| reply.decode()),
             false => reply.decode(),

@@ -44,7 +44,7 @@ async fn inspect_with(
     call: Request,
     token: &Token,
 ) -> Result<Inspection, InspectError> {
-    let reply = connection.call(&call.into()).await?;
+    let reply = connection.call(&call).await?;
     Ok(Inspection::decode(&reply, token)?)
 }
 
@@ -66,7 +66,7 @@ pub(crate) async fn second(
         );
     }
     let second = match first.second_call(previous) {
-        Some(call) => Some(connection.call(&call.into()).await?),
+        Some(call) => Some(connection.call(&call).await?),
         None => None,
     };
     Ok(tokio::task::block_in_place(|| {

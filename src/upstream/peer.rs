@@ -10,7 +10,7 @@ use std::{
 
 use bytes::Bytes;
 use hyper::StatusCode;
-use ros1_master::{master, xmlrpc};
+use ros1_master::master::{CALLER_ID, Method, Request};
 use thiserror::Error;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
@@ -151,8 +151,8 @@ impl Peer {
 
     /// Whether the other computer confirms that it leads in `term`.
     pub(crate) async fn leads(&self, term: u64) -> bool {
-        let call = master::get_pid();
-        let body = Bytes::from(xmlrpc::encode_call(&call));
+        let call = Request::new(Method::GetPid, [CALLER_ID]);
+        let body = Bytes::from(call.encode());
         self.forward(term, &Head::default(), &body).await.is_ok()
     }
 }

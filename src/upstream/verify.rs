@@ -124,7 +124,7 @@ pub(crate) async fn probe(
 }
 
 async fn look_up(connection: &mut Connection, token: &Token) -> Result<(), VerifyError> {
-    match Token::is_found(&connection.call(&token.lookup().into()).await?) {
+    match Token::is_found(&connection.call(&token.lookup()).await?) {
         true => Ok(()),
         false => Err(VerifyError::OtherIncarnation),
     }

@@ -10,7 +10,7 @@ use rescue_core::{
 };
 use ros1_master::{
     master::{Entry, Kind, Method, Request, entry_reply},
-    xmlrpc::{self, Reply, Value},
+    xmlrpc::{Reply, Value},
 };
 use tokio::sync::oneshot;
 
@@ -286,15 +286,14 @@ pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
         return (head.clone(), body.clone());
     }
     let calls = items.iter().filter_map(|item| item.call.as_deref());
-    let call = match items {
+    let body = match items {
         [
             Item {
                 call: Some(call), ..
             },
-        ] => Request::clone(call),
-        _ => Request::multicall(calls.cloned()),
+        ] => call.encode(),
+        _ => Request::multicall(calls.cloned()).encode(),
     };
-    let body = xmlrpc::encode_call(&call.into());
     (Head::default(), Bytes::from(body))
 }
 

@@ -15,7 +15,7 @@ use rescue_core::{
 };
 use ros1_master::{
     master::Request,
-    xmlrpc::{self, Reply, Value},
+    xmlrpc::{Reply, Value},
 };
 use tokio::sync::oneshot;
 
@@ -70,10 +70,8 @@ fn multicall<'a>(calls: impl IntoIterator<Item = &'a Request>) -> Request {
 }
 
 fn set_call(item: &mut Item, call: Request) {
-    let call = Arc::new(call);
-    let body = xmlrpc::encode_call(&Request::clone(&call).into());
-    item.raw = Some((Head::default(), body.into()));
-    item.call = Some(call);
+    item.raw = Some((Head::default(), call.encode().into()));
+    item.call = Some(Arc::new(call));
 }
 
 /// Leaves out writes that conflict with changes by other computers. If no write remains, answers the item and returns

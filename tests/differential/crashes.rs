@@ -228,12 +228,12 @@ pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) ->
     while !complete(&model) {
         assert!(Instant::now() < deadline, "core is never complete");
         let token = Token::new("none", 1);
-        let look = wire.call(&Inspection::call(&token).into()).unwrap();
+        let look = wire.ask(&Inspection::call(&token)).unwrap();
         let look = Inspection::decode(&look, &token).unwrap();
         let nothing = Master::default();
         let second = look
             .second_call(&nothing)
-            .map(|call| wire.call(&call.into()).unwrap());
+            .map(|call| wire.ask(&call).unwrap());
         // The next read sees a rosout that registers between the two requests.
         model = look
             .into_master(second.as_ref(), &nothing)

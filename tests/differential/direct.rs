@@ -153,7 +153,7 @@ fn succeed(
 fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     let mark = Token::new("none", 1);
     let mut look = |call: Request| {
-        wire.call(&call.into())
+        wire.ask(&call)
             .map(|reply| Inspection::decode(&reply, &mark))
     };
     let look = match look(Inspection::call(&mark))? {
@@ -168,7 +168,7 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
         return Err("the master has a token, although none was set".to_owned());
     }
     let second = match look.second_call(model) {
-        Some(call) => Some(wire.call(&call.into())?),
+        Some(call) => Some(wire.ask(&call)?),
         None => None,
     };
     let found = look

@@ -4,7 +4,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use ros1_master::{
-    master::Master,
+    master::{Master, Request},
     xmlrpc::{Call, Reply, Value, decode_reply, encode_call},
 };
 
@@ -106,6 +106,13 @@ impl Wire {
         self.receive()
     }
 
+    /// Like [`Self::call`], for a call that rosrescue makes.
+    pub(crate) fn ask(&mut self, call: &Request) -> Result<Reply, String> {
+        let sent = self.0.send(&http_request(&call.encode()));
+        sent.map_err(|error| format!("the call cannot be sent: {error}"))?;
+        self.receive()
+    }
+
     /// Process id and address of the master.
     pub(crate) fn identity(&mut self) -> (i32, String) {
         let mut ask = |method: &str| match self.call(&Call::new(method, vec!["/test".into()])) {
@@ -120,7 +127,7 @@ impl Wire {
     pub(crate) fn identify(&mut self, model: &mut Master) {
         let (pid, uri) = self.identity();
         model.set_identity(pid, uri);
-        let answer = self.call(&Master::ask_if_old().into()).unwrap();
+        let answer = self.ask(&Master::ask_if_old()).unwrap();
         model.set_old(Master::shows_old(&answer));
     }
 }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use ros1_master::{
-    master,
+    master::{self, CALLER_ID, Method, Request},
     xmlrpc::{Call, Value},
 };
 use serde::Deserialize;
@@ -98,7 +98,8 @@ pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
         let stream = TcpStream::connect(&*addresses.ok()?).await.ok()?;
         let connection = Connection::over(stream, address, MAX_REPLY).await;
         let mut connection = connection.ok()?;
-        connection.call(&master::get_pid()).await.ok()?;
+        let get_pid = Request::new(Method::GetPid, [CALLER_ID]);
+        connection.call(&get_pid).await.ok()?;
         Some(software::speaks(
             connection.keeps_alive()?,
             connection.server(),

@@ -5,7 +5,7 @@ use hyper::StatusCode;
 use rescue_core::checkpoint::format::{Record, RecordContent, Session};
 use ros1_master::{
     master::{Master, Method},
-    xmlrpc::{Value, decode_reply, encode_call, encode_reply},
+    xmlrpc::{Value, decode_reply, encode_reply},
 };
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
@@ -125,7 +125,7 @@ impl Computer {
             path: path.to_owned(),
             ..Head::default()
         };
-        let body = encode_call(&call.clone().into()).into();
+        let body = call.encode().into();
         let from = "127.0.0.1:4000".parse().unwrap();
         self.calls
             .answer(from, head, body, Some(call.clone()))

@@ -5,7 +5,7 @@ use super::*;
 use crate::{cli::SyncPolicy, ledger::Ledger};
 
 fn item(call: Request) -> Item {
-    let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));
+    let body = Bytes::from(call.encode());
     Item::new(Some((Head::default(), body)), Some(Arc::new(call))).0
 }
 

@@ -1,5 +1,7 @@
 //! A call, parsed once: its method, its parameters, and the entries of a multicall.
 
+use std::borrow::Cow;
+
 use super::{Kind, Method};
 use crate::xmlrpc::{self, Call, DecodeError, Python, Value};
 
@@ -24,7 +26,7 @@ const TOO_MANY: usize = 5;
 /// assert_eq!(request.kind(), Kind::Mutate);
 /// # Ok::<(), ros1_master::xmlrpc::DecodeError>(())
 /// ```
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
     method: Method,
     /// Empty for a multicall, which has entries instead.
@@ -33,7 +35,7 @@ pub struct Request {
 }
 
 /// One entry of a multicall.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Entry {
     /// An entry that can be run.
     Request(Request),
@@ -136,6 +138,11 @@ impl Request {
         xmlrpc::decode_call_for(body, python).map(Self::from)
     }
 
+    /// Encodes the call as the body of a request, like [`xmlrpc::encode_call`].
+    pub fn encode(&self) -> Vec<u8> {
+        xmlrpc::encode_call_of(self.method.name(), &self.wire_params())
+    }
+
     fn parse(method: Method, params: Vec<Value>, depth: usize) -> Self {
         let (params, entries) = match method {
             Method::Multicall => (Vec::new(), entries(params, depth)),
@@ -155,6 +162,26 @@ impl Request {
     /// The parameters, caller id first. Empty for a multicall.
     pub fn params(&self) -> &[Value] {
         &self.params
+    }
+
+    /// The parameters as they are sent. Those of a multicall are one list of its entries; an entry that cannot be run is
+    /// nil.
+    pub fn wire_params(&self) -> Cow<'_, [Value]> {
+        match self.method {
+            Method::Multicall => Cow::Owned(self.clone().into_wire_params()),
+            _ => Cow::Borrowed(&self.params),
+        }
+    }
+
+    fn into_wire_params(self) -> Vec<Value> {
+        if self.method != Method::Multicall {
+            return self.params;
+        }
+        let entries = self.entries.into_iter().map(|entry| match entry {
+            Entry::Request(request) => request.into_entry(),
+            Entry::Refused(_) | Entry::Malformed(_) => Value::Nil,
+        });
+        vec![Value::Array(entries.collect())]
     }
 
     pub fn entries(&self) -> &[Entry] {
@@ -252,18 +279,10 @@ impl From<Call> for Request {
     }
 }
 
-/// Converts a call. An entry of a multicall that cannot be run becomes nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
-        let mut params = request.params;
-        if request.method == Method::Multicall {
-            let entries = request.entries.into_iter().map(|entry| match entry {
-                Entry::Request(request) => request.into_entry(),
-                Entry::Refused(_) | Entry::Malformed(_) => Value::Nil,
-            });
-            params = vec![Value::Array(entries.collect())];
-        }
-        Self::new(request.method.name(), params)
+        let method = request.method.name().to_owned();
+        Self::new(method, request.into_wire_params())
     }
 }
 
@@ -475,9 +494,13 @@ mod tests {
     fn a_nested_multicall_is_parsed_completely_and_encoded_unchanged() {
         let nest =
             |levels| (0..levels).fold(call("setParam"), |inner, _| Request::multicall([inner]));
-        let deepest = Call::from(nest(MAX_NESTED));
-        assert_eq!(Call::from(Request::from(deepest.clone())), deepest);
-        let deeper = Request::from(Call::from(nest(MAX_NESTED + 2)));
+        let received = |call: &Request| {
+            let params = call.wire_params().into_owned();
+            Request::from(Call::new(call.method().name(), params))
+        };
+        let deepest = nest(MAX_NESTED);
+        assert_eq!(received(&deepest), deepest);
+        let deeper = received(&nest(MAX_NESTED + 2));
         assert_eq!((deeper.calls().len(), deeper.kind()), (0, Kind::Unknown));
         let calls = nest(3);
         assert_eq!(calls.calls(), [&call("setParam")]);

@@ -22,8 +22,13 @@ const BASE64_LINE: usize = 57;
 /// reference, because XML reads a bare one as a line feed. Characters that XML does not allow (a decoded
 /// document has none) are written unchanged, and the receiver refuses them.
 pub fn encode_call(call: &Call) -> Vec<u8> {
-    let mut writer = Writer::request(&call.method);
-    for param in &call.params {
+    encode_call_of(&call.method, &call.params)
+}
+
+/// Like [`encode_call`], for a call of `method` with `params`.
+pub(crate) fn encode_call_of(method: &str, params: &[Value]) -> Vec<u8> {
+    let mut writer = Writer::request(method);
+    for param in params {
         writer.raw("<param>");
         writer.value(param);
         writer.raw("</param>");

@@ -6,7 +6,7 @@ use super::changes::param_of;
 use crate::{
     cluster::mutant::Mutant,
     master::{Effect, Method, Request, Write},
-    xmlrpc::{self, Value},
+    xmlrpc::Value,
 };
 
 /// What a call registers or unregisters: for example, the node `caller` as a publisher of the topic `name`.
@@ -92,7 +92,7 @@ impl WritesToSend {
                 at.unregistrations.push((number, api));
             }
         } else {
-            let encoded = xmlrpc::encode_call(&call.clone().into());
+            let encoded = call.encode();
             let encoded = String::from_utf8_lossy(&encoded).into_owned();
             if let Some(before) = self.others.insert(encoded, number) {
                 self.calls.remove(&before);

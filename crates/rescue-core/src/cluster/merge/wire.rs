@@ -25,13 +25,12 @@ pub struct Ask {
 
 impl Ask {
     pub fn to_request(&self) -> Request {
-        let calls = Call::from(Request::multicall(self.calls.iter().cloned()));
+        let calls = Request::multicall(self.calls.iter().cloned())
+            .wire_params()
+            .into_owned();
         let seq = self.seq.to_string();
         let head = [CALLER_ID, &*self.id, seq.as_str()].map(Value::from);
-        Request::new(
-            Method::named(METHOD),
-            head.into_iter().chain(calls.params.into_iter().take(1)),
-        )
+        Request::new(Method::named(METHOD), head.into_iter().chain(calls))
     }
 
     /// Reads a request. `None` if it calls another method.
@@ -185,7 +184,7 @@ mod tests {
     }
 
     fn coded(request: Request) -> Request {
-        let body = crate::xmlrpc::encode_call(&request.into());
+        let body = request.encode();
         Request::decode(&body).unwrap()
     }
 
