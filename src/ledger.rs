@@ -250,7 +250,7 @@ impl Ledger {
                 }
             }
             if answered.executed && !is_recorded {
-                let call = answered.call.clone().into();
+                let call = answered.call.clone();
                 entries.push(RecordContent::labelled(call, Label { at, origin }));
                 sources.push(source);
             }
@@ -289,7 +289,7 @@ impl Ledger {
             return;
         }
         let at = clock::wall_millis();
-        let entry = RecordContent::labelled(Request::clone(call).into(), Label { at, origin });
+        let entry = RecordContent::labelled(Request::clone(call), Label { at, origin });
         self.stats.writes_recorded.count();
         inner.append(vec![entry]);
         inner.ahead = Some(call.clone());
@@ -314,7 +314,7 @@ impl Ledger {
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
         let (at, origin) = (clock::wall_millis(), Origin::Rosrescue);
         let label = Label { at, origin };
-        inner.append(vec![RecordContent::labelled(call.clone().into(), label)]);
+        inner.append(vec![RecordContent::labelled(call.clone(), label)]);
         drop(inner);
         self.write();
     }
@@ -466,9 +466,8 @@ impl Ledger {
             records.iter().map(|record| record.entry.clone()).collect();
         for entry in &entries {
             if let RecordContent::Call { call, label, .. } = entry {
-                let call = Request::from(call.clone());
-                inner.mirror.apply_telling(&call, &mut ());
-                label.origin.note_in(&mut inner.mirror, &call);
+                inner.mirror.apply_telling(call, &mut ());
+                label.origin.note_in(&mut inner.mirror, call);
                 inner.version += 1;
             }
         }

@@ -25,8 +25,8 @@ use rescue_core::{
     },
 };
 use ros1_master::{
-    master::{Master, Request},
-    xmlrpc::{Call, Value},
+    master::{Master, Method, Request},
+    xmlrpc::Value,
 };
 use rosrescue::cluster::replica::Replica;
 use serde::Serialize;
@@ -300,15 +300,15 @@ fn record(seq: u64) -> Record {
     let params = params!["/robot_state", key, seq as f64 * 0.1];
     Record {
         seq,
-        entry: RecordContent::call(Call::new("setParam", params)),
+        entry: RecordContent::call(Request::new(Method::SetParam, params)),
     }
 }
 
 /// The state of a robot with this many nodes, with seven registrations each.
 fn state(nodes: usize) -> Checkpoint {
     let mut master = Master::default();
-    let mut apply = |method: &'static str, params: Vec<Value>| {
-        master.apply(&Request::from(Call::new(method, params)));
+    let mut apply = |method: Method, params: Vec<Value>| {
+        master.apply(&Request::new(method, params));
     };
     for number in 0..nodes {
         let name = format!("/node_{number:03}");
@@ -317,21 +317,21 @@ fn state(nodes: usize) -> Checkpoint {
         let rosout = "/rosout".to_owned();
         for topic in published.into_iter().chain([rosout]) {
             let params = params![name.as_str(), topic, "std_msgs/String", api.as_str()];
-            apply("registerPublisher", params);
+            apply(Method::RegisterPublisher, params);
         }
         for topic in subscribed {
             let params = params![name.as_str(), topic, "std_msgs/String", api.as_str()];
-            apply("registerSubscriber", params);
+            apply(Method::RegisterSubscriber, params);
         }
         for service in ["get_loggers", "set_logger_level"] {
             let service = format!("{name}/{service}");
             let params = params![name.as_str(), service, "rosrpc://127.0.0.1:5", api.as_str()];
-            apply("registerService", params);
+            apply(Method::RegisterService, params);
         }
     }
     for seq in 0..u64::from(PARAMS) {
         if let RecordContent::Call { call, .. } = record(seq).entry {
-            master.apply(&Request::from(call));
+            master.apply(&call);
         }
     }
     Checkpoint {

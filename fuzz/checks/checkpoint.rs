@@ -10,7 +10,7 @@ use rescue_core::checkpoint::{
     format::{self, Checkpoint, Label, Origin, Record, RecordContent},
     session::{Rebuilt, rebuild},
 };
-use ros1_master::{master::Master, xmlrpc::Call};
+use ros1_master::master::{Master, Method, Request};
 
 /// Separates the present file from its previous generation, which may follow it.
 const PREVIOUS: &[u8] = b"=== previous generation ===\n";
@@ -114,14 +114,14 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         seq: store.seq(),
         session: session.unwrap_or_default(),
         snapshot,
-        pending: pending.into_iter().map(Call::from).collect(),
+        pending,
         displaced,
         follows: false,
     };
     store
         .begin(&expected)
         .expect("cannot write what was loaded");
-    let call = Call::new("deleteParam", vec!["/n".into(), "/p".into()]);
+    let call = Request::new(Method::DeleteParam, ["/n", "/p"]);
     let entries = [
         RecordContent::Call {
             call,
@@ -147,6 +147,11 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
 }
 
 fn check_record(record: &Record) {
+    // An entry that cannot be run is written as nil.
+    if matches!(&record.entry, RecordContent::Call { call, .. } if *call.method() == Method::Multicall)
+    {
+        return;
+    }
     let fresh =
         format::encode_checkpoint(&Checkpoint::default(), 1).expect("cannot encode an empty state");
     let line = format::encode_record(record, fresh.stamp).expect("cannot encode what was read");

@@ -172,7 +172,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
     let loaded = loaded.ok_or_else(gone)?;
     let snapshot_seq = loaded.checkpoint.as_ref().map(|checkpoint| checkpoint.seq);
     let entries = loaded.records.iter().map(|record| match &record.entry {
-        RecordContent::Call { call, .. } => call.method.clone(),
+        RecordContent::Call { call, .. } => call.method().name().to_owned(),
         RecordContent::Session(_) => "session".to_owned(),
     });
     let journal = entries.collect();

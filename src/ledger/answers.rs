@@ -216,7 +216,7 @@ impl Ledger {
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| RecordContent::Call {
-            call: call.clone().into(),
+            call: call.clone(),
             pending: true,
             label: Label { at, origin },
         });

@@ -270,7 +270,7 @@ impl Inner {
             return;
         }
         let entries = calls.iter();
-        let entries = entries.map(|&call| RecordContent::labelled(call.clone().into(), label));
+        let entries = entries.map(|&call| RecordContent::labelled(call.clone(), label));
         let entries: Vec<_> = entries.collect();
         self.share(&entries, &vec![source; entries.len()]);
         // Later calls have other numbers than the session's record tells.
@@ -285,7 +285,7 @@ impl Inner {
         for (index, entry) in entries.iter().enumerate() {
             if let RecordContent::Call { call, label, .. } = entry {
                 let source = sources.get(index).copied().unwrap_or(&Source::Here);
-                sharing.record_labelled(&Request::from(call.clone()), source, *label);
+                sharing.record_labelled(call, source, *label);
             }
         }
     }
@@ -314,13 +314,7 @@ impl Inner {
                 at: clock::wall_millis(),
                 ..self.session.clone()
             },
-            pending: self
-                .pending
-                .calls()
-                .iter()
-                .cloned()
-                .map(Into::into)
-                .collect(),
+            pending: self.pending.calls().to_vec(),
             snapshot: self.mirror.snapshot(),
             displaced: self.activity.displaced_lately(Instant::now()),
             follows: !self.whole.is_due(),

@@ -163,7 +163,7 @@ mod tests {
     }
 
     fn record(seq: u64, call: Request) -> Record {
-        let entry = RecordContent::call(call.into());
+        let entry = RecordContent::call(call);
         Record { seq, entry }
     }
 

@@ -8,8 +8,8 @@ use rescue_core::checkpoint::format::{
     Stamp, decode, encode_checkpoint, encode_record,
 };
 use ros1_master::{
-    master::{Snapshot, SnapshotNode},
-    xmlrpc::{Call, Struct, Value},
+    master::{Method, Request, Snapshot, SnapshotNode},
+    xmlrpc::{Struct, Value},
 };
 
 fn checkpoint(seq: u64) -> Checkpoint {
@@ -39,14 +39,14 @@ fn checkpoint(seq: u64) -> Checkpoint {
 }
 
 fn record(seq: u64) -> Record {
-    let params = vec![
+    let params = [
         "/n".into(),
         format!("/p{seq}").into(),
         Value::Double(seq as f64),
     ];
     Record {
         seq,
-        entry: RecordContent::call(Call::new("setParam", params)),
+        entry: RecordContent::call(Request::new(Method::SetParam, params)),
     }
 }
 

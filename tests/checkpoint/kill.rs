@@ -7,7 +7,10 @@ use std::time::Duration;
 
 use checkpoint_store::{Store, SyncJob};
 use rescue_core::checkpoint::format::{Checkpoint, RecordContent};
-use ros1_master::xmlrpc::{Call, Value};
+use ros1_master::{
+    master::{Method, Request},
+    xmlrpc::Value,
+};
 
 const FILE: &str = "ROSRESCUE_TEST_CHECKPOINT";
 
@@ -30,10 +33,8 @@ fn write_until_killed(path: &Path) -> ! {
     let mut output = std::io::stderr();
     let mut append = |store: &mut Store| {
         let next = store.seq() + 1;
-        let call = Call::new(
-            "setParam",
-            vec!["/w".into(), "/n".into(), (next as i32).into()],
-        );
+        let params = ["/w".into(), "/n".into(), Value::from(next as i32)];
+        let call = Request::new(Method::SetParam, params);
         let seq = store.append(&[RecordContent::call(call)]).unwrap();
         writeln!(output, "recorded {seq}").unwrap();
     };
@@ -99,7 +100,7 @@ fn acknowledged_records_survive_a_kill() {
             loaded.damage
         );
         let state = match loaded.records.last().map(|record| &record.entry) {
-            Some(RecordContent::Call { call, .. }) => call.params[2].clone(),
+            Some(RecordContent::Call { call, .. }) => call.params()[2].clone(),
             _ => loaded.checkpoint.unwrap().snapshot.params["n"].clone(),
         };
         assert_eq!(state, Value::from(store.seq() as i32));

@@ -9,8 +9,8 @@ use rescue_core::checkpoint::{
     log::LogReader,
 };
 use ros1_master::{
-    master::{Master, Request},
-    xmlrpc::{Call, Value},
+    master::{Master, Method, Request},
+    xmlrpc::Value,
 };
 
 /// Time of the first record, in milliseconds since 1970.
@@ -23,13 +23,13 @@ fn robot(nodes: usize) -> Master {
         let (node, api) = (format!("/node_{number:03}"), format!("http://r:{number}/"));
         for topic in 0..5 {
             let topic = format!("/topic_{}", number * 5 + topic);
-            let params = [&*node, &*topic, "std_msgs/String", &*api].map(Value::from);
-            master.apply(&Call::new("registerPublisher", params.to_vec()).into());
+            let params = [&*node, &*topic, "std_msgs/String", &*api];
+            master.apply(&Request::new(Method::RegisterPublisher, params));
         }
         for service in ["get_loggers", "set_logger_level"] {
             let service = format!("{node}/{service}");
-            let params = [&*node, &*service, "rosrpc://r:5", &*api].map(Value::from);
-            master.apply(&Call::new("registerService", params.to_vec()).into());
+            let params = [&*node, &*service, "rosrpc://r:5", &*api];
+            master.apply(&Request::new(Method::RegisterService, params));
         }
     }
     master
@@ -59,13 +59,13 @@ fn record(path: &Path, seconds: u64, nodes: usize) -> u64 {
             _ => format!("/robot/part_{}/state", second % 50),
         };
         let value = second as f64 * 0.1;
-        let params = vec!["/robot_state".into(), key.into(), value.into()];
-        let call = Call::new("setParam", params);
+        let params: [Value; 3] = ["/robot_state".into(), key.into(), value.into()];
+        let call = Request::new(Method::SetParam, params);
         let label = Label {
             at: START + second * 1_000,
             origin: Origin::At([127, 0, 0, 1].into()),
         };
-        master.apply(&Request::from(call.clone()));
+        master.apply(&call);
         let before = store.journal_bytes();
         store
             .append(&[RecordContent::labelled(call, label)])

@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 
 use checkpoint_store::{OpenError, Store, StoreError};
 use rescue_core::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
-use ros1_master::xmlrpc::{Call, Value};
+use ros1_master::{
+    master::{Method, Request},
+    xmlrpc::Value,
+};
 use tempfile::TempDir;
 
 /// A new folder, and a path for a checkpoint in it.
@@ -24,10 +27,8 @@ fn seqs(records: &[Record]) -> Vec<u64> {
 }
 
 fn entry(nth: i32) -> RecordContent {
-    RecordContent::call(Call::new(
-        "setParam",
-        vec!["/n".into(), format!("/p{nth}").into(), nth.into()],
-    ))
+    let params = ["/n".into(), format!("/p{nth}").into(), Value::from(nth)];
+    RecordContent::call(Request::new(Method::SetParam, params))
 }
 
 fn checkpoint(seq: u64) -> Checkpoint {

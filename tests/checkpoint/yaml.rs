@@ -12,8 +12,8 @@ use rescue_core::checkpoint::format::{
     encode_checkpoint, encode_record,
 };
 use ros1_master::{
-    master::{Displaced, ServiceEntry, Snapshot, SnapshotNode},
-    xmlrpc::{Call, Struct, Value},
+    master::{Displaced, Method, Request, ServiceEntry, Snapshot, SnapshotNode},
+    xmlrpc::{Struct, Value},
 };
 
 const LABEL: Label = Label {
@@ -35,14 +35,16 @@ fn in_struct(value: Value) -> Value {
 
 /// A state that has `value` as a parameter, set by a pending write.
 fn with_value(value: &Value) -> Checkpoint {
+    let delete = Request::new(Method::DeleteParam, [Value::Nil; 0]);
     Checkpoint {
-        pending: vec![set_param(value), Call::new("deleteParam", vec![])],
+        pending: vec![set_param(value), delete],
         ..with_params(Struct::from([("p".to_owned(), value.clone())]))
     }
 }
 
-fn set_param(value: &Value) -> Call {
-    Call::new("setParam", vec!["/n".into(), "/p".into(), value.clone()])
+fn set_param(value: &Value) -> Request {
+    let params = ["/n".into(), "/p".into(), value.clone()];
+    Request::new(Method::SetParam, params)
 }
 
 fn with_params(params: Struct) -> Checkpoint {
@@ -158,7 +160,7 @@ fn assert_round_trip(value: &Value) {
     else {
         panic!("{:?}\n{text}", decoded.damaged);
     };
-    assert!(call.params[2] == *value, "the value has changed:\n{text}");
+    assert!(call.params()[2] == *value, "the value has changed:\n{text}");
 }
 
 #[test]

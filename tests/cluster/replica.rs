@@ -13,7 +13,7 @@ use rescue_core::{
         machine::{EtcdAnswer, Op, RevisionGuard},
     },
 };
-use ros1_master::xmlrpc::Call;
+use ros1_master::master::{Method, Request};
 use rosrescue::cluster::replica::{Replica, ReplicaError};
 
 use crate::servers::{LIMIT, Servers, keys, settings};
@@ -29,8 +29,8 @@ fn replica(servers: &Servers) -> Replica {
 fn record(seq: u64, bytes: usize) -> Record {
     let key = format!("/p{seq}");
     let value = "x".repeat(bytes);
-    let params = ["/n", key.as_str(), value.as_str()].map(Into::into);
-    let entry = RecordContent::call(Call::new("setParam", params.to_vec()));
+    let params = ["/n", key.as_str(), value.as_str()];
+    let entry = RecordContent::call(Request::new(Method::SetParam, params));
     Record { seq, entry }
 }
 

@@ -9,7 +9,6 @@ use super::generation::append_all;
 use super::names::{previous, with};
 use super::{Disk, Names, Storage};
 use rescue_core::checkpoint::format::{self, Checkpoint};
-use ros1_master::xmlrpc::Value;
 
 /// Maximum number of earlier sessions that are kept.
 const SESSIONS_MAX: usize = 5;
@@ -97,7 +96,7 @@ pub fn last_rescue(path: &Path) -> u64 {
 pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
     checkpoint.snapshot.remove_named(DRILLS);
     checkpoint.pending.retain(|call| {
-        let caller = call.params.first().and_then(Value::as_str);
+        let caller = call.caller();
         caller.is_none_or(|caller| !caller.starts_with(DRILLS))
     });
     let names = names_of(path);
@@ -157,7 +156,10 @@ fn names_of(path: &Path) -> Names {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros1_master::{master::SnapshotNode, xmlrpc::Call};
+    use ros1_master::{
+        master::{Method, Request, SnapshotNode},
+        xmlrpc::Value,
+    };
 
     fn place() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
@@ -167,6 +169,11 @@ mod tests {
 
     fn file(path: &Path, name: &str, bytes: usize) {
         fs::write(with(path, &format!(".{name}")), vec![b'x'; bytes]).unwrap();
+    }
+
+    fn set(caller: &str, key: &str, value: i32) -> Request {
+        let params = [Value::from(caller), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
     }
 
     fn listed(path: &Path) -> Vec<String> {
@@ -244,10 +251,7 @@ mod tests {
                 .subscribers
                 .insert("/scan".to_owned(), list(&["/n"]));
             snapshot.params.insert("speed".to_owned(), 3.into());
-            checkpoint.pending = vec![Call::new(
-                "setParam",
-                vec!["/n".into(), "/speed".into(), 3.into()],
-            )];
+            checkpoint.pending = vec![set("/n", "/speed", 3)];
             checkpoint
         };
         let mut with_drill = robot();
@@ -274,11 +278,7 @@ mod tests {
         snapshot
             .params
             .insert("rosrescue_drill_7".to_owned(), 1.into());
-        let write = Call::new(
-            "setParam",
-            vec![drill.as_str().into(), drill.as_str().into(), 1.into()],
-        );
-        with_drill.pending.push(write);
+        with_drill.pending.push(set(&drill, &drill, 1));
         let kept = keep_rescue(&path, 1, with_drill).unwrap();
         let loaded = super::super::read(&kept).unwrap().unwrap();
         assert_eq!(loaded.checkpoint, Some(robot()));

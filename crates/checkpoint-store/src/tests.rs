@@ -10,7 +10,10 @@ use super::generation::MEANWHILE_BYTES_MAX;
 use super::sim::{Fault, SimFs};
 use super::*;
 use rescue_core::checkpoint::format::{Checkpoint, RecordContent, Session};
-use ros1_master::xmlrpc::{Call, Value};
+use ros1_master::{
+    master::{Method, Request},
+    xmlrpc::Value,
+};
 
 const PATH: &str = "/log/latest-chkpt.yaml";
 
@@ -75,7 +78,7 @@ impl Model {
 }
 
 fn entry(number: u64) -> RecordContent {
-    RecordContent::call(Call::new("setParam", vec![number.to_string().into()]))
+    RecordContent::call(Request::new(Method::SetParam, [number.to_string()]))
 }
 
 /// The numbers that a loaded state contains, in the order in which they were applied.
@@ -88,7 +91,7 @@ fn state(loaded: &Loaded) -> Vec<u64> {
     for record in &loaded.records {
         match &record.entry {
             RecordContent::Call { call, .. } => {
-                numbers.push(call.params[0].as_str().unwrap().parse().unwrap())
+                numbers.push(call.text(0).unwrap().parse().unwrap())
             }
             RecordContent::Session(_) => {}
         }

@@ -10,7 +10,10 @@ use std::path::{Path, PathBuf};
 use checkpoint_store::{Store, log::files};
 use flate2::{Compression, read::MultiGzDecoder, write::GzEncoder};
 use rescue_core::checkpoint::format::{Checkpoint, Label, RecordContent, decode};
-use ros1_master::xmlrpc::Call;
+use ros1_master::{
+    master::{Method, Request},
+    xmlrpc::Value,
+};
 
 /// Sets `/a` `writes` times, and begins a part of the log for every 20 writes.
 fn record_parts(path: &Path, writes: u64) -> Option<String> {
@@ -28,12 +31,12 @@ fn record_parts(path: &Path, writes: u64) -> Option<String> {
             store.begin(&checkpoint).unwrap();
             trouble = store.take_log_trouble().or(trouble);
         }
-        let params = vec![
-            "/n".into(),
+        let params = [
+            Value::from("/n"),
             "/a".into(),
             i32::try_from(write).unwrap().into(),
         ];
-        let call = Call::new("setParam", params);
+        let call = Request::new(Method::SetParam, params);
         let labelled = RecordContent::labelled(call, Label::default());
         store.append(&[labelled]).unwrap();
     }

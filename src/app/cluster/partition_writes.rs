@@ -73,7 +73,7 @@ impl PartitionWritesFile {
             let RecordContent::Call { call, .. } = record.entry else {
                 return None;
             };
-            Some(Request::from(call))
+            Some(call)
         });
         let left = CutOff::left(base.clone(), calls);
         tracing::info!(
@@ -175,8 +175,7 @@ fn check(path: &Path) -> Result<(), String> {
 }
 
 fn entries(calls: Vec<Request>) -> Vec<RecordContent> {
-    let calls = calls.into_iter();
-    calls.map(|call| RecordContent::call(call.into())).collect()
+    calls.into_iter().map(RecordContent::call).collect()
 }
 
 fn remove_files(path: PathBuf) {

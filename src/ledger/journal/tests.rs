@@ -47,7 +47,7 @@ fn set(value: i32) -> Request {
 }
 
 fn entry(value: i32) -> Vec<RecordContent> {
-    vec![RecordContent::call(set(value).into())]
+    vec![RecordContent::call(set(value))]
 }
 
 /// The complete state after these values were set.

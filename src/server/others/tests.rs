@@ -482,7 +482,7 @@ async fn a_subscription_that_is_there_already_waits_for_no_leader() {
     let subscribe = |key| Request::new(Method::SubscribeParam, ["/n", "http://n:1/", key]);
     let record = Record {
         seq: 1,
-        entry: RecordContent::call(subscribe("/a").into()),
+        entry: RecordContent::call(subscribe("/a")),
     };
     let prompt = 5 * PATIENCE;
     for standing in [leader(None).await, Standing::Nobody { known: true }] {

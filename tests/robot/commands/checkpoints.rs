@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use rescue_core::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
-use ros1_master::{master::Snapshot, xmlrpc::Call};
+use ros1_master::master::{Method, Request, Snapshot};
 
 use crate::support::{
     FakeNode, Library, Mode, Robot, Scratch, Tool, eventually, free_port, params, tree,
@@ -140,7 +140,7 @@ fn file(at: &Path) -> [usize; 3] {
     let mut bytes = encoded.bytes;
     let mut starts = [bytes.len(); 3];
     for (seq, name) in [(2, "/two"), (3, "/three")] {
-        let call = Call::new("setParam", params!["/n", name, 2]);
+        let call = Request::new(Method::SetParam, params!["/n", name, 2]);
         let record = Record {
             seq,
             entry: RecordContent::call(call),

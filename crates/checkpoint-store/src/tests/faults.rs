@@ -92,7 +92,7 @@ fn a_compaction_that_cannot_keep_up_is_dropped_at_a_memory_limit() {
     let (mut store, _) = open(&fs).unwrap();
     model.begin(&mut store);
     let job = store.begin_compaction(model.checkpoint(0)).unwrap();
-    let large = RecordContent::call(Call::new("setParam", vec!["x".repeat(1 << 20).into()]));
+    let large = RecordContent::call(Request::new(Method::SetParam, ["x".repeat(1 << 20)]));
     for _ in 0..20 {
         store.append(std::slice::from_ref(&large)).unwrap();
         assert!(store.pending.as_ref().unwrap().meanwhile.len() <= MEANWHILE_BYTES_MAX);

@@ -23,7 +23,6 @@ use std::ops::Range;
 use thiserror::Error;
 
 use crate::master::{Displaced, Master, Request, Snapshot};
-use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub use frame::{Framed, Line, head_length, push_body, push_record, read_records, scan, seal};
@@ -112,7 +111,7 @@ impl Origin {
 pub enum RecordContent {
     /// A write that was answered with success.
     Call {
-        call: Call,
+        call: Request,
         /// Whether the mirror answered the write before a master had run it.
         pending: bool,
         label: Label,
@@ -123,12 +122,12 @@ pub enum RecordContent {
 
 impl RecordContent {
     /// A write that a master has run, without a label.
-    pub fn call(call: Call) -> Self {
+    pub fn call(call: Request) -> Self {
         Self::labelled(call, Label::default())
     }
 
     /// A write that a master has run.
-    pub fn labelled(call: Call, label: Label) -> Self {
+    pub fn labelled(call: Request, label: Label) -> Self {
         Self::Call {
             call,
             pending: false,
@@ -153,7 +152,7 @@ pub struct Checkpoint {
     pub session: Session,
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
-    pub pending: Vec<Call>,
+    pub pending: Vec<Request>,
     /// Nodes that must shut down because another node has taken their name. Some of them may not have been told yet.
     pub displaced: Vec<Displaced>,
     /// Whether the state is exactly what the records before it give. False after a change without a record. Not written

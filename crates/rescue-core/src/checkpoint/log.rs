@@ -92,7 +92,7 @@ pub fn moment(text: &[u8], time: u64) -> Result<Option<Moment>, String> {
     let records = framed.records(snapshot_seq, &mut Vec::new());
     let seq = records.last().map_or(snapshot_seq, |record| record.seq);
     let journal = records.iter().map(|record| match &record.entry {
-        RecordContent::Call { call, .. } => call.method.clone(),
+        RecordContent::Call { call, .. } => call.method().name().to_owned(),
         RecordContent::Session(_) => "session".to_owned(),
     });
     Ok(Some(Moment {
@@ -207,8 +207,7 @@ impl LogReader {
         };
         self.state = Some(match entry {
             RecordContent::Call { call, label, .. } => {
-                let request = Request::from(call);
-                for call in request.calls() {
+                for call in call.calls() {
                     self.call(&mut state, call, label);
                 }
                 (state, session)

@@ -110,7 +110,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
     let mut displaced = BTreeMap::new();
     if let Some(checkpoint) = checkpoint {
         let writes = checkpoint.pending.into_iter();
-        pending.extend(writes.map(|call| (checkpoint.seq, call.into())));
+        pending.extend(writes.map(|call| (checkpoint.seq, call)));
         rebuilt.session = Some(checkpoint.session);
         let owed = checkpoint.displaced.into_iter();
         displaced.extend(owed.map(|it| (it.api.clone(), it)));
@@ -127,17 +127,16 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                 pending: waits,
                 label,
             } => {
-                let request = Request::from(call);
-                let calls = request.calls().into_iter();
+                let calls = call.calls().into_iter();
                 let taken = calls.filter_map(|call| rebuilt.mirror.displaced_by(call));
                 displaced.extend(taken.map(|it| (it.api.clone(), it)));
-                rebuilt.mirror.apply_telling(&request, &mut ());
-                label.origin.note_in(&mut rebuilt.mirror, &request);
+                rebuilt.mirror.apply_telling(&call, &mut ());
+                label.origin.note_in(&mut rebuilt.mirror, &call);
                 if let Some(session) = &mut rebuilt.session {
                     session.cluster_seq += 1;
                 }
                 if waits {
-                    pending.push((seq, request));
+                    pending.push((seq, call));
                 }
             }
             RecordContent::Session(session) => {
@@ -157,11 +156,12 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
 mod tests {
     use super::*;
     use crate::checkpoint::format::Label;
-    use crate::xmlrpc::Call;
+    use crate::master::Method;
+    use crate::xmlrpc::Value;
 
     fn write(seq: u64, pending: bool) -> Record {
-        let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
-        let call = Call::new("setParam", params);
+        let params = [Value::from("/n"), format!("/p{seq}").into(), 1.into()];
+        let call = Request::new(Method::SetParam, params);
         let entry = RecordContent::Call {
             call,
             pending,
@@ -244,8 +244,7 @@ mod tests {
     fn displaced_nodes_are_found_in_the_records() {
         let publish = |topic: &str, port: u16| {
             let api = format!("http://n:{port}/");
-            let params = ["/n", topic, "x/Y", &api].map(Into::into);
-            Call::new("registerPublisher", params.to_vec())
+            Request::new(Method::RegisterPublisher, ["/n", topic, "x/Y", &api])
         };
         let calls = [("/a", 1), ("/b", 1), ("/a", 2), ("/c", 1), ("/a", 3)];
         let records = (1..).zip(calls).map(|(seq, (topic, port))| Record {

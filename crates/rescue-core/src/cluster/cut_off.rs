@@ -115,9 +115,7 @@ impl CutOff {
         for period in &mut self.periods {
             for record in records {
                 if let RecordContent::Call { call, .. } = &record.entry {
-                    period
-                        .changes
-                        .note(record.seq, &Request::from(call.clone()));
+                    period.changes.note(record.seq, call);
                 }
             }
         }
@@ -161,7 +159,6 @@ impl CutOff {
             let RecordContent::Call { call, .. } = &record.entry else {
                 continue;
             };
-            let call = Request::from(call.clone());
             // No node wrote a value that a merge sets again.
             if call.caller() == Some(merge::TELLER) {
                 continue;
@@ -171,8 +168,8 @@ impl CutOff {
                 period.expected += 1;
                 period.changes.expect_record(record.seq, call.clone());
             }
-            period.pending.add(&call);
-            calls.push(call);
+            period.pending.add(call);
+            calls.push(call.clone());
         }
         calls
     }
@@ -221,7 +218,7 @@ mod tests {
     }
 
     fn record(seq: u64, call: Request) -> Record {
-        let entry = RecordContent::call(call.into());
+        let entry = RecordContent::call(call);
         Record { seq, entry }
     }
 

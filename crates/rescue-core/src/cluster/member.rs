@@ -81,10 +81,9 @@ impl Journal {
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
             if let JournalEntry::Call { call, label, .. } = &record.entry {
-                let request = Request::from(call.clone());
-                self.displaced.note(now, &self.state, &request);
-                self.state.apply_telling(&request, &mut ());
-                label.origin.note_in(&mut self.state, &request);
+                self.displaced.note(now, &self.state, call);
+                self.state.apply_telling(call, &mut ());
+                label.origin.note_in(&mut self.state, call);
             }
         }
     }

@@ -8,7 +8,7 @@ use crate::{
         journal::{self, JournalError, Keys, Put},
         sharing::{Change, Source},
     },
-    master::{self, Master},
+    master::{CALLER_ID, Master, Method, Request},
     xmlrpc::Value,
 };
 
@@ -66,7 +66,7 @@ impl Outgoing {
             match change {
                 Change::Call(record, _) => {
                     if let RecordContent::Call { call, .. } = &record.entry {
-                        state.apply_telling(&call.clone().into(), &mut ());
+                        state.apply_telling(call, &mut ());
                     }
                 }
                 Change::State { state: whole, .. } => *state = (**whole).clone(),
@@ -136,7 +136,7 @@ impl Outgoing {
     pub fn leave_out_next(&mut self) {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
-            let (seq, entry) = (next.seq(), RecordContent::call(master::get_pid()));
+            let (seq, entry) = (next.seq(), RecordContent::call(no_change()));
             *next = Change::Call(Record { seq, entry }, Source::Here);
         }
     }
@@ -178,6 +178,11 @@ impl Outgoing {
     }
 }
 
+/// A call that changes nothing.
+fn no_change() -> Request {
+    Request::new(Method::GetPid, [CALLER_ID])
+}
+
 fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
     match change {
         Change::Call(record, _) => journal::parts(keys, record),
@@ -189,7 +194,7 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
 fn weight_of(change: &Change) -> usize {
     match change {
         Change::Call(record, _) => match &record.entry {
-            RecordContent::Call { call, .. } => call.params.iter().map(Value::size).sum(),
+            RecordContent::Call { call, .. } => call.params().iter().map(Value::size).sum(),
             RecordContent::Session(_) => 0,
         },
         // A state does not count, because replacing it by a state would save nothing.
@@ -215,11 +220,11 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cluster::journal::Manifest, xmlrpc::Call};
+    use crate::cluster::journal::Manifest;
 
     fn call(seq: u64, bytes: usize) -> Change {
-        let value = "x".repeat(bytes).as_str().into();
-        let call = Call::new("setParam", vec!["/n".into(), "/p".into(), value]);
+        let value = "x".repeat(bytes);
+        let call = Request::new(Method::SetParam, ["/n", "/p", value.as_str()]);
         let entry = RecordContent::call(call);
         Change::Call(Record { seq, entry }, Source::Here)
     }
@@ -359,7 +364,7 @@ mod tests {
         let [Change::Call(Record { seq: 6, entry }, _)] = instead.as_slice() else {
             panic!("{instead:?}");
         };
-        assert_eq!(*entry, RecordContent::call(master::get_pid()));
+        assert_eq!(*entry, RecordContent::call(no_change()));
         assert_eq!(added(&outgoing, &keys, 7), [5, 6, 7]);
     }
 }

@@ -137,7 +137,7 @@ impl Sharing {
     pub fn record_labelled(&mut self, call: &Request, source: &Source, label: Label) {
         let record = Record {
             seq: self.last + 1,
-            entry: RecordContent::labelled(call.clone().into(), label),
+            entry: RecordContent::labelled(call.clone(), label),
         };
         if format::push_record(&mut Vec::new(), &record).is_ok() {
             self.last += 1;

@@ -6,7 +6,7 @@ use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
 use super::{Checkpoint, EncodeError, Label, Origin, RecordContent, Session, frame, yaml};
-use crate::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
+use crate::master::{Displaced, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// Writes the document up to and including the line `journal:`.
@@ -146,16 +146,17 @@ fn names(out: &mut Vec<u8>, ids: &[String]) {
 }
 
 /// Writes `setParam: […]`, or `call: "x", params: […]` for a method whose name cannot be a key.
-fn write_call(out: &mut Vec<u8>, call: &Call) -> Result<(), EncodeError> {
-    if is_key(&call.method) {
-        out.extend_from_slice(call.method.as_bytes());
+fn write_call(out: &mut Vec<u8>, call: &Request) -> Result<(), EncodeError> {
+    let method = call.method().name();
+    if is_key(method) {
+        out.extend_from_slice(method.as_bytes());
         out.extend_from_slice(b": ");
     } else {
         out.extend_from_slice(b"call: ");
-        quoted(out, &call.method);
+        quoted(out, method);
         out.extend_from_slice(b", params: ");
     }
-    flow_list(out, &call.params, |out, value| flow(out, value, 0))
+    flow_list(out, &call.wire_params(), |out, value| flow(out, value, 0))
 }
 
 /// Whether a method's name can be the key of its record. All writes have such names. Shorter words could be `true` or
@@ -389,16 +390,16 @@ pub(super) fn read_record(line: &str) -> Result<RecordContent, String> {
 }
 
 /// Reverses [`write_call`].
-fn read_call(mut entry: Struct) -> Result<Call, String> {
+fn read_call(mut entry: Struct) -> Result<Request, String> {
     if entry.contains_key("call") {
         let method = text(&mut entry, "call")?;
         return match entry.shift_remove("params") {
-            Some(Value::Array(params)) => Ok(Call { method, params }),
+            Some(Value::Array(params)) => Ok(Call { method, params }.into()),
             _ => Err("`params` is not a list".to_owned()),
         };
     }
     let call = entry.into_iter().find_map(|(method, params)| match params {
-        Value::Array(params) if is_key(&method) => Some(Call { method, params }),
+        Value::Array(params) if is_key(&method) => Some(Call { method, params }.into()),
         _ => None,
     });
     call.ok_or_else(|| "it has no call".to_owned())

@@ -1,7 +1,7 @@
 //! Damage to a file of realistic size, examined before its YAML is read.
 
 use super::*;
-use crate::xmlrpc::Value;
+use crate::{master::Method, xmlrpc::Value};
 
 /// A file of at least 64 KiB with more than 500 records, and where each of its lines starts.
 fn file() -> (Vec<u8>, Vec<usize>) {
@@ -17,7 +17,7 @@ fn file() -> (Vec<u8>, Vec<usize>) {
         ];
         let record = Record {
             seq: seq as u64,
-            entry: RecordContent::call(Call::new("setParam", params)),
+            entry: RecordContent::call(Request::new(Method::SetParam, params)),
         };
         bytes.extend(encode_record(&record, encoded.stamp).unwrap());
         starts.push(bytes.len());

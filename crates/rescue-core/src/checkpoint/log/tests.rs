@@ -30,7 +30,7 @@ fn history(calls: &[(u64, Request)], each: usize) -> Vec<Vec<u8>> {
         for (time, call) in calls {
             (seq, at) = (seq + 1, *time);
             let origin = Origin::At([10, 0, 0, 5].into());
-            let entry = RecordContent::labelled(call.clone().into(), Label { at, origin });
+            let entry = RecordContent::labelled(call.clone(), Label { at, origin });
             bytes.extend(format::encode_record(&Record { seq, entry }, encoded.stamp).unwrap());
             master.apply(call);
         }

@@ -3,19 +3,15 @@
 use super::*;
 use crate::{
     checkpoint::format::{Checkpoint, RecordContent, Session},
-    xmlrpc::Call,
+    master::{Method, Request},
 };
 
 /// The largest value for one transaction, with room for the keys and the leader's `alive`.
 const REQUEST_BYTES: usize = 1_500_000;
 
 fn record(seq: u64, bytes: usize) -> Record {
-    let value = "x".repeat(bytes).as_str().into();
-    let call = Call::new(
-        "setParam",
-        vec!["/n".into(), format!("/p{seq}").as_str().into(), value],
-    );
-    let entry = RecordContent::call(call);
+    let params = ["/n".into(), format!("/p{seq}"), "x".repeat(bytes)];
+    let entry = RecordContent::call(Request::new(Method::SetParam, params));
     Record { seq, entry }
 }
 

@@ -14,7 +14,7 @@ use crate::{
 /// Record `seq`, in which others set the parameter again.
 fn record(seq: u64) -> Record {
     let value = i32::try_from(seq).unwrap();
-    let entry = RecordContent::call(set(value).into());
+    let entry = RecordContent::call(set(value));
     Record { seq, entry }
 }
 

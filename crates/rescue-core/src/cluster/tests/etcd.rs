@@ -121,7 +121,7 @@ impl Etcd {
     pub(super) fn holds(&self, call: &Request) -> bool {
         self.log.iter().rev().any(|(_, held)| match held {
             Held::Records(records) => records.iter().any(|record| match &record.entry {
-                JournalEntry::Call { call: of, .. } => of.params == *call.params(),
+                JournalEntry::Call { call: of, .. } => of.params() == call.params(),
                 JournalEntry::Session(_) => false,
             }),
             Held::State(_) => false,
@@ -139,7 +139,7 @@ impl Etcd {
                     let first = records.iter().take(place.saturating_sub(index * 1000));
                     for record in first {
                         if let JournalEntry::Call { call, .. } = &record.entry {
-                            state.apply_telling(&Request::from(call.clone()), &mut ());
+                            state.apply_telling(call, &mut ());
                         }
                     }
                 }
@@ -380,8 +380,7 @@ impl Etcd {
                 assert_eq!(records[0].seq, next, "the journal has no gap");
                 for record in records {
                     if let JournalEntry::Call { call, .. } = &record.entry {
-                        let call = Request::from(call.clone());
-                        self.state.apply_telling(&call, &mut ());
+                        self.state.apply_telling(call, &mut ());
                     }
                 }
             }

@@ -225,7 +225,7 @@ impl History {
         let in_log = etcd.log.iter().any(|(_, held)| match held {
             Held::State(state) => value_of(state, call.key) == Some(call.value),
             Held::Records(records) => records.iter().any(|record| match &record.entry {
-                JournalEntry::Call { call, .. } => same(&call.params),
+                JournalEntry::Call { call, .. } => same(call.params()),
                 _ => false,
             }),
         });
@@ -677,7 +677,7 @@ impl Places {
             };
             for (part, record) in records.iter().enumerate() {
                 if let JournalEntry::Call { call, .. } = &record.entry
-                    && let Some(call) = history.find(&call.params)
+                    && let Some(call) = history.find(call.params())
                 {
                     of[call].push(index * 1000 + part);
                     changed[call].push(index * 1000 + part);

@@ -22,7 +22,7 @@ use crate::{
         standing::{Pass, Place, Standing},
     },
     dice::Dice,
-    master::{Notice, Request},
+    master::Notice,
     xmlrpc::{Reply, Value},
 };
 
@@ -605,8 +605,7 @@ impl World {
                     if let crate::checkpoint::format::RecordContent::Call { call, .. } =
                         &record.entry
                     {
-                        let call = Request::from(call.clone());
-                        computer.ledger.mirror.apply_telling(&call, &mut ());
+                        computer.ledger.mirror.apply_telling(call, &mut ());
                     }
                 }
             }
