@@ -646,7 +646,10 @@ impl World {
             Event::Breaks => self.breaks(),
             Event::Recovery(event) => self.recovers(event),
             Event::Bypasses => self.bypasses(),
-            Event::Compares => input = Input::Compare,
+            Event::Compares => {
+                self.after(COMPARE_WITHIN, Event::Compares);
+                input = Input::Compare;
+            }
             Event::WorkerDies => self.worker_dies(),
             Event::WorkerStarts => self.worker_starts(),
             Event::DiskWrites => self.disk_writes(),

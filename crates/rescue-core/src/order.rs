@@ -176,7 +176,7 @@ impl Order {
         self.outbox.renew_all(subject);
         let about = self.under_way.about(now, subject);
         let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
-        self.repeats.drop_all_but(subject, &ports);
+        self.repeats.drop_all_but(subject, &ports, until);
         for (answer, port) in about {
             // An answer in the same batch does not count: its call ran later, or has itself caused the notification.
             if !self.in_flight.answers.contains(&answer) {
@@ -260,6 +260,7 @@ impl Order {
     /// Queues, at the time `at`, a notification for the node at `port` with the state of `subject` at the time of
     /// sending.
     pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
+        self.repeats.last.insert((subject.clone(), port.to_owned()));
         self.repeats.add(at, port.to_owned(), subject);
     }
 
@@ -342,7 +343,9 @@ impl Order {
     /// Queues the notifications whose time has come: those that tell a state once more (see [`REPEAT_AFTER`]), and
     /// those of [`Self::tell_state_at`].
     pub fn repeat(&mut self, now: Instant) {
-        while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
+        while let Some((_, repeat)) = self.repeats.at.take_due(now) {
+            self.repeats.last.remove(&repeat);
+            let (subject, port) = repeat;
             self.outbox.add(&port, subject, Payload::StateAgain);
         }
     }
@@ -456,6 +459,8 @@ impl Told {
 #[derive(Debug, Default)]
 struct Repeats {
     at: Schedule<(Subject, String)>,
+    /// Those that come after older notifications of another sender, which nothing that the master sends makes needless.
+    last: BTreeSet<(Subject, String)>,
     is_new: bool,
 }
 
@@ -465,14 +470,19 @@ impl Repeats {
         self.at.set((subject, port), at);
     }
 
-    /// Drops the planned notifications about `subject` for nodes at ports other than `kept`.
-    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
+    /// Drops the planned notifications about `subject` for nodes at ports other than `kept`, or puts them off until the
+    /// master has sent its own, at `until`, if they must come last.
+    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>, until: Instant) {
         let from = (subject.clone(), String::new());
         let about = self.at.at.range(from..);
         let about = about.take_while(|((of, _), _)| of == subject);
         let others = about.filter(|((_, port), _)| !kept.contains(port.as_str()));
         let others: Vec<_> = others.map(|(thing, at)| (*at, thing.clone())).collect();
         for (at, thing) in others {
+            if self.last.contains(&thing) {
+                self.at.set(thing, at.max(until));
+                continue;
+            }
             self.at.at.remove(&thing);
             self.at.queue.remove(&(at, thing));
         }

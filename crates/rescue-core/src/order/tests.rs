@@ -363,3 +363,19 @@ fn a_node_does_not_wait_for_its_own_registrations() {
     order.sent(watch.tells(), Vec::new());
     assert!(!order.read_must_wait(&watch.heard()));
 }
+
+/// Another sender, such as the last process of rosrescue, may have an older notification on its way.
+#[test]
+fn a_state_that_must_come_last_is_told_after_newer_notifications_of_the_master() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    let at = now + Duration::from_secs(1);
+    order.tell_state_at(at, A, topic("/t"));
+    order.told_by_master(now, &topic("/t"), 1);
+    assert_eq!(order.next_repeat(), Some(at));
+    order.told_by_master(at, &topic("/t"), 1);
+    assert!(order.next_repeat() > Some(at));
+    order.repeat(at + Duration::from_secs(1));
+    assert_eq!(order.next_repeat(), None);
+    sent(order.next(at + Duration::from_secs(1), A, &mirror));
+}
