@@ -12,12 +12,9 @@ quick:
 test:
     tests/run.sh
 
-# Print the tables of benches/results.md
-bench:
-    cargo bench --bench pauses
-    cargo bench --bench table1
-    cargo bench --bench compare
-    . tests/install_etcd.sh && cargo bench --bench computers
+# Measure all tables of docs/benchmarks.md and write them (20 minutes on two cores; needs root)
+benchmarks:
+    benches/run.sh
 
 # Show a rescue with a real rosmaster and nodes
 quickstart:

@@ -106,6 +106,9 @@ struct Options {
     /// The rosrescue to test [default: the one that was just built]
     #[arg(long, value_name = "FILE")]
     rosrescue: Option<PathBuf>,
+    /// Also write the table into benches/results.md
+    #[arg(long)]
+    write_docs: bool,
 }
 
 /// The results of all starts in one mode.
@@ -160,7 +163,11 @@ fn main() -> ExitCode {
             }
         }
     }
-    println!("{}", table(&rows, &plan, first));
+    let text = table(&rows, &plan, first);
+    println!("{text}");
+    if options.write_docs {
+        numbers::write_document("links", text.trim_end());
+    }
     if whole {
         ExitCode::SUCCESS
     } else {

@@ -23,7 +23,7 @@ use clap::Args;
 
 use crate::{
     deaths::{Death, Victims},
-    shared::{caller::Seen, machine},
+    shared::{caller::Seen, machine, numbers},
     subject::{Kind, Subject, Window},
 };
 
@@ -64,43 +64,56 @@ struct Options {
     /// Number of busy processes during this measurement
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
     load: usize,
+    /// Also write the tables into benches/results.md
+    #[arg(long)]
+    write_docs: bool,
 }
 
 fn main() {
     let Some(options) = shared::options::<Options>("pauses") else {
         return;
     };
-    if !options.deaths.is_empty() {
-        println!("{}", rosrescue_dies(&options));
-        return;
+    let (name, text) = match (options.deaths.is_empty(), options.load) {
+        (true, _) => ("pauses", master_dies(&options)),
+        (false, 0) => ("deaths", rosrescue_dies(&options)),
+        (false, _) => ("deaths-under-load", rosrescue_dies(&options)),
+    };
+    println!("{text}");
+    if options.write_docs {
+        numbers::write_document(name, &text);
     }
+}
+
+/// The tables of deaths of the master.
+fn master_dies(options: &Options) -> String {
     let lines: Vec<_> = options
         .kinds
         .iter()
-        .map(|kind| kills(*kind, &options))
+        .map(|kind| kills(*kind, options))
         .collect();
-    println!(
-        "{}, {} nodes, {} kills each.\n",
+    let mut text = format!(
+        "{}, {} nodes, {} kills each.\n\n\
+         | | read | write | write that changes nothing | bare injection | calls without an answer | answers that were no success |\n\
+         |---|--:|--:|--:|--:|--:|--:|\n\
+         {}\n",
         machine::describe(),
         options.nodes,
-        options.kills
+        options.kills,
+        lines.concat()
     );
-    println!(
-        "| | read | write | write that changes nothing | bare injection | calls without an answer | answers that were no success |"
-    );
-    println!("|---|--:|--:|--:|--:|--:|--:|");
-    println!("{}", lines.concat());
-    let guarded = options.kinds.iter().filter(|kind| **kind != Kind::Bare);
     if options.away > 0 {
-        println!("Without a master for {} s:\n", options.away);
-        println!("| | read | write | write that changes nothing | a subscriber is notified |");
-        println!("|---|--:|--:|--:|--:|");
-        for kind in guarded {
-            println!("{}", outage(*kind, &options));
+        text += &format!(
+            "Without a master for {} s:\n\n\
+             | | read | write | write that changes nothing | a subscriber is notified |\n\
+             |---|--:|--:|--:|--:|\n",
+            options.away
+        );
+        for kind in options.kinds.iter().filter(|kind| **kind != Kind::Bare) {
+            text += &outage(*kind, options);
         }
-        println!();
+        text += "\n";
     }
-    println!("{}", EXPLANATION.trim());
+    text + EXPLANATION.trim()
 }
 
 const EXPLANATION: &str = "
@@ -185,7 +198,7 @@ fn outage(kind: Kind, options: &Options) -> String {
         .sum();
     assert_eq!(failed, 0, "{window:?}");
     format!(
-        "| {kind} | {:.1} | {:.1} | {:.1} | {} |",
+        "| {kind} | {:.1} | {:.1} | {:.1} | {} |\n",
         window.read.pause,
         window.write.pause,
         window.idle.pause,
@@ -193,7 +206,7 @@ fn outage(kind: Kind, options: &Options) -> String {
     )
 }
 
-/// Prints the table of deaths of rosrescue.
+/// The table of deaths of rosrescue.
 fn rosrescue_dies(options: &Options) -> String {
     let mut text = format!(
         "{}, {} nodes, {} deaths each, {} busy processes beside them.\n\n\
@@ -219,5 +232,6 @@ fn rosrescue_dies(options: &Options) -> String {
             long.count(),
         );
     }
+    text += "\nMilliseconds: median (largest) over the deaths.";
     text
 }

@@ -4,7 +4,7 @@ use std::{fs, process::Command, thread::available_parallelism};
 
 use rosrescue::clock;
 
-/// Processor, system, and versions, in one phrase.
+/// Processor, system, versions, date and commit, in one phrase.
 pub(crate) fn describe() -> String {
     let cores = available_parallelism().map_or(0, usize::from);
     let date = clock::wall_text(clock::wall_time());
@@ -12,11 +12,12 @@ pub(crate) fn describe() -> String {
     let uname = rustix::system::uname();
     let release = uname.release().to_string_lossy();
     format!(
-        "{}, {cores} cores, Linux {}, {}, rosmaster {}, {date}",
+        "{}, {cores} cores, Linux {}, {}, rosmaster {}, {date}, commit {}",
         processor(),
         release.split('-').next().unwrap_or_default(),
-        said("/usr/bin/python3", &["--version"]),
-        said("rosversion", &["rosmaster"]),
+        output_of("/usr/bin/python3", &["--version"]),
+        output_of("rosversion", &["rosmaster"]),
+        output_of("git", &["rev-parse", "--short", "HEAD"]),
     )
 }
 
@@ -30,7 +31,7 @@ fn processor() -> String {
     name.unwrap_or_else(|| std::env::consts::ARCH.to_owned())
 }
 
-fn said(program: &str, arguments: &[&str]) -> String {
+fn output_of(program: &str, arguments: &[&str]) -> String {
     let output = Command::new(program).args(arguments).output();
     output.map_or_else(
         |_| "of unknown version".to_owned(),

@@ -6,7 +6,7 @@
 //! which makes seven registrations together with those that every node has.
 //!
 //! Between any two kills, the same computer measures the best possible recovery at that moment ([`limit`]).
-//! The text below the tables explains the columns ([`table::print`]).
+//! The text below the tables explains the columns ([`table::markdown`]).
 
 #![allow(
     clippy::unwrap_used,
@@ -25,6 +25,7 @@ use clap::Args;
 
 use crate::{
     robot::{Kind, Robot},
+    shared::numbers,
     table::Row,
 };
 
@@ -45,6 +46,9 @@ struct Options {
     /// Number of kills for each number of real rospy nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     real: usize,
+    /// Also write the tables into benches/results.md
+    #[arg(long)]
+    write_docs: bool,
 }
 
 fn main() {
@@ -63,7 +67,15 @@ fn main() {
             (kind, measured.collect())
         })
         .collect();
-    table::print(&tables);
+    let text = table::markdown(&tables);
+    println!("{text}");
+    if options.write_docs {
+        let name = match std::env::var_os("ROSRESCUE_HTTP_1_0") {
+            Some(_) => "table1-http-1-0",
+            None => "table1",
+        };
+        numbers::write_document(name, &text);
+    }
 }
 
 /// Kills the master of a robot with this many nodes again and again.

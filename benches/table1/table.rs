@@ -1,4 +1,4 @@
-//! Prints the results as Markdown.
+//! Formats the results as Markdown.
 
 use crate::{
     limit::Limit,
@@ -62,27 +62,25 @@ impl Spread {
     }
 }
 
-/// Prints the tables between the marks that `benches/results.md` has for them.
-pub(crate) fn print(tables: &[(Kind, Vec<Row>)]) {
-    println!("<!-- table1:begin -->");
-    println!(
-        "Milliseconds, median (largest), on {}.",
+/// The tables with their explanation.
+pub(crate) fn markdown(tables: &[(Kind, Vec<Row>)]) -> String {
+    let mut text = format!(
+        "Milliseconds, median (largest), on {}.\n",
         machine::describe()
     );
     for (kind, rows) in tables {
         let kills = rows.first().map_or(0, Row::kills);
-        println!("\nWith {kind}, {kills} kills each:\n");
-        println!(
-            "| nodes | detection | new port open | recovery alone | its limit | ratio | whole state | \
-             its limit | ratio | answer | the paper |"
+        text += &format!(
+            "\nWith {kind}, {kills} kills each:\n\n\
+             | nodes | detection | new port open | recovery alone | its limit | ratio | whole state | \
+             its limit | ratio | answer | the paper |\n\
+             |--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n"
         );
-        println!("|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|");
         for row in rows {
-            println!("{}", line(row));
+            text += &line(row);
         }
     }
-    println!(
-        "\n\
+    text + "\n\
          * *detection*: from just before the SIGKILL to the shut gate. *New port open*: from the SIGKILL \
          to rosrescue's connection to the new master.\n\
          * *recovery alone*: from the open port to the open gate; the state has been restored, read \
@@ -92,9 +90,7 @@ pub(crate) fn print(tables: &[(Kind, Vec<Row>)]) {
          * *whole state*: from the SIGKILL to the open gate. *Its limit*: from the start of the second \
          rosmaster's process to that reply.\n\
          * *answer*: from the SIGKILL to the answer to a call that a node made at the moment of the SIGKILL.\n\
-         * *the paper*: recovery alone in the paper, on another computer.\n\
-         <!-- table1:end -->"
-    );
+         * *the paper*: recovery alone in the paper, on another computer."
 }
 
 fn line(row: &Row) -> String {
@@ -116,5 +112,5 @@ fn line(row: &Row) -> String {
         row.spread(|ours, _| ours.answered).cell(),
         paper.map_or_else(String::new, |(_, ms)| ms.to_string()),
     ];
-    format!("| {} |", cells.join(" | "))
+    format!("| {} |\n", cells.join(" | "))
 }

@@ -74,6 +74,17 @@ fn every_document_is_in_the_table_of_contents() {
 
 /// `tests/robot/documents.rs` compares the lines of the recording with those of a new one.
 #[test]
+fn numbers_of_the_documents_are_those_of_the_benchmarks() {
+    let check = Command::new("/usr/bin/python3")
+        .args(["benches/summary.py", "--check"])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    let why = String::from_utf8_lossy(&check.stderr);
+    assert!(check.status.success(), "{why}; run benches/summary.py");
+}
+
+#[test]
 fn the_recording_is_small_and_needs_nothing_else() {
     let picture = read("docs/rescue.svg");
     assert!(picture.len() < 40 << 10, "{} bytes", picture.len());
