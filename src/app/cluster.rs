@@ -193,9 +193,10 @@ impl ClusterDriver {
                         self.setup.config.robot.clone(),
                     ));
                 }
-                let range = self.replica.keys.small();
+                let keys = &self.replica.keys;
                 let ttl = self.member.settings().ttl;
-                let watch = self.replica.client.watch(range, view.revision, ttl);
+                let watch = self.replica.client.watch(keys.small(), view.revision, ttl);
+                let watch = watch.with_deletions(keys.values());
                 self.watch = Some(Watching::new(watch, self.trouble.clone()));
                 self.watched = view;
             }
@@ -435,6 +436,13 @@ impl ClusterDriver {
         let keys = self.replica.keys.clone();
         let (mut entries, mut heard, mut deleted) = (Vec::new(), Vec::new(), None);
         for change in changes {
+            if change.kv.is_none() {
+                deleted = deleted.max(keys.record_of(&change.key));
+            }
+            if keys.values().contains(&change.key) {
+                // It may arrive before earlier changes, so it says nothing about the revision.
+                continue;
+            }
             if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
                 self.trouble.set(&error.into());
             }
@@ -445,10 +453,6 @@ impl ClusterDriver {
                 change.kv.as_ref(),
             ));
             let seq = keys.seq_of(&change.key);
-            if change.kv.is_none() {
-                let snapshot = (change.key == keys.snapshot()).then_some(u64::MAX);
-                deleted = deleted.max(seq).max(snapshot);
-            }
             if let (Some(kv), Some(seq)) = (change.kv, seq) {
                 entries.push(entry(seq, &kv));
             }

@@ -120,3 +120,35 @@ async fn long_values_arrive_complete_and_their_parts_are_not_watched() {
     let mut seen = 0;
     follow(&mut watch, &mut seen, 5).await;
 }
+
+/// Only deletions of parts are received. They do not move the watch past changes that have not arrived.
+#[tokio::test]
+async fn deletions_of_parts_are_received_and_hide_no_other_change() {
+    let mut servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let part = |seq| Put {
+        key: format!("{}values/blob/{seq:020}/1234/0", keys.prefix()),
+        value: b"part".to_vec(),
+    };
+    let watch = client.watch(keys.small(), 0, LIMIT);
+    let mut watch = watch.with_deletions(keys.values());
+    for (seq, restarts) in [(1, false), (2, true), (3, false)] {
+        assert!(client.put(&keys, 0, &[part(seq)], LIMIT).await.unwrap());
+        let deleted = [keys.values()];
+        assert!(client.delete(&keys, 0, &deleted, LIMIT).await.unwrap());
+        assert!(client.put(&keys, 0, &[entry(seq)], LIMIT).await.unwrap());
+        if restarts {
+            servers.kill(0);
+            servers.start(0);
+        }
+        let (mut gone, mut added) = (false, false);
+        while !gone || !added {
+            for change in watch.next().await.unwrap() {
+                let is_part = keys.values().contains(&change.key);
+                assert_eq!(is_part, change.kv.is_none(), "{change:?}");
+                gone |= keys.record_of(&change.key) == Some(seq) && is_part;
+                added |= keys.seq_of(&change.key) == Some(seq);
+            }
+        }
+    }
+}

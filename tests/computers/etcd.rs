@@ -156,6 +156,36 @@ fn keys_that_are_deleted_in_a_living_etcd_come_back_and_no_write_is_lost() {
     fleet.assert_nodes_live();
 }
 
+/// Large values are stored beside the journal, in parts.
+#[test]
+fn deleted_parts_of_a_large_value_come_back() {
+    let _turn = turn();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    let value = "x".repeat(1 << 20);
+    let computer = &fleet.computers[leader];
+    computer.within(|| {
+        computer
+            .client()
+            .ok("setParam", params!["/test", "/large", value.as_str()])
+    });
+    fleet.await_same_state();
+    delete_keys(&fleet, "/robot/values/");
+    eventually("the leader has noticed it", || {
+        !fleet.computers[leader]
+            .logged("etcd has lost its data")
+            .is_empty()
+    });
+    fleet.await_whole();
+    let follower = &fleet.computers[(leader + 1) % 3];
+    signal(follower.worker(), Signal::KILL);
+    fleet.await_whole();
+    fleet.await_same_state();
+    let follower = &fleet.computers[(leader + 1) % 3];
+    assert_eq!(follower.param("/large"), Some(value.as_str().into()));
+    fleet.assert_nodes_live();
+}
+
 /// The older copy lacks what was written after it was made. That used to count as a change by others.
 #[test]
 fn an_older_copy_of_etcd_is_no_conflict_with_what_was_written_while_cut_off() {

@@ -60,6 +60,8 @@ type Opening = Pin<Box<dyn Future<Output = Result<Incoming, EtcdError>> + Send>>
 pub struct Watch {
     client: Client,
     range: Range<String>,
+    /// Keys of which only deletions are received.
+    deletions: Option<Range<String>>,
     /// The next revision to receive.
     next: u64,
     quiet: Duration,
@@ -75,12 +77,20 @@ impl Watch {
         Self {
             client,
             range,
+            deletions: None,
             next,
             quiet,
             open: None,
             opening: None,
             failures: 0,
         }
+    }
+
+    /// Also receives deletions of keys in `range`. They may arrive before or after other changes of the same time.
+    #[must_use]
+    pub fn with_deletions(self, range: Range<String>) -> Self {
+        let deletions = Some(range);
+        Self { deletions, ..self }
     }
 
     /// Waits for the next changes. Cancel safe.
@@ -194,20 +204,22 @@ impl Watch {
     }
 
     fn opening_of(&self, index: usize) -> Opening {
-        let request = json!({ "create_request": {
-            "key": STANDARD.encode(&self.range.start), "range_end": STANDARD.encode(&self.range.end),
-            "start_revision": self.next.to_string(), "fragment": true,
-        }});
+        let create = |range: &Range<String>, filters: &[&str]| {
+            json!({ "create_request": {
+                "key": STANDARD.encode(&range.start), "range_end": STANDARD.encode(&range.end),
+                "start_revision": self.next.to_string(), "fragment": true, "filters": filters,
+            }})
+            .to_string()
+        };
+        let deletions = self.deletions.as_ref();
+        let deletions = deletions.map(|range| create(range, &["NOPUT"]));
+        let request = create(&self.range, &[]) + &deletions.unwrap_or_default();
         let (client, quiet) = (self.client.clone(), self.quiet);
         let pause = PAUSE.saturating_mul(u32::from(self.failures > 0));
         Box::pin(async move {
             tokio::time::sleep(pause).await;
             match client.endpoints.get(index) {
-                Some(endpoint) => {
-                    endpoint
-                        .stream("watch", request.to_string().into(), quiet)
-                        .await
-                }
+                Some(endpoint) => endpoint.stream("watch", request.into(), quiet).await,
                 None => std::future::pending().await,
             }
         })
@@ -219,7 +231,10 @@ impl Watch {
             let kv = event.kv.read()?;
             // The next message of a fragmented answer has the rest of this revision, so the watch still needs this
             // revision.
-            self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
+            // Deletions may arrive before earlier changes.
+            if self.range.contains(&kv.key) {
+                self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
+            }
             changes.push(KeyChange {
                 key: kv.key.clone(),
                 revision: kv.revision,

@@ -136,8 +136,30 @@ impl Keys {
         [
             key("journal/")..key("journal0"),
             key("snapshot")..key("snapshot\0"),
-            key("values/")..key("values0"),
+            self.values(),
         ]
+    }
+
+    /// The keys of all parts of values.
+    pub fn values(&self) -> Range<String> {
+        let key = |name: &str| format!("{}{name}", self.0);
+        key("values/")..key("values0")
+    }
+
+    /// The number of a record that cannot be read, or not without this key, once the key is deleted. `None` for a key
+    /// that is not of the journal.
+    pub fn record_of(&self, key: &str) -> Option<u64> {
+        if key == self.snapshot() {
+            return Some(u64::MAX);
+        }
+        let mut names = key.strip_prefix(&self.0)?.split('/');
+        match (names.next()?, names.next()?, names.next()) {
+            ("journal", seq, None) => seq.parse().ok(),
+            ("values", "blob", Some(seq)) => seq.parse().ok(),
+            // Unlike its journal entry, a snapshot is still needed when it has replaced the journal.
+            ("values", "snapshot", Some(seq)) => Some(seq.parse::<u64>().ok()?.saturating_add(1)),
+            _ => None,
+        }
     }
 
     /// The number in a journal key: its last record.

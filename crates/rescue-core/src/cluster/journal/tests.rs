@@ -210,3 +210,28 @@ fn the_rest_of_the_keys_lacks_only_the_known_journal() {
     assert!([8, 9, u64::MAX].iter().all(|&seq| has(&keys.journal(seq))));
     assert!(rest.iter().all(|range| keys.small().contains(&range.start)));
 }
+
+/// A leader must notice deletions by others, and not those of what its snapshot replaces.
+#[test]
+fn what_a_snapshot_replaces_holds_no_later_record() {
+    let keys = Keys::new("robot");
+    let held = |key: &str| keys.record_of(key);
+    let (blobs, put) = (
+        parts(&keys, &record(5, BATCH_BYTES)).unwrap(),
+        keys.journal(5),
+    );
+    assert_eq!((held(&blobs[0].key), held(&put)), (Some(5), Some(5)));
+    let (parts, manifest) = snapshot(&keys, 5, b"state");
+    assert!(parts.iter().all(|part| held(&part.key) > Some(5)));
+    assert!(held(&manifest.key) > Some(5));
+    let (earlier, _) = snapshot(&keys, 4, b"state");
+    assert!(keys.snapshots_before(5).contains(&earlier[0].key));
+    assert!(held(&earlier[0].key) <= Some(5));
+    for other in [
+        keys.leader(),
+        keys.member("base"),
+        "/other/journal/5".to_owned(),
+    ] {
+        assert_eq!(held(&other), None, "{other}");
+    }
+}

@@ -136,7 +136,7 @@ pub enum Input {
     Watched {
         view: View,
         entries: Vec<Entry>,
-        /// The number of the last journal entry that was deleted, or `u64::MAX` if the snapshot was.
+        /// The highest number of a record that a deleted key held; see [`Keys::record_of`](crate::cluster::journal::Keys::record_of).
         deleted: Option<u64>,
         heard: Vec<Heard>,
     },
