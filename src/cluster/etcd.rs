@@ -212,10 +212,29 @@ fn write(put: &Put) -> TxnOp {
     }
 }
 
-fn write_json(key: String, value: &impl Serialize) -> TxnOp {
+fn json(value: &impl Serialize) -> Vec<u8> {
     // Texts and numbers always serialize.
-    let value = serde_json::to_vec(value).unwrap_or_default();
-    TxnOp::Put { key, value }
+    serde_json::to_vec(value).unwrap_or_default()
+}
+
+/// The value of `leader` after this claim.
+fn leader_value(settings: &Settings, claim: u64) -> Vec<u8> {
+    let Settings {
+        name,
+        id,
+        uri,
+        boot,
+        version,
+        ..
+    } = settings.clone();
+    json(&LeaderValue {
+        name,
+        id,
+        claim,
+        uri,
+        boot,
+        version,
+    })
 }
 
 fn get_view(keys: &Keys) -> Vec<TxnOp> {
@@ -263,10 +282,13 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
             released,
             settled,
         };
-        write_json(keys.alive(), &value)
+        TxnOp::Put {
+            key: keys.alive(),
+            value: json(&value),
+        }
     };
-    let txn = |guard: &RevisionGuard, changes: Vec<TxnOp>| Txn {
-        compare: unchanged(keys, guard),
+    let txn = |compare: Vec<Compare>, changes: Vec<TxnOp>| Txn {
+        compare,
         success: changes,
         failure: get_view(keys),
     };
@@ -279,35 +301,23 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
             seq,
             settled,
         } => {
-            let Settings {
-                name,
-                id,
-                uri,
-                boot,
-                version,
-                ..
-            } = settings.clone();
-            let claim = *claim;
-            let leader = LeaderValue {
-                name,
-                id,
-                claim,
-                uri,
-                boot,
-                version,
+            let leader = TxnOp::Put {
+                key: keys.leader(),
+                value: leader_value(settings, *claim),
             };
             let alive = alive(0, *seq, &None, *settled);
-            let mut changes = vec![write_json(keys.leader(), &leader), alive];
+            let mut changes = vec![leader, alive];
             if *begins {
                 let began_by = settings.name.clone().into_bytes();
                 let (key, value) = (keys.origin(), began_by);
                 changes.push(TxnOp::Put { key, value });
                 changes.extend(keys.of_journal().map(TxnOp::Delete));
             }
-            (txn(guard, changes), *seq)
+            (txn(unchanged(keys, guard), changes), *seq)
         }
         Op::Beat {
             guard,
+            claim,
             beat,
             seq,
             released,
@@ -317,7 +327,12 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
             let seq = last.unwrap_or(*seq);
             let alive = alive(*beat, seq, released, *settled);
             let changes = entry.map(write).into_iter().chain([alive]);
-            (txn(guard, changes.collect()), seq)
+            let mut compare = unchanged(keys, guard);
+            compare.push(Compare::Is {
+                key: keys.leader(),
+                value: leader_value(settings, *claim),
+            });
+            (txn(compare, changes.collect()), seq)
         }
     }
 }

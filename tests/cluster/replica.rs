@@ -86,6 +86,7 @@ impl Leader {
             self.beat += 1;
             let beat = Op::Beat {
                 guard: self.guard,
+                claim: 1,
                 beat: self.beat,
                 seq: last.seq,
                 released: None,
@@ -312,6 +313,7 @@ async fn no_transaction_of_the_leader_succeeds_once_a_key_that_makes_the_journal
         assert!(deleted.unwrap());
         let beat = Op::Beat {
             guard: leader.guard,
+            claim: 1,
             beat: 9,
             seq: 2,
             released: None,
@@ -324,6 +326,33 @@ async fn no_transaction_of_the_leader_succeeds_once_a_key_that_makes_the_journal
         let last = gone == keys.journal(2);
         assert!(view.is_torn() || view.leader.is_none() || last, "{view:?}");
     }
+}
+
+/// A restored etcd gives revisions out again, so another computer may have got this leader's.
+#[tokio::test]
+async fn a_transaction_of_another_claim_does_not_succeed_at_the_same_revisions() {
+    let servers = Servers::new(1).await;
+    let leader = Leader::new(&servers).await;
+    let beat = |claim| Op::Beat {
+        guard: leader.guard,
+        claim,
+        beat: 1,
+        seq: 0,
+        released: None,
+        settled: true,
+    };
+    for (name, claim) in [("b", 1), ("a", 2)] {
+        let answer = leader
+            .replica
+            .run(&settings(name), &beat(claim), None)
+            .await;
+        assert!(matches!(answer, Ok(EtcdAnswer::Is(_))), "{answer:?}");
+    }
+    let answer = leader.replica.run(&settings("a"), &beat(1), None).await;
+    assert!(
+        matches!(answer, Ok(EtcdAnswer::Applied { .. })),
+        "{answer:?}"
+    );
 }
 
 #[tokio::test]
@@ -345,6 +374,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
     leader.beat += 1;
     let beat = Op::Beat {
         guard: leader.guard,
+        claim: 1,
         beat: leader.beat,
         seq: 3,
         released: None,

@@ -21,6 +21,7 @@ fn entry(seq: u64) -> Put {
 fn beat(guard: RevisionGuard, beat: u64, seq: u64) -> Op {
     Op::Beat {
         guard,
+        claim: 1,
         beat,
         seq,
         released: None,

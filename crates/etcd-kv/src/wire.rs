@@ -35,6 +35,8 @@ pub enum Compare {
     Modified(String, u64),
     /// The key exists.
     Exists(String),
+    /// The key has this value.
+    Is { key: String, value: Vec<u8> },
 }
 
 /// An operation of a transaction.
@@ -122,6 +124,9 @@ impl Compare {
             }),
             Self::Exists(key) => json!({
                 "key": base64(key), "target": "CREATE", "result": "GREATER", "create_revision": "0",
+            }),
+            Self::Is { key, value } => json!({
+                "key": base64(key), "target": "VALUE", "result": "EQUAL", "value": base64(value),
             }),
         }
     }

@@ -71,6 +71,7 @@ impl Machine {
                 let whole = seq == self.written.committed && self.role == Role::Leading;
                 Op::Beat {
                     guard,
+                    claim: self.view.leader.as_ref().map_or(0, |leader| leader.claim),
                     beat: leadership.beat + 1,
                     seq,
                     released: self.releasing.clone().filter(|_| whole),

@@ -110,6 +110,10 @@ impl View {
     pub fn continues(&self, earlier: &Self) -> bool {
         let (after, before) = (self.guard(), earlier.guard());
         let same = before.origin == 0 || after.origin == before.origin;
+        // An older copy gives revisions out again.
+        let leader = after.leader != before.leader || self.leader == earlier.leader;
+        let alive = after.alive != before.alive || self.alive == earlier.alive;
+        let same = same && leader && alive;
         let later = after.leader >= before.leader && after.alive >= before.alive;
         same && later && after.seq >= before.seq && self.revision >= earlier.revision
     }
@@ -155,6 +159,9 @@ pub enum Op {
     /// heartbeat may carry other records; at most one of the two succeeds.
     Beat {
         guard: RevisionGuard,
+        /// The claim of this process by which it leads. A restored etcd gives revisions out again, so the key `leader`
+        /// must also have the content that this claim wrote.
+        claim: u64,
         beat: u64,
         seq: u64,
         released: Option<String>,

@@ -267,12 +267,19 @@ impl Etcd {
             Op::Read => return EtcdAnswer::Is(self.view.clone()),
             Op::Claim { guard, .. } | Op::Beat { guard, .. } => *guard,
         };
+        // A restored etcd gives revisions out again.
+        let leads = match (&sent.op, &self.view.leader) {
+            (Op::Beat { claim, .. }, Some(leader)) => {
+                (&leader.id, leader.claim) == (&sent.settings.id, *claim)
+            }
+            _ => true,
+        };
         let has_last = expected.seq == 0 || self.entries.contains_key(&expected.seq);
         let guard = RevisionGuard {
             seq: expected.seq,
             ..self.view.guard()
         };
-        if guard != expected || !has_last {
+        if guard != expected || !has_last || !leads {
             return EtcdAnswer::Is(self.view.clone());
         }
         self.view.revision += 1;
