@@ -242,6 +242,13 @@ pub struct Synced {
     pub(super) result: io::Result<()>,
 }
 
+impl Synced {
+    /// Why the sync failed.
+    pub fn error(&self) -> Option<&io::Error> {
+        self.result.as_ref().err()
+    }
+}
+
 impl<S: Storage> SyncJob<S> {
     /// Runs the sync. Blocks as long as the disk does.
     pub fn run(self) -> Synced {

@@ -1,8 +1,15 @@
 //! Stores this computer's partition writes beside the checkpoint, until the leader has them.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
 
-use checkpoint_store::{Store, StoreError, regular_file};
+use checkpoint_store::{Store, StoreError, SyncJob, Synced, regular_file};
 use rescue_core::{
     checkpoint::{
         format::{Checkpoint, RecordContent},
@@ -20,6 +27,8 @@ use crate::{
 
 /// The file is rewritten when it is twice as large as necessary and larger than this many bytes.
 const FILE_BYTES: u64 = 64 << 10;
+/// How long after a write the file is synced.
+const SYNC_PAUSE: Duration = Duration::from_millis(100);
 
 /// The file `CHECKPOINT.alone`, which holds the partition writes.
 #[derive(Default)]
@@ -28,6 +37,8 @@ pub(super) struct PartitionWritesFile {
     store: Option<Store>,
     /// The size of the file's journal when it was last rewritten, in bytes.
     written: u64,
+    /// Whether a sync of the file begins soon.
+    sync_is_due: Arc<AtomicBool>,
 }
 
 fn file_path(checkpoint: &Path) -> PathBuf {
@@ -116,7 +127,12 @@ impl PartitionWritesFile {
         let write = move || {
             let written = store.begin(&checkpoint);
             let written = written.and_then(|()| store.append(&entries).map(|_| ()));
-            (written, store)
+            // The file that it replaces had them synced.
+            let synced = written.and_then(|()| match store.sync_job().map(SyncJob::run) {
+                Some(done) => store.synced(done),
+                None => Ok(()),
+            });
+            (synced, store)
         };
         self.have(write).await;
         self.written = self.store.as_ref().map_or(0, Store::journal_bytes);
@@ -128,7 +144,28 @@ impl PartitionWritesFile {
             let entries = entries(calls);
             let append = move || (store.append(&entries).map(|_| ()), store);
             self.have(append).await;
+            self.sync_soon();
         }
+    }
+
+    /// Syncs what was added, after a pause in which more may be added. A power cut costs no more than that.
+    fn sync_soon(&self) {
+        let Some(job) = self.store.as_ref().and_then(Store::sync_job) else {
+            return;
+        };
+        if self.sync_is_due.swap(true, Ordering::Relaxed) {
+            return;
+        }
+        let is_due = self.sync_is_due.clone();
+        crate::task::spawn(async move {
+            tokio::time::sleep(SYNC_PAUSE).await;
+            // What is added from now on gets a sync of its own.
+            is_due.store(false, Ordering::Relaxed);
+            let synced = crate::task::spawn_blocking(move || job.run()).await;
+            if let Some(error) = synced.as_ref().ok().and_then(Synced::error) {
+                log_unsaved(error);
+            }
+        });
     }
 
     /// Whether the file is twice as large as necessary.
@@ -179,6 +216,7 @@ fn entries(calls: Vec<Request>) -> Vec<RecordContent> {
 }
 
 fn remove_files(path: PathBuf) {
+    let folder = path.parent().map(std::fs::File::open);
     let previous = checkpoint_store::previous_of(&path);
     for path in [path, previous] {
         if let Err(error) = std::fs::remove_file(&path)
@@ -190,6 +228,10 @@ fn remove_files(path: PathBuf) {
                 "cannot delete the file of writes that have been sent; delete it, or its writes will be sent again"
             );
         }
+    }
+    // Otherwise a power cut may bring the file back.
+    if let Some(Ok(folder)) = folder {
+        let _ = folder.sync_all();
     }
 }
 

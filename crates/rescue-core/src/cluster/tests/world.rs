@@ -639,7 +639,9 @@ impl World {
             }
             Action::ServeOwnOnly(own_only) => self.computers[at].own_only = own_only,
             Action::KeepAll { base, calls } => {
-                self.computers[at].disk.kept = Some((base, calls));
+                let computer = &mut self.computers[at];
+                computer.disk.kept = Some((base, calls));
+                computer.synced.kept = computer.disk.kept.clone();
             }
             Action::Keep(calls) => {
                 if let Some((_, kept)) = &mut self.computers[at].disk.kept {
