@@ -261,7 +261,10 @@ impl Computer {
     /// Copies the data of this computer's etcd, which must not run.
     pub(crate) fn save_etcd(&self) {
         assert!(self.etcd.is_none(), "etcd runs");
-        copy_folder(&self.path("etcd"), &self.path("etcd.saved"));
+        let saved = self.path("etcd.saved");
+        // There is none yet at the first time.
+        let _ = fs::remove_dir_all(&saved);
+        copy_folder(&self.path("etcd"), &saved);
     }
 
     /// Puts back the data of [`Self::save_etcd`].

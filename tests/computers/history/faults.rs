@@ -41,6 +41,8 @@ pub(super) enum Fault {
     Wiped,
     /// The keys of a running etcd with this prefix are deleted.
     Keys(&'static str),
+    /// An older copy of all etcds is restored, in this time.
+    OlderCopy(Duration),
     Handover(usize),
 }
 
@@ -70,7 +72,7 @@ impl Fault {
     pub(super) fn roll(chance: &mut Chance) -> Self {
         let one = chance.below(COUNT);
         let other = (one + 1 + chance.below(COUNT - 1)) % COUNT;
-        match chance.below(35) {
+        match chance.below(36) {
             0..3 => Self::Worker(one),
             3..5 => Self::Guardian(one),
             5..7 => Self::Killed(one),
@@ -101,6 +103,7 @@ impl Fault {
                 "/robot/alive",
                 "/robot/origin",
             ])),
+            33 => Self::OlderCopy(chance.time(Duration::from_secs(8))),
             _ => Self::Handover(one),
         }
     }
@@ -108,7 +111,7 @@ impl Fault {
     /// The computers that the failure hits. No other failure may hit them at the same time.
     fn computers(&self) -> Vec<usize> {
         match *self {
-            Self::AllEtcds | Self::Wiped | Self::Keys(_) => vec![0, 1, 2],
+            Self::AllEtcds | Self::Wiped | Self::Keys(_) | Self::OlderCopy(_) => vec![0, 1, 2],
             // Two failures must not change the same cable.
             Self::OneWay(one, other) | Self::Pair(one, other) => vec![one, other],
             Self::NoEtcd(_) => vec![0, 1, 2],
@@ -195,6 +198,10 @@ impl Fault {
                 delete_keys(fleet, prefix);
                 return None;
             }
+            Self::OlderCopy(time) => {
+                restore_older(fleet, clients, chance, time);
+                return None;
+            }
             Self::Handover(one) => {
                 // There may be no computer to hand over to.
                 let (status, said) = fleet.computers[one].rosrescue(&["handover"]);
@@ -272,6 +279,33 @@ fn switch_on(fleet: &mut Fleet, one: usize) {
     computer.boot();
     computer.start_etcd();
     computer.start_rescue();
+}
+
+/// Makes a copy of all etcds, and restores it after some seconds with new writes.
+#[track_caller]
+fn restore_older(fleet: &mut Fleet, clients: &Clients, chance: &mut Chance, time: Duration) {
+    fleet.await_whole();
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+    }
+    for computer in &mut fleet.computers {
+        computer.save_etcd();
+        computer.start_etcd();
+    }
+    fleet.await_whole();
+    std::thread::sleep(chance.time(Duration::from_secs(5)));
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+    }
+    clients.forget_terms();
+    for computer in &fleet.computers {
+        computer.restore_etcd();
+    }
+    std::thread::sleep(time);
+    for computer in &mut fleet.computers {
+        computer.start_etcd();
+    }
+    fleet.await_etcd();
 }
 
 /// Sets etcd up again, as docs/several-computers.md says under "Backup".
