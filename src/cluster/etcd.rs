@@ -190,6 +190,8 @@ struct LeaderValue {
     name: String,
     id: String,
     claim: u64,
+    /// The number of the journal's last record at the claim.
+    claimed_at: u64,
     uri: String,
     boot: String,
     version: String,
@@ -217,8 +219,8 @@ fn json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(value).unwrap_or_default()
 }
 
-/// The value of `leader` after this claim.
-fn leader_value(settings: &Settings, claim: u64) -> Vec<u8> {
+/// The value of `leader` after this claim, at which the journal ended with record `claimed_at`.
+fn leader_value(settings: &Settings, claim: u64, claimed_at: u64) -> Vec<u8> {
     let Settings {
         name,
         id,
@@ -231,6 +233,7 @@ fn leader_value(settings: &Settings, claim: u64) -> Vec<u8> {
         name,
         id,
         claim,
+        claimed_at,
         uri,
         boot,
         version,
@@ -303,7 +306,7 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
         } => {
             let leader = TxnOp::Put {
                 key: keys.leader(),
-                value: leader_value(settings, *claim),
+                value: leader_value(settings, *claim, *seq),
             };
             let alive = alive(0, *seq, &None, *settled);
             let mut changes = vec![leader, alive];
@@ -318,6 +321,7 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
         Op::Beat {
             guard,
             claim,
+            claimed_at,
             beat,
             seq,
             released,
@@ -330,7 +334,7 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
             let mut compare = unchanged(keys, guard);
             compare.push(Compare::Is {
                 key: keys.leader(),
-                value: leader_value(settings, *claim),
+                value: leader_value(settings, *claim, *claimed_at),
             });
             (txn(compare, changes.collect()), seq)
         }
@@ -373,6 +377,7 @@ fn absorb_key(view: &mut View, keys: &Keys, key: &str, kv: Option<&Kv>) -> Resul
                     name: value.name,
                     id: value.id,
                     claim: value.claim,
+                    claimed_at: value.claimed_at,
                     uri: value.uri,
                     boot: value.boot,
                     version: value.version,

@@ -87,6 +87,7 @@ impl Leader {
             let beat = Op::Beat {
                 guard: self.guard,
                 claim: 1,
+                claimed_at: 0,
                 beat: self.beat,
                 seq: last.seq,
                 released: None,
@@ -314,6 +315,7 @@ async fn no_transaction_of_the_leader_succeeds_once_a_key_that_makes_the_journal
         let beat = Op::Beat {
             guard: leader.guard,
             claim: 1,
+            claimed_at: 0,
             beat: 9,
             seq: 2,
             released: None,
@@ -336,6 +338,7 @@ async fn a_transaction_of_another_claim_does_not_succeed_at_the_same_revisions()
     let beat = |claim| Op::Beat {
         guard: leader.guard,
         claim,
+        claimed_at: 0,
         beat: 1,
         seq: 0,
         released: None,
@@ -375,6 +378,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
     let beat = Op::Beat {
         guard: leader.guard,
         claim: 1,
+        claimed_at: 0,
         beat: leader.beat,
         seq: 3,
         released: None,

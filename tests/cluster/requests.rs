@@ -22,6 +22,7 @@ fn beat(guard: RevisionGuard, beat: u64, seq: u64) -> Op {
     Op::Beat {
         guard,
         claim: 1,
+        claimed_at: 0,
         beat,
         seq,
         released: None,

@@ -78,6 +78,9 @@ pub(crate) struct History {
     pub(crate) ops: Vec<Op>,
     pub(crate) losses: Vec<Loss>,
     pub(crate) samples: Vec<Sample>,
+    /// When older copies of all etcds were restored. What a leader had shown on a computer before may reach it only with
+    /// the new journal.
+    pub(crate) restored: Vec<Time>,
 }
 
 /// The final state, on which all computers agree.
@@ -263,16 +266,18 @@ impl<'a> Judge<'a> {
         }
         floors.values_mut().for_each(|of| of.sort_by_key(|it| it.0));
         reads.sort_by_key(|(op, _)| op.start);
-        let mut at: BTreeMap<usize, (usize, Option<&Op>)> = BTreeMap::new();
+        let mut at: BTreeMap<usize, (usize, Option<(Time, &Op)>)> = BTreeMap::new();
         for (op, write) in reads {
             let Some(floors) = floors.get(&op.computer) else {
                 continue;
             };
+            let restored = self.history.restored.iter().rev();
+            let restored = restored.copied().find(|at| *at < op.start).unwrap_or(0);
             let (next, floor) = at.entry(op.computer).or_default();
+            *floor = floor.filter(|(from, _)| *from >= restored);
             while let Some((from, of)) = floors.get(*next).filter(|it| it.0 < op.start) {
-                debug_assert!(*from < op.start);
-                if floor.is_none_or(|floor| floor.start < of.start) {
-                    *floor = Some(of);
+                if *from >= restored && floor.is_none_or(|(_, floor)| floor.start < of.start) {
+                    *floor = Some((*from, of));
                 }
                 *next += 1;
             }
@@ -280,7 +285,7 @@ impl<'a> Judge<'a> {
                 None => true,
                 Some(write) => write.op.end.is_some_and(|end| end < floor.start),
             };
-            if let Some(floor) = floor.filter(is_older) {
+            if let Some(floor) = floor.map(|(_, floor)| floor).filter(is_older) {
                 wrong.push(format!("{op:?} goes back behind {floor:?}"));
             }
         }
@@ -402,6 +407,7 @@ mod tests {
             ops: ops.to_vec(),
             losses: losses.collect(),
             samples: vec![says(2, 10 * S, 20 * S, Says::Alone)],
+            restored: Vec::new(),
         };
         let values = end.map(|value| (KEY.to_owned(), value)).into_iter();
         let end = End {
@@ -507,6 +513,34 @@ mod tests {
         let ops = |reader| [write(0, 1, 1, 2), write(0, 2, 3, 4), read(reader, 1, 5, 6)];
         bad(&ops(0), &[], Some(2), "goes back");
         good(&ops(1), &[], Some(2));
+    }
+
+    #[test]
+    fn reads_may_go_back_once_when_an_older_copy_of_etcd_is_restored() {
+        let ops = [
+            write(0, 1, 1, 2),
+            write(0, 2, 3, 4),
+            read(1, 2, S, S + 1),
+            read(1, 1, 3 * S, 3 * S + 1),
+        ];
+        let checked = |ops: &[Op], restored| {
+            let history = History {
+                ops: ops.to_vec(),
+                restored: vec![restored],
+                ..History::default()
+            };
+            let end = End {
+                values: BTreeMap::from([(KEY.to_owned(), 2)]),
+                told: Vec::new(),
+            };
+            violations(&history, &end)
+        };
+        assert_eq!(checked(&ops, 2 * S), <[String; 0]>::default());
+        for restored in [S / 2, 4 * S] {
+            assert!(checked(&ops, restored)[0].contains("goes back"));
+        }
+        let again = [read(1, 2, 4 * S, 4 * S + 1), read(1, 1, 5 * S, 5 * S + 1)];
+        assert!(checked(&[&ops[..], &again].concat(), 2 * S)[0].contains("goes back"));
     }
 
     #[test]

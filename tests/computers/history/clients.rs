@@ -44,6 +44,8 @@ struct Shared {
     written: AtomicI32,
     /// How often etcd was set up again. Its terms then start over.
     etcds: AtomicU64,
+    /// When older copies of etcd were restored.
+    restored: Mutex<Vec<Time>>,
     quiet: AtomicBool,
     finish: AtomicBool,
     ops: Mutex<Vec<Op>>,
@@ -81,6 +83,7 @@ impl Clients {
             name: name.to_owned(),
             written: AtomicI32::new(0),
             etcds: AtomicU64::new(0),
+            restored: Mutex::default(),
             quiet: AtomicBool::new(false),
             finish: AtomicBool::new(false),
             ops: Mutex::default(),
@@ -146,9 +149,15 @@ impl Clients {
         }
     }
 
-    /// Notes that etcd was set up again while no rosrescue ran, so its terms start over.
+    /// Notes that etcd was set up again, so its terms start over.
     pub(crate) fn forget_terms(&self) {
         self.shared.etcds.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Notes that an older copy of etcd is restored.
+    pub(crate) fn restore(&self) {
+        self.forget_terms();
+        self.shared.restored.lock().unwrap().push(self.shared.now());
     }
 
     /// The number of answered calls.
@@ -163,6 +172,7 @@ impl Clients {
             ops: self.shared.ops.lock().unwrap().clone(),
             losses: losses(fleet, &self.shared.keys()),
             samples: self.shared.samples.lock().unwrap().clone(),
+            restored: self.shared.restored.lock().unwrap().clone(),
         }
     }
 

@@ -297,7 +297,7 @@ fn restore_older(fleet: &mut Fleet, clients: &Clients, chance: &mut Chance, time
     for computer in &mut fleet.computers {
         computer.kill_etcd();
     }
-    clients.forget_terms();
+    clients.restore();
     for computer in &fleet.computers {
         computer.restore_etcd();
     }

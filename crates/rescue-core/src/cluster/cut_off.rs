@@ -63,6 +63,17 @@ impl CutOff {
         }
     }
 
+    /// Notes that an earlier process has seen `state`. What differs there, except by this computer's own writes, was
+    /// changed by others.
+    pub fn note_seen(&mut self, state: &Master) {
+        for period in &mut self.periods {
+            let mut seen = Changes::default();
+            seen.expect(period.pending.calls().cloned());
+            seen.note_difference(&period.base, state);
+            period.changes.add_all(&seen);
+        }
+    }
+
     /// Whether a leader has all partition writes.
     pub fn is_empty(&self) -> bool {
         self.periods.is_empty()

@@ -199,9 +199,12 @@ impl Machine {
             .filter(|flight| flight.number == number)
             .map(|of| &of.op)
         {
-            Some(Op::Claim { guard, .. } | Op::Beat { guard, .. }) => {
-                let shown = view.guard();
-                guard.seq > 0 && (shown == *guard)
+            Some(Op::Claim { guard, .. }) => guard.seq > 0 && view.guard() == *guard,
+            Some(Op::Beat { guard, claim, .. }) => {
+                let leader = view.leader.as_ref();
+                let leads =
+                    leader.is_some_and(|of| (&of.id, of.claim) == (&self.settings.id, *claim));
+                guard.seq > 0 && view.guard() == *guard && leads
             }
             Some(Op::Read) | None => false,
         }
@@ -294,6 +297,7 @@ impl Machine {
             Op::Read => return self.view.clone(),
             Op::Claim {
                 claim,
+                seq,
                 settled,
                 begins,
                 ..
@@ -314,6 +318,7 @@ impl Machine {
                     name,
                     id,
                     claim: *claim,
+                    claimed_at: *seq,
                     uri,
                     boot,
                     version,
@@ -364,7 +369,7 @@ impl Machine {
 
     /// Makes this computer claim leadership no earlier than `until`.
     pub fn hold_claims(&mut self, until: Instant) {
-        self.claim_not_before = Some(until);
+        self.claim_not_before = self.claim_not_before.max(Some(until));
     }
 
     /// Notes the origin of a journal that cannot be read from its beginning, or 0.
@@ -389,7 +394,11 @@ impl Machine {
 
     /// Handles the keys `leader` and `alive` as etcd shows them.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
-        self.heard = Some(now);
+        let heard = self.heard.replace(now);
+        if view.leader.is_none() && heard.is_some_and(|at| at + self.settings.ttl <= now) {
+            // Others may have led meanwhile, and etcd may have lost their journal, too. They say so now.
+            self.hold_claims(now + self.settings.ttl);
+        }
         if view.revision < self.view.revision {
             return;
         }
@@ -410,6 +419,8 @@ impl Machine {
         self.view = view;
         let leader = self.view.leader.as_ref();
         let mine = leader.filter(|leader| leader.id == self.settings.id);
+        // A journal that has lost one of its keys cannot go on.
+        let mine = mine.filter(|_| !self.view.is_torn());
         let mine = mine.map(|leader| leader.term);
         let alive = self.view.alive.as_ref();
         match (self.leadership, mine) {

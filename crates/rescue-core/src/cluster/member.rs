@@ -118,6 +118,8 @@ pub struct Member {
     journal: Journal,
     reading: Reading,
     place: Place,
+    /// How much of a journal the ledger's state holds, even if etcd has lost that journal.
+    held: Holds,
     outgoing: Outgoing,
     cut_off: CutOff,
     merging: Merging,
@@ -143,6 +145,12 @@ impl Member {
     /// `id` is the unique name under which partition writes are sent to a leader.
     pub fn new(settings: Settings, keys: Keys, own: Own, left: CutOff, id: String) -> Self {
         let known = own.restored;
+        let held = Holds {
+            term: own.term,
+            seq: own.seq,
+        };
+        let mut cut_off = left;
+        cut_off.note_seen(&own.state);
         Self {
             keys,
             machine: Machine::new(settings),
@@ -156,8 +164,9 @@ impl Member {
             journal: Journal::default(),
             reading: Reading::default(),
             place: Place::default(),
+            held,
             outgoing: Outgoing::default(),
-            cut_off: left,
+            cut_off,
             merging: Merging::new(id),
             before: Before::default(),
             namesake: Namesake::default(),
@@ -186,7 +195,7 @@ impl Member {
                 deleted,
                 ..
             } => self.watched(now, view, entries, deleted),
-            Input::WatchEnded => self.reading.ended(now),
+            Input::WatchEnded => self.watch_ended(now),
             Input::Loaded(read) => self.loaded(now, read),
             Input::Recorded(changes) => self.recorded(changes),
             Input::AsState(state) => self.recorded_as_state(state),

@@ -130,6 +130,7 @@ mod tests {
                 name: name.to_owned(),
                 id: format!("{name}-1"),
                 claim: 1,
+                claimed_at: 0,
                 uri: uri.to_owned(),
                 boot: boot.to_owned(),
                 version: String::new(),

@@ -71,7 +71,8 @@ impl Machine {
                 let whole = seq == self.written.committed && self.role == Role::Leading;
                 Op::Beat {
                     guard,
-                    claim: self.view.leader.as_ref().map_or(0, |leader| leader.claim),
+                    claim: self.view.leader.as_ref().map_or(0, |of| of.claim),
+                    claimed_at: self.view.leader.as_ref().map_or(0, |of| of.claimed_at),
                     beat: leadership.beat + 1,
                     seq,
                     released: self.releasing.clone().filter(|_| whole),

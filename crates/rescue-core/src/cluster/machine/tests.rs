@@ -32,6 +32,7 @@ fn led(name: &str, term: u64, revision: u64) -> View {
             name: name.to_owned(),
             id: format!("{name}-1"),
             claim: 1,
+            claimed_at: 0,
             uri: String::new(),
             boot: String::new(),
             version: String::new(),

@@ -58,6 +58,8 @@ pub struct Leader {
     /// The id of the process, and the number of its claim.
     pub id: String,
     pub claim: u64,
+    /// The number of the journal's last record at the claim.
+    pub claimed_at: u64,
     pub uri: String,
     pub boot: String,
     pub version: String,
@@ -113,7 +115,10 @@ impl View {
         // An older copy gives revisions out again.
         let leader = after.leader != before.leader || self.leader == earlier.leader;
         let alive = after.alive != before.alive || self.alive == earlier.alive;
-        let same = same && leader && alive;
+        // Nor does a later leader's journal continue a longer one.
+        let began = self.leader.as_ref().map_or(0, |leader| leader.claimed_at);
+        let begins_later = after.leader == before.leader || began >= before.seq;
+        let same = same && leader && alive && begins_later;
         let later = after.leader >= before.leader && after.alive >= before.alive;
         same && later && after.seq >= before.seq && self.revision >= earlier.revision
     }
@@ -162,6 +167,8 @@ pub enum Op {
         /// The claim of this process by which it leads. A restored etcd gives revisions out again, so the key `leader`
         /// must also have the content that this claim wrote.
         claim: u64,
+        /// See [`Leader::claimed_at`].
+        claimed_at: u64,
         beat: u64,
         seq: u64,
         released: Option<String>,

@@ -147,22 +147,15 @@ impl Member {
         }
         let torn = view.is_torn() || view.term() < known || !is_readable || is_without_end;
         let torn = torn && !trusts();
-        older || torn || self.contradicts(view, before)
+        // A read that began after an earlier loss shows a later one only by what has been seen since.
+        let known = self.view();
+        let contradicts_known = view.revision >= known.revision && self.contradicts(view, known);
+        older || torn || self.contradicts(view, before) || contradicts_known
     }
 
     /// Starts over with the etcd that shows `view`, and with this computer's state.
     pub(super) fn start_over(&mut self, now: Instant, view: &View) {
-        let holds = match self.reading.loaded {
-            true => Holds {
-                term: self.place.term,
-                seq: self.journal.progress.seq,
-            },
-            false => Holds {
-                term: self.own.term,
-                seq: self.own.seq,
-            },
-        };
-        let holds = self.data_loss.holds().unwrap_or(holds);
+        let holds = self.held;
         self.report_news(News::EtcdLost);
         // The ledger keeps its state, if no leader has written its own to the journal yet.
         self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
@@ -217,10 +210,12 @@ impl Member {
     pub(super) fn note_holdings(&mut self, now: Instant, heard: &Heard) {
         let said = heard.said.as_ref();
         let holds = said.and_then(|said| said.holds);
-        match holds {
+        let before = match holds {
             Some(holds) => self.data_loss.others.insert(heard.name.clone(), holds),
             None => self.data_loss.others.remove(&heard.name),
         };
+        // Another computer may have lost a later journal, which this one has not seen.
+        self.data_loss.is_second &= holds == before;
         let (leads, view) = (self.published.role == Role::Leading, self.view());
         let shown = Holds {
             term: view.term(),
@@ -239,7 +234,7 @@ impl Member {
 
     /// Lets a computer that holds more of the lost journal claim leadership first.
     pub(super) fn update_data_loss(&mut self, now: Instant) {
-        let Some(Loss { since, holds, .. }) = self.data_loss.present else {
+        let Some(Loss { holds, .. }) = self.data_loss.present else {
             return;
         };
         if !self.journal.own_wins || self.published.role == Role::Leading {
@@ -252,7 +247,7 @@ impl Member {
         let mut others = others.map(|(name, holds)| (*holds, name));
         if !self.data_loss.is_second && others.any(|other| other > mine) {
             self.data_loss.is_second = true;
-            let until = since + self.settings().ttl * PATIENCE;
+            let until = now + self.settings().ttl * PATIENCE;
             self.machine.hold_claims(until);
         }
         // A request of this computer may have succeeded since.

@@ -70,8 +70,7 @@ impl Reading {
         self.load_at.filter(|_| !self.loading)
     }
 
-    /// Handles the end of the watch on etcd.
-    pub(super) fn ended(&mut self, now: Instant) {
+    fn ended(&mut self, now: Instant) {
         self.watching = false;
         self.load_at = Some(now + AGAIN);
     }
@@ -147,10 +146,14 @@ impl Member {
     ) {
         // What the watch delivers late is older than the answers to requests, and says nothing.
         if view.revision >= self.view().revision && self.doubts(now, &view) {
+            // What was added to the lost journal before still counts.
+            let next = self.journal.progress.seq + 1;
+            if entries.first().is_some_and(|first| first.begins_with(next)) {
+                self.take_entries(now, entries);
+            }
             return;
         }
-        let leads = self.published.role == Role::Leading && !Mutant::TrustsDeletedKeys.lives();
-        if leads && deleted.is_some_and(|seq| seq > self.chores.replaced) {
+        if self.guards_journal() && deleted.is_some_and(|seq| seq > self.chores.replaced) {
             self.reading.check_all(now);
             self.reading.is_doubtful = true;
         }
@@ -158,7 +161,18 @@ impl Member {
             return;
         }
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
+        let origin = view.origin;
         self.see(now, view);
+        if origin != self.view().origin {
+            // A new journal has begun since.
+            return;
+        }
+        self.take_entries(now, entries);
+        self.discard_own_state();
+    }
+
+    /// Follows the journal with these entries, up to the first that does not continue it.
+    fn take_entries(&mut self, now: Instant, entries: Vec<Entry>) {
         let progress = &mut self.journal.progress;
         // All records at once, because each new state may take long.
         let mut records = Vec::new();
@@ -178,7 +192,18 @@ impl Member {
             }
         }
         self.follow(now, &records);
-        self.discard_own_state();
+    }
+
+    /// Whether this computer must notice that keys of the journal are deleted: it leads, or may lead on.
+    fn guards_journal(&self) -> bool {
+        let leads = matches!(self.published.role, Role::Leading | Role::Alone);
+        leads && self.machine.term().is_some() && !Mutant::TrustsDeletedKeys.lives()
+    }
+
+    /// Handles the end of the watch on etcd. It may have missed that keys were deleted.
+    pub(super) fn watch_ended(&mut self, now: Instant) {
+        self.reading.check_due |= self.guards_journal();
+        self.reading.ended(now);
     }
 
     /// Passes the keys `leader` and `alive` to the machine.
@@ -263,7 +288,8 @@ impl Member {
         if self.has_lost(&read.view, &before, read.is_readable) {
             return self.start_over(now, &read.view);
         }
-        if self.data_loss.is_remainder(&read.view) {
+        // Without its origin, what can be read is left of a lost journal.
+        if self.data_loss.is_remainder(&read.view) || read.view.origin == 0 {
             read = Read {
                 view: read.view,
                 ..Read::empty()
@@ -275,7 +301,8 @@ impl Member {
         } else if checks {
             // The records are known.
             (read.state, read.records) = (None, Vec::new());
-            self.reading.is_doubtful = false;
+            // If another check is due, the watch has shown something since this one began.
+            self.reading.is_doubtful &= self.reading.check_due;
         }
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);

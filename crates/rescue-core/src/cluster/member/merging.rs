@@ -179,11 +179,26 @@ impl Member {
         self.merging.untold.extend(parameters.chain(merged.equal));
         let lost = merged.lost.iter();
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
-        self.merging.left = Some(merged.send);
         self.merging.judged = self.journal.progress.seq;
         self.merging.unread = false;
         self.report(lost);
+        self.keep_only(&merged.send);
+        self.merging.left = Some(merged.send);
         self.next_portion(now);
+    }
+
+    /// Drops the oldest period's other writes, which are lost or need not be sent, also from the file. After a restart
+    /// this computer would not know why, and send them.
+    fn keep_only(&mut self, writes: &[Request]) {
+        let Some(period) = self.cut_off.first_mut() else {
+            return;
+        };
+        if period.pending.len() > writes.len() {
+            period.pending = writes.iter().collect();
+            if !self.chores.keeps_file() {
+                self.keep_all();
+            }
+        }
     }
 
     fn next_portion(&mut self, now: Instant) {

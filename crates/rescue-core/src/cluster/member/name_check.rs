@@ -16,8 +16,8 @@ pub(super) struct Namesake {
     pub(super) sign: Option<Sign>,
     /// Looks for a living computer with this one's name. Set once etcd has been read.
     pub(super) watch: Option<namesake::NamesakeWatch>,
-    /// Whether this process has led.
-    pub(super) led: bool,
+    /// The last term in which this process has led, or 0.
+    pub(super) led_in: u64,
 }
 
 impl Member {
@@ -47,8 +47,10 @@ impl Member {
             let is_this = process(&leader.id) == process(&own.id);
             // Only one process runs on a computer at a time, so any other leader is another computer.
             if is_this {
-                self.namesake.led = true;
-            } else if self.namesake.led
+                self.namesake.led_in = self.namesake.led_in.max(leader.term);
+            } else if self.namesake.led_in > 0
+                // An older copy of etcd may show an earlier process of this computer.
+                && leader.term > self.namesake.led_in
                 && leader.name == own.name
                 && !self.data_loss.is_remainder(view)
             {

@@ -1,6 +1,6 @@
 //! Publishes where this computer's calls go, and how current its mirror is.
 
-use super::{Action, Member};
+use super::{Action, Holds, Member};
 use crate::cluster::{
     machine::Role,
     standing::{Pass, Place, Standing},
@@ -25,11 +25,15 @@ impl Member {
         self.publish_standing(Standing::Leads { term, pass });
     }
 
-    /// The address and term of the leader, if it is another computer that has not given up leadership.
+    /// The address and term of the leader, if it is another computer that has not given up leadership. The leader of a
+    /// lost journal is none, although it may not know of the loss yet.
     pub(super) fn leader(&self) -> Option<(&str, u64)> {
         let own = self.settings();
         let view = self.view();
         let leader = view.leader.as_ref()?;
+        if self.data_loss.is_remainder(view) {
+            return None;
+        }
         let released = view.alive.as_ref().is_some_and(|of| of.released.is_some());
         let is_own = leader.id == own.id || leader.name == own.name && leader.uri == own.uri;
         (!released && !is_own).then_some((&*leader.uri, leader.term))
@@ -51,7 +55,9 @@ impl Member {
             return;
         }
         // After a restart, a term that etcd has not reached would mean that etcd has lost its data.
-        if let Some((_, term)) = self.leader() {
+        if let Some((_, term)) = self.leader()
+            && term == self.held.term
+        {
             self.keep_term(term);
         }
         let standing = match self.leader() {
@@ -83,15 +89,16 @@ impl Member {
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.place.term, |leader| leader.term);
         let epoch = self.data_loss.times;
-        // A former leader's mirror still has the changes that the journal may lack.
+        // The mirror of a leader has changes that the journal may lack, also while this computer is cut off.
         let own = view
             .leader
             .as_ref()
             .is_some_and(|of| of.id == self.settings().id);
-        let seq = match self.follows() && own {
+        let seq = match own {
             true => seq.max(self.outgoing.last()),
             false => seq,
         };
         self.place = Place { epoch, term, seq };
+        self.held = Holds { term, seq };
     }
 }

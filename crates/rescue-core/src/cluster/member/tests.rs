@@ -34,6 +34,7 @@ fn led(seq: u64) -> View {
             name: "b".to_owned(),
             id: "b-1".to_owned(),
             claim: 1,
+            claimed_at: 0,
             uri: "http://b:1/".to_owned(),
             boot: String::new(),
             version: String::new(),

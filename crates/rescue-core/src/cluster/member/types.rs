@@ -92,6 +92,16 @@ pub enum Entry {
     Apart(u64),
 }
 
+impl Entry {
+    /// Whether the first record of this entry has the number `seq`.
+    pub(super) fn begins_with(&self, seq: u64) -> bool {
+        match self {
+            Self::Records { records, .. } => records.first().is_some_and(|first| first.seq == seq),
+            Self::Apart(_) => false,
+        }
+    }
+}
+
 /// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {

@@ -143,6 +143,12 @@ impl Changes {
         }
     }
 
+    /// Adds the changes of others that `seen` has.
+    pub fn add_all(&mut self, seen: &Self) {
+        self.params.extend(seen.params.iter().cloned());
+        self.rest.extend(seen.rest.iter().cloned());
+    }
+
     /// Notes that the others' state changed from `was` to `is`, without the calls in between. A value that was changed
     /// and changed back does not show.
     pub fn note_difference(&mut self, was: &Master, is: &Master) {

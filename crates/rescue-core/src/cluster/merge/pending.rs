@@ -36,6 +36,14 @@ pub struct WritesToSend {
     others: HashMap<String, u64>,
 }
 
+impl<'a> FromIterator<&'a Request> for WritesToSend {
+    fn from_iter<I: IntoIterator<Item = &'a Request>>(calls: I) -> Self {
+        let mut writes = Self::default();
+        calls.into_iter().for_each(|call| writes.add(call));
+        writes
+    }
+}
+
 impl WritesToSend {
     /// Adds a write that was answered. The entries of a multicall are writes of their own.
     pub fn add(&mut self, call: &Request) {

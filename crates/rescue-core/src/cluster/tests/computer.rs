@@ -108,7 +108,10 @@ pub(super) struct Computer {
     pub(super) disturbed_until: u64,
     /// The origin of a journal of which the watch has shown this process that it can no longer be read.
     pub(super) seen_unreadable: u64,
-    /// Whether this process started while etcd had an older copy, which looks like any journal, and no new one has begun.
+    /// Whether this process has read etcd.
+    pub(super) has_read: bool,
+    /// Whether etcd had an older copy when this process read it first, and no new journal has begun since. The copy looks
+    /// like any journal.
     pub(super) unaware: bool,
     /// By how much the computer's clock is too fast, in millionths.
     drift: i64,
@@ -183,6 +186,7 @@ impl Computer {
             undisturbed_since: 0,
             disturbed_until: 0,
             seen_unreadable: 0,
+            has_read: false,
             unaware: false,
             drift,
             clock: Instant::now() + Duration::from_secs(1),
@@ -211,6 +215,7 @@ impl Computer {
     pub(super) fn start(&mut self, index: usize, plan: &Plan) {
         self.life += 1;
         self.seen_unreadable = 0;
+        (self.has_read, self.unaware) = (false, false);
         self.up = true;
         self.hangs_until = 0;
         self.disk.own.restored = true;

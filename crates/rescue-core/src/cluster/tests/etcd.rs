@@ -311,6 +311,7 @@ impl Etcd {
                     name: of.name,
                     id: of.id,
                     claim: *claim,
+                    claimed_at: *seq,
                     uri: of.uri,
                     boot: of.boot,
                     version: of.version,

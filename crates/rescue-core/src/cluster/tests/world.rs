@@ -468,6 +468,9 @@ impl World {
         }
         let read = match self.network.reaches_etcd(at) {
             true => {
+                let computer = &mut self.computers[at];
+                computer.unaware |= self.etcd.is_old && !computer.has_read;
+                computer.has_read = true;
                 let read = self.etcd.read(known);
                 if read.state.is_some() {
                     self.history.skips(at, self.now);

@@ -358,7 +358,6 @@ impl World {
             let plan = self.plan.clone();
             self.history.skips(at, self.now);
             self.computers[at].start(at, &plan);
-            self.computers[at].unaware = self.etcd.is_old;
             self.input(at, Input::Begin);
         }
     }
