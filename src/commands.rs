@@ -140,12 +140,12 @@ fn json(value: &impl Serialize, pretty: bool) -> Result<Printable, CommandFailur
 
 /// Prints a sentence to standard error.
 fn note(sentence: &str) {
-    say(&format!("rosrescue: {sentence}"));
+    eprint_line(&format!("rosrescue: {sentence}"));
 }
 
 /// Prints a line to standard error. No command prints there in another way.
 #[expect(clippy::print_stderr, reason = "only printable text")]
-fn say(line: &str) {
+fn eprint_line(line: &str) {
     eprintln!("{}", Printable::line(line));
 }
 

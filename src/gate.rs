@@ -93,11 +93,11 @@ impl Rx {
     }
 
     /// When calls last began or stopped passing to the master.
-    pub fn since(&self) -> Instant {
+    pub fn opened_or_shut_at(&self) -> Instant {
         self.0.borrow().since
     }
 
-    /// Waits until the state has changed since the last [`Self::look`] or the last return of this method. Cancel safe.
+    /// Waits until the state has changed since the last [`Self::observe`] or the last return of this method. Cancel safe.
     /// Never returns once the sender is dropped.
     pub async fn changed(&mut self) {
         if self.0.changed().await.is_err() {
@@ -105,21 +105,21 @@ impl Rx {
         }
     }
 
-    /// The present state, and whether it has changed since the last look or since [`Self::changed`] returned.
+    /// The present state, and whether it has changed since the last observation or since [`Self::changed`] returned.
     pub fn look_changed(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
     }
 
     /// The present state. [`Self::changed`] waits for changes after it.
-    pub fn look(&mut self) -> State {
+    pub fn observe(&mut self) -> State {
         self.0.borrow_and_update().state
     }
 
     /// Waits until `is_it` accepts the state. Cancel safe.
     pub async fn wait_for(&mut self, is_it: impl Fn(State) -> bool) -> State {
         loop {
-            let state = self.look();
+            let state = self.observe();
             if is_it(state) {
                 return state;
             }
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_look_reports_a_change_that_was_not_waited_for() {
+    async fn an_observation_reports_a_change_that_was_not_waited_for() {
         let (tx, mut rx) = gate();
         tx.set(State::StandingIn);
         assert_eq!(rx.look_changed(), (State::StandingIn, true));

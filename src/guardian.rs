@@ -75,14 +75,17 @@ pub fn run(listeners: &[TcpListener], words: &[OsString]) -> Result<i32, Guardia
     let mut count = 0;
     loop {
         let end = worker.run_until_end(&signals, |signal| restarts.stop(signal));
-        let (pause, again_and_again) =
-            match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
-                NextStart::Exit(status) => return Ok(status),
-                NextStart::Restart {
-                    pause,
-                    again_and_again,
-                } => (pause, again_and_again),
-            };
+        let (pause, again_and_again) = match restarts.worker_ended(
+            end,
+            worker.wait_for_word(handover::SERVES),
+            Instant::now(),
+        ) {
+            NextStart::Exit(status) => return Ok(status),
+            NextStart::Restart {
+                pause,
+                again_and_again,
+            } => (pause, again_and_again),
+        };
         let pid = worker.pid;
         if again_and_again || !pause.is_zero() {
             rarely!(
@@ -235,7 +238,7 @@ impl Worker {
     /// Passes on `signal` once the worker handles signals. Before that, a signal would kill it.
     fn pass_on(&mut self, signal: i32) {
         if !std::mem::replace(&mut self.handles_signals, true) {
-            self.has_said(handover::HANDLES_SIGNALS);
+            self.wait_for_word(handover::HANDLES_SIGNALS);
         }
         let signal = match signal {
             SIGINT => Signal::INT,
@@ -251,7 +254,7 @@ impl Worker {
 
     /// Waits until the worker has written `word` to the link. Returns false if the worker ends
     /// first, or is silent for [`START_TIME`]. Skips other words.
-    fn has_said(&self, word: u8) -> bool {
+    fn wait_for_word(&self, word: u8) -> bool {
         let mut said = [0];
         while (&self.link).read(&mut said).is_ok_and(|length| length > 0) {
             if said == [word] {

@@ -24,7 +24,7 @@ pub(crate) struct Limit(Mutex<Bucket>);
 
 #[derive(Debug)]
 struct Bucket {
-    left: u32,
+    tokens: u32,
     /// When the bucket was last refilled.
     filled: Option<Instant>,
     left_out: u64,
@@ -44,26 +44,26 @@ impl Limit {
 
 impl Bucket {
     const FULL: Self = Self {
-        left: BURST,
+        tokens: BURST,
         filled: None,
         left_out: 0,
     };
 
     fn pass(&mut self, now: Instant) -> Option<Pass> {
         let mut filled = *self.filled.get_or_insert(now);
-        while self.left < BURST && now.duration_since(filled) >= REFILL {
+        while self.tokens < BURST && now.duration_since(filled) >= REFILL {
             filled += REFILL;
-            self.left += 1;
+            self.tokens += 1;
         }
-        if self.left == BURST {
+        if self.tokens == BURST {
             filled = now;
         }
         self.filled = Some(filled);
-        let Some(left) = self.left.checked_sub(1) else {
+        let Some(left) = self.tokens.checked_sub(1) else {
             self.left_out += 1;
             return None;
         };
-        self.left = left;
+        self.tokens = left;
         let left_out = std::mem::take(&mut self.left_out);
         Some(Pass {
             left_out: (left_out > 0).then_some(left_out),
@@ -79,14 +79,14 @@ pub(crate) struct Pair(Mutex<Episode>);
 struct Episode {
     bucket: Bucket,
     /// Whether an alarm was logged since the last all-clear. `None` if there was no alarm.
-    told: Option<bool>,
+    alarm_logged: Option<bool>,
 }
 
 impl Pair {
     pub(crate) const fn new() -> Self {
         Self(Mutex::new(Episode {
             bucket: Bucket::FULL,
-            told: None,
+            alarm_logged: None,
         }))
     }
 
@@ -98,7 +98,7 @@ impl Pair {
     pub(crate) fn alarm(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         let passed = episode.bucket.pass(now);
-        episode.told = Some(episode.told == Some(true) || passed.is_some());
+        episode.alarm_logged = Some(episode.alarm_logged == Some(true) || passed.is_some());
         passed
     }
 
@@ -107,15 +107,15 @@ impl Pair {
     /// any other line.
     pub(crate) fn all_clear(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
-        match episode.told.take() {
+        match episode.alarm_logged.take() {
             Some(told) => told.then_some(Pass { left_out: None }),
             None => episode.bucket.pass(now),
         }
     }
 
     /// Notes that another log line has reported the same trouble, so that the all-clear is logged as well.
-    pub(crate) fn told(&self) {
-        self.lock().told = Some(true);
+    pub(crate) fn note_reported(&self) {
+        self.lock().alarm_logged = Some(true);
     }
 }
 
@@ -215,7 +215,7 @@ mod tests {
         let alone = (0..20).filter(|_| pair.all_clear(now).is_some()).count();
         assert_eq!(alone, 10);
         assert_eq!(pair.alarm(now), None);
-        pair.told();
+        pair.note_reported();
         assert_eq!(pair.alarm(now), None);
         assert_eq!(pair.all_clear(now), passed(None));
     }

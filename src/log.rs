@@ -18,7 +18,7 @@ pub struct Stderr {
 impl Stderr {
     /// Finds out whether journald reads standard error. `stream` is the value of `JOURNAL_STREAM`: device and inode of
     /// the stream that systemd created. Standard error may have been redirected since.
-    pub fn of(stream: Option<&str>) -> Self {
+    pub fn detect(stream: Option<&str>) -> Self {
         let own = fstat(io::stderr()).ok();
         let own = own.map(|file| format!("{}:{}", file.st_dev, file.st_ino));
         Self {

@@ -135,7 +135,7 @@ impl Nodes {
     /// because the leader notifies those nodes.
     pub(super) async fn may_notify(&self, port: &str) -> bool {
         let may_notify = !self.alone.load(Ordering::Relaxed)
-            || self.served.has(port)
+            || self.served.serves_host_of(port)
             || !resolver::is_elsewhere(port, self.timeout).await;
         may_notify && self.leads_to_node(port).await
     }
@@ -264,18 +264,18 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         let identify_at = new.map(|since| (since + IDENTIFY_AFTER).into());
         tokio::select! {
             () = nodes.ledger.outbox_changed.notified() => empty_outbox(&nodes, &mut repeats),
-            () = wait::until(tell_again_at.map(Into::into)) => {
+            () = wait::sleep_until(tell_again_at.map(Into::into)) => {
                 nodes.ledger.with_order(|order, _| order.repeat(Instant::now()));
                 notifications::send_waiting(&nodes);
             }
-            () = gate.changed() => match gate.look() {
+            () = gate.changed() => match gate.observe() {
                 State::StandingIn if !owed_told => {
                     owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
                 }
                 State::Open { .. } => (owed_at, owed_told) = (None, false),
                 _ => {}
             },
-            () = wait::until(owed_at) => {
+            () = wait::sleep_until(owed_at) => {
                 let now = Instant::now();
                 let again = nodes.ledger.with_order(|order, _| order.master_is_away(now));
                 (owed_at, owed_told) = (again.map(Into::into), again.is_none());
@@ -283,16 +283,16 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
                     notify_owed(&nodes, now, Telling::Now);
                 }
             }
-            () = wait::until(next) => ask_unreachable(&nodes),
-            () = wait::until(repeats.next().map(Into::into)) => {
+            () = wait::sleep_until(next) => ask_unreachable(&nodes),
+            () = wait::sleep_until(repeats.next().map(Into::into)) => {
                 let unanswered = nodes.unanswered.load(Ordering::Relaxed) > 0;
                 let holding_up = unanswered || !nodes.lock().is_empty();
-                for change in repeats.due(Instant::now(), holding_up) {
+                for change in repeats.take_due(Instant::now(), holding_up) {
                     notify_of_change(&nodes, change);
                 }
             }
             () = nodes.changed.notified() => {}
-            () = wait::until(identify_at) => identify::new_nodes(&nodes),
+            () = wait::sleep_until(identify_at) => identify::new_nodes(&nodes),
             () = wait::tick(&mut reaping) => {
                 if nodes.gate.is_open() {
                     let check = reap(nodes.clone());
@@ -357,7 +357,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
     let due = {
         let mut unreachable = nodes.lock();
         unreachable.retain(|port| registered.contains(port));
-        unreachable.due(Instant::now())
+        unreachable.take_due(Instant::now())
     };
     nodes.update_notifying();
     for port in due {

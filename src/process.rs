@@ -106,7 +106,7 @@ impl Rosmaster {
     }
 
     /// Whether this is ROS's own rosmaster, and not a program that the user chose.
-    pub(crate) fn is_own(&self) -> bool {
+    pub(crate) fn is_ros_rosmaster(&self) -> bool {
         self.config.rosmaster.is_none()
     }
 
@@ -334,14 +334,14 @@ pub(crate) fn is_of_any(pid: u32) -> bool {
 }
 
 /// All processes that this one can see.
-pub(crate) fn all() -> impl Iterator<Item = u32> {
+pub(crate) fn all_pids() -> impl Iterator<Item = u32> {
     let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
 }
 
 /// The parent of the process `pid`.
 pub(crate) fn parent_of(pid: u32) -> Option<u32> {
-    Stat::of(pid).map(|stat| stat.parent)
+    Stat::read(pid).map(|stat| stat.parent)
 }
 
 /// The name of the process `pid`, at most 15 bytes; empty if there is no such process.
@@ -358,8 +358,8 @@ pub(crate) fn is_rosrescue(pid: u32) -> bool {
 }
 
 /// Waits until the process `pid` has ended. It need not be a child of this process.
-pub(crate) async fn ended(pid: u32) {
-    if orphan::ended(pid).await.is_err() {
+pub(crate) async fn wait_until_ended(pid: u32) {
+    if orphan::wait_until_ended(pid).await.is_err() {
         while is_alive(pid) {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }

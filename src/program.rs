@@ -190,7 +190,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
     }
     let mut names = vec![hostname, config.advertised.host.clone()];
     names.extend(std::env::var("ROS_HOSTNAME").ok());
-    app::run(config, sockets, own_names(names), stop, say).await?;
+    app::run(config, sockets, own_names(names), stop, print_line).await?;
     Ok(())
 }
 
@@ -209,7 +209,7 @@ async fn warn_of_another_master(served: MasterUri) {
 }
 
 /// Prints a line. A closed stdout is not an error.
-fn say(line: &str) {
+fn print_line(line: &str) {
     let mut stdout = std::io::stdout();
     let colour = stdout.is_terminal() && colour_is_welcome();
     let (on, off) = if colour {
@@ -236,7 +236,9 @@ fn start_log(args: &LoggingArgs, verbose: bool) -> Result<(), String> {
         .map_err(|error| format!("--log: `{filter}`: {error}"))?;
     let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
     let log = fmt::layer()
-        .with_writer(Stderr::of(std::env::var("JOURNAL_STREAM").ok().as_deref()))
+        .with_writer(Stderr::detect(
+            std::env::var("JOURNAL_STREAM").ok().as_deref(),
+        ))
         .with_target(false)
         // These errors would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)

@@ -33,7 +33,7 @@ use crate::{
     ledger::history::Rescues,
     limit::{Pair, alarm, all_clear, rarely},
     nodes::{self, Nodes},
-    process::{self, ProcessError, effort, listeners::Holder},
+    process::{self, ProcessError, effort, listeners::PortHolder},
     status::{
         Board,
         report::{AWAY, RecoveryOutcome, STARTED},
@@ -255,7 +255,7 @@ impl Driver {
         if !self.lifecycle.needs_sample(Instant::now(), input) {
             return;
         }
-        let look = move || (pid.and_then(effort::of), effort::own_wait());
+        let look = move || (pid.and_then(effort::measure), effort::own_wait());
         let (master, own_wait) = crate::task::spawn_blocking(look).await.unwrap_or_default();
         self.lifecycle.observe(Sample {
             at: Instant::now(),
@@ -320,12 +320,12 @@ impl Driver {
                 () = self.write_queue.late_answered() => return Input::LateAnswered,
                 () = self.write_queue.late() => return Input::Late,
                 () = self.write_queue.slow() => return Input::Slow,
-                () = wait::until(self.probe_deadline) => {
+                () = wait::sleep_until(self.probe_deadline) => {
                     let late = self.probe_deadline.take().map(|at| at.elapsed());
                     self.timers_late += late.unwrap_or_default();
                     return Input::ProbeMissed;
                 }
-                () = wait::until(wake) => return Input::Wake,
+                () = wait::sleep_until(wake) => return Input::Wake,
             }
         }
     }
@@ -349,8 +349,8 @@ impl Driver {
                     // This check comes before the first call, because another program at the port must not get the
                     // state.
                     match holder(new).await {
-                        Holder::Stranger(pid) => Done::PortTaken(pid),
-                        Holder::Master | Holder::Unknown => Done::Connected(sentinel),
+                        PortHolder::Stranger(pid) => Done::PortTaken(pid),
+                        PortHolder::Master | PortHolder::Unknown => Done::Connected(sentinel),
                     }
                 }));
             }
@@ -536,7 +536,7 @@ impl Driver {
     /// Keeps `sentinel` to notice the master's end.
     fn watch(&mut self, sentinel: Arc<Sentinel>) {
         let watched = sentinel.clone();
-        self.ended = Some(Box::pin(async move { watched.ended().await }));
+        self.ended = Some(Box::pin(async move { watched.wait_until_ended().await }));
         self.sentinel = Some(sentinel);
     }
 
@@ -676,12 +676,12 @@ fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
 }
 
 /// Finds the process that listens at the port of a new master. Does not block the runtime.
-async fn holder(new: Option<(u32, u16, bool)>) -> Holder {
+async fn holder(new: Option<(u32, u16, bool)>) -> PortHolder {
     let Some((pid, port, own)) = new else {
-        return Holder::Unknown;
+        return PortHolder::Unknown;
     };
-    let look = crate::task::spawn_blocking(move || Holder::of(pid, port, own));
-    look.await.unwrap_or(Holder::Unknown)
+    let look = crate::task::spawn_blocking(move || PortHolder::find(pid, port, own));
+    look.await.unwrap_or(PortHolder::Unknown)
 }
 
 async fn exited(process: &mut Option<MasterProcess>) {

@@ -53,7 +53,7 @@ fn set(key: &str, value: &str) -> Request {
     Request::new(Method::SetParam, [CALLER_ID, key, value])
 }
 
-fn has(roscore: &Roscore, key: &str) -> bool {
+fn has_param(roscore: &Roscore, key: &str) -> bool {
     let call = Request::new(Method::HasParam, [CALLER_ID, key]);
     let yes = Value::Bool(true);
     matches!(roscore.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
@@ -66,7 +66,7 @@ fn run_id(roscore: &Roscore) -> Request {
 /// Sets the run id of a new session before there is a master. The master gets it with the rest of the state, so every
 /// roslaunch sees a master with a run id. Does nothing if the master may already have a run id.
 pub(crate) fn seed_run_id(roscore: &Roscore) {
-    if !has(roscore, "/run_id") {
+    if !has_param(roscore, "/run_id") {
         roscore.ledger.seed(&run_id(roscore));
     }
 }
@@ -80,7 +80,7 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
             version(&roscore, "/rosdistro", "-d"),
             first_opening(&roscore),
         );
-        let missing = Some(run_id(&roscore)).filter(|_| !has(&roscore, "/run_id"));
+        let missing = Some(run_id(&roscore)).filter(|_| !has_param(&roscore, "/run_id"));
         let calls: Vec<_> = [missing, versions.0, versions.1]
             .into_iter()
             .flatten()
@@ -111,7 +111,7 @@ async fn first_opening(roscore: &Roscore) {
 
 /// The call that sets `key` to the output of `rosversion`, with the line feed that `roscore.xml` keeps.
 async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
-    if has(roscore, key) {
+    if has_param(roscore, key) {
         return None;
     }
     let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
@@ -143,7 +143,7 @@ async fn keep_rosout(roscore: &Roscore) {
         {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
-                process::ended(pid).await;
+                process::wait_until_ended(pid).await;
             }
             None => match rosout.spawn(&roscore.uri).await {
                 Ok(mut child) => {
@@ -180,7 +180,7 @@ async fn living_rosout(roscore: &Roscore) -> Option<u32> {
     let api = roscore
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
-    match client::ask_for(&api, &master::get_pid(), roscore.node_timeout).await {
+    match client::call_for_value(&api, &master::get_pid(), roscore.node_timeout).await {
         (Reaction::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }
@@ -206,6 +206,6 @@ async fn end_rosout(roscore: &Roscore) {
     };
     let _ = tokio::time::timeout(STARTED, named).await;
     if process::runs(pid, "rosout") {
-        process::stop(pid, process::ended(pid)).await;
+        process::stop(pid, process::wait_until_ended(pid)).await;
     }
 }

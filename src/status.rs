@@ -193,7 +193,7 @@ impl Facts {
     }
 
     /// Whether calls are answered by the master, the mirror, or another computer.
-    pub(crate) fn answers(&self, gate: State) -> bool {
+    pub(crate) fn answers_calls(&self, gate: State) -> bool {
         match gate {
             State::Open { .. } | State::StandingIn | State::Late | State::Injecting => true,
             State::Elsewhere => {

@@ -189,7 +189,7 @@ pub(crate) struct OpenCall<'a>(&'a Upstream);
 
 impl Drop for OpenCall<'_> {
     fn drop(&mut self) {
-        self.0.lock_open_calls().ended(Instant::now());
+        self.0.lock_open_calls().end(Instant::now());
     }
 }
 
@@ -268,7 +268,7 @@ impl Upstream {
 
     /// Notes that a call begins.
     pub(crate) fn begin_call(&self) -> OpenCall<'_> {
-        self.lock_open_calls().begins(Instant::now());
+        self.lock_open_calls().begin(Instant::now());
         OpenCall(self)
     }
 

@@ -5,7 +5,7 @@ use std::{sync::mpsc, thread, time::Duration};
 use tokio::time::Instant;
 
 /// Sleeps until `deadline`, or forever if there is none.
-pub(crate) async fn until(deadline: Option<Instant>) {
+pub(crate) async fn sleep_until(deadline: Option<Instant>) {
     match deadline {
         Some(deadline) => tokio::time::sleep_until(deadline).await,
         None => std::future::pending().await,

@@ -300,7 +300,9 @@ impl ClusterDriver {
                 let leads = false;
                 let otherwise = Input::Probed { number, leads };
                 let pause = self.member.settings().ttl / PROBES;
-                let peer = MasterUri::parse(&uri).ok().map(|uri| self.peers.at(&uri));
+                let peer = MasterUri::parse(&uri)
+                    .ok()
+                    .map(|uri| self.peers.peer_at(&uri));
                 self.spawn(otherwise, async move {
                     let asked = async { peer?.leads(term).await.then_some(()) };
                     let leads = tokio::time::timeout(pause, asked).await;
@@ -414,14 +416,14 @@ impl ClusterDriver {
                 },
                 Some(_) = self.beside.join_next() => {}
                 Some(_) = self.endings.join_next() => {}
-                () = wait::until(wake.map(Into::into)) => return Ok(Input::Wake),
+                () = wait::sleep_until(wake.map(Into::into)) => return Ok(Input::Wake),
             }
         }
     }
 
     async fn end_master(&mut self) {
         if let Some(duties) = self.duties.take() {
-            let ending = duties.end().await;
+            let ending = duties.stop_and_kill_master().await;
             self.endings.spawn(ending);
         }
         self.setup.context.ledger.end_injection();
@@ -571,7 +573,7 @@ async fn merge(
         return queue.merge(ask, Origin::At(own)).await;
     };
     let uri = MasterUri::parse(&uri).ok()?;
-    let leader = peers.at(&uri);
+    let leader = peers.peer_at(&uri);
     let body = Bytes::from(ask.to_request().encode());
     let raw = leader.forward(term, &Head::default(), &body).await.ok()?;
     let reply = xmlrpc::decode_reply(&raw.body).ok()?;

@@ -194,7 +194,7 @@ impl MasterDuties {
 
     /// Stops recovery and roscore's other duties, and kills the master at once: another computer may lead, and no node
     /// may hear from this computer's master any more. The returned future waits for the processes.
-    pub(super) async fn end(self) -> impl Future<Output = ()> + Send + 'static {
+    pub(super) async fn stop_and_kill_master(self) -> impl Future<Output = ()> + Send + 'static {
         self.stop.cancel();
         let process = match self.driver.await {
             Ok(ended) => ended.ok().flatten(),

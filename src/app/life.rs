@@ -37,7 +37,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
         questions.spawn(async move {
             (same_boot || resolver::is_elsewhere(&api, LIFE_SIGN).await)
                 && answer_counts(&api, from).await
-                && client::ask(&api, &call, LIFE_SIGN).await == Reaction::Alive
+                && client::call(&api, &call, LIFE_SIGN).await == Reaction::Alive
         });
     }
     while let Some(alive) = questions.join_next().await {
@@ -55,5 +55,5 @@ async fn answer_counts(api: &str, from: Option<IpAddr>) -> bool {
         None => None,
     };
     let at: Vec<_> = at.iter().flatten().map(SocketAddr::ip).collect();
-    Reach::of(from, &at, resolver::is_own).answer_counts()
+    Reach::classify(from, &at, resolver::is_own).answer_counts()
 }

@@ -73,7 +73,7 @@ impl Context {
         let situation = Situation {
             nodes: self.nodes.trouble(&self.nodes.lives()),
             gate: self.gate.state(),
-            gate_since: self.gate.since().into_std(),
+            gate_since: self.gate.opened_or_shut_at().into_std(),
             unprotected: self.ledger.unprotected(),
             master: self.upstream.address().to_string(),
         };
@@ -85,7 +85,7 @@ impl Context {
     /// Checks whether the guardian `pid` is stopped. A stopped guardian starts no worker, and neither its link nor its
     /// exit would show that. `guarded` is the state to report while the guardian runs.
     fn see_guardian(&self, pid: u32, guarded: Guarded) {
-        let now = match Stat::of(pid).is_some_and(Stat::is_stopped) {
+        let now = match Stat::read(pid).is_some_and(Stat::is_stopped) {
             true => Guarded::Stopped(pid),
             false => guarded,
         };
@@ -112,11 +112,11 @@ impl Context {
     }
 
     /// Waits until calls are answered by the master, the mirror, or another computer.
-    async fn answers(&self) {
+    async fn wait_until_answering(&self) {
         let mut gate = self.gate.clone();
         loop {
             let state = gate.wait_for(|state| state != State::Unknown).await;
-            if self.board.update(|facts| facts.answers(state)) {
+            if self.board.update(|facts| facts.answers_calls(state)) {
                 return;
             }
             // Polled, because the end of joining wakes no waiter.
@@ -144,7 +144,7 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, context: Arc
     let Ok(mut link) = link else { return };
     let (mut from, mut to) = link.split();
     let served = async {
-        context.answers().await;
+        context.wait_until_answering().await;
         // If the guardian is gone, the read below notices.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
@@ -174,7 +174,7 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, context: Arc
 }
 
 async fn report_ready(context: Arc<Context>) {
-    context.answers().await;
+    context.wait_until_answering().await;
     let line = context.line();
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }

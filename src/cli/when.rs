@@ -45,7 +45,7 @@ impl FromStr for When {
         let parsed = match text.strip_prefix('-') {
             _ if text == "now" => Some(Self::Now),
             Some(span) => span_of(span).map(Self::Ago),
-            None => at(text),
+            None => parse_time(text),
         };
         parsed.ok_or_else(|| format!("\"{text}\" is not a time: {EXAMPLES}"))
     }
@@ -64,7 +64,7 @@ fn span_of(text: &str) -> Option<u64> {
     count.checked_mul(millis)
 }
 
-fn at(text: &str) -> Option<When> {
+fn parse_time(text: &str) -> Option<When> {
     let text = text.strip_suffix('Z').unwrap_or(text);
     match text.split_once(['T', ' ']) {
         Some((date, time)) => Some(When::At(days_to(date)? * DAY + of_day(time)?)),

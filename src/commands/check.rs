@@ -19,7 +19,7 @@ use std::{convert::Infallible, fmt, time::Duration};
 use serde::Serialize;
 
 use self::facts::SetupFacts;
-use super::{CommandFailure, Exit, counted, print, running::Running, say};
+use super::{CommandFailure, Exit, counted, eprint_line, print, running::Running};
 use crate::{
     cli::{CheckArgs, OptionValue, TargetArgs},
     printable::{Lines, Page, display_lines, line},
@@ -35,7 +35,7 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     let facts = SetupFacts::gather(args, master);
     let slow = async {
         tokio::time::sleep(Duration::from_secs(1)).await;
-        say("still checking: looking up unknown names takes long");
+        eprint_line("still checking: looking up unknown names takes long");
         std::future::pending::<Infallible>().await
     };
     let facts = tokio::select! {

@@ -31,7 +31,7 @@ use self::{
     topics::{Topic, Usefulness},
     verdict::{DrillVerdict, names},
 };
-use super::{CommandFailure, Exit, agrees, counted, print, running::Running, say};
+use super::{CommandFailure, Exit, agrees, counted, eprint_line, print, running::Running};
 use crate::{
     cli::{DrillArgs, Victim},
     process,
@@ -110,7 +110,7 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), CommandFailure> 
     let kill = if args.hang { Victim::Master } else { args.kill };
     let victims = names(&target.victims(kill).await?);
     let how = if args.hang { "SIGSTOP" } else { "SIGKILL" };
-    say(&format!(
+    eprint_line(&format!(
         "This sends {how} to {victims} of {}, {}.",
         target.running.address,
         counted(args.times as usize, "time")
@@ -161,7 +161,7 @@ impl Drill<'_> {
         stop: &CancellationToken,
     ) -> Result<DrillVerdict, CommandFailure> {
         let start = Instant::now();
-        say("watching normal operation, and finding topics with messages");
+        eprint_line("watching normal operation, and finding topics with messages");
         let api = self.target.api.clone();
         self.remove_left_behind().await?;
         let before = RobotState::read(&api)
@@ -174,7 +174,7 @@ impl Drill<'_> {
         let callers = Callers {
             api: api.clone(),
             node_api: self.node.api.clone(),
-            heard: self.node.heard.clone(),
+            log: self.node.log.clone(),
             key: self.key().to_owned(),
             topic: format!("{}/topic", self.key()),
         };
@@ -188,7 +188,7 @@ impl Drill<'_> {
             topic.begin();
         }
         let kills = if self.args.no_kill {
-            say(&format!("watching for {} s", self.args.seconds));
+            eprint_line(&format!("watching for {} s", self.args.seconds));
             sleep(Duration::from_secs(self.args.seconds.into())).await;
             Vec::new()
         } else {
@@ -196,7 +196,7 @@ impl Drill<'_> {
         };
         stop.cancel();
         let calls = self.calls().await;
-        let updates = self.node.heard.updates();
+        let updates = self.node.log.updates();
         let (now, watched) = (Instant::now(), self.topics.iter());
         let mut topics: Vec<_> = watched.map(|topic| topic.report(now, &updates)).collect();
         let difference = match self.read_after(&before).await {
@@ -222,7 +222,7 @@ impl Drill<'_> {
             failures: Vec::new(),
             notes: Vec::new(),
         };
-        let shutdown = self.node.heard.shutdown();
+        let shutdown = self.node.log.shutdown();
         verdict.collect_failures(difference, shutdown, self.args.limit);
         Ok(verdict)
     }
@@ -238,7 +238,7 @@ impl Drill<'_> {
             sleep(LOOK_AGAIN).await;
         };
         let others = ByOthers {
-            changed: self.node.heard.changed(),
+            changed: self.node.log.changed(),
             died: self.target.died().await?,
             alive: before.alive_without(&after).await,
         };
@@ -268,7 +268,7 @@ impl Drill<'_> {
             match Topic::subscribe(&api, &self.node, &name, usefulness).await {
                 Ok(topic) => found.push(topic),
                 Err(why) => {
-                    say(&format!("not watched: {why}"));
+                    eprint_line(&format!("not watched: {why}"));
                     let _ = topics::unregister(&api, &self.node, &name).await;
                 }
             }

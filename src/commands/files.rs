@@ -18,9 +18,8 @@ use rescue_core::checkpoint::{
 use ros1_master::master::{Master, Request};
 
 use super::{
-    CommandFailure, note,
+    CommandFailure, eprint_line, note,
     running::{Running, is_here},
-    say,
 };
 use crate::{
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
@@ -157,7 +156,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
         return Err(CommandFailure::Usage(why));
     }
     if metadata.len() > LARGE && io::stderr().is_terminal() {
-        say(&format!("reading `{shown}`, {} …", size(metadata.len())));
+        eprint_line(&format!("reading `{shown}`, {} …", size(metadata.len())));
     }
     let loaded = checkpoint_store::read(path).map_err(|error| {
         CommandFailure::Usage(match error {

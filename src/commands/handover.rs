@@ -99,7 +99,7 @@ pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, CommandFailure> {
     let mut to = Some(from.clone());
     let start = Instant::now();
     if wanted != Some(&from.name) {
-        ask(&running, wanted, args.timeout).await?;
+        request_handover(&running, wanted, args.timeout).await?;
         to = next_leader(&running, from, start, args.timeout).await?;
     }
     let outcome = Outcome {
@@ -150,7 +150,11 @@ fn leader(now: &Computers) -> Result<&LeaderStatus, CommandFailure> {
 }
 
 /// Asks the leader to hand over.
-async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<(), CommandFailure> {
+async fn request_handover(
+    running: &Running,
+    wanted: Option<&str>,
+    timeout: f64,
+) -> Result<(), CommandFailure> {
     let limit =
         Duration::try_from_secs_f64(timeout).map_or(ANSWER_LIMIT, |limit| limit.max(ANSWER_LIMIT));
     let params = [CALLER, wanted.unwrap_or_default()].map(Value::from);

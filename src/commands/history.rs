@@ -27,7 +27,7 @@ pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
             let counts = opened.as_ref().ok().map(|opened| opened.state.counts());
             Row {
                 number,
-                what: what(&listed.name),
+                what: describe_file(&listed.name),
                 rescue: Rescue::from_reports(&listed.name, &reports),
                 name: listed.name,
                 written: clock::wall_text(listed.written as f64),
@@ -53,7 +53,7 @@ pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
     })
 }
 
-fn what(name: &str) -> &'static str {
+fn describe_file(name: &str) -> &'static str {
     match name.split('-').next() {
         Some("rescue") => "restored in a rescue",
         Some("session") => "end of an earlier session",

@@ -23,7 +23,7 @@ use self::units::{MARK, UnitSettings};
 use super::{
     CommandFailure, Exit, agrees,
     check::units::{self as others, UnitKind},
-    print, say,
+    eprint_line, print,
 };
 use crate::{
     cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
@@ -59,7 +59,7 @@ enum Change {
 
 /// All changes in order, and notes for the operator.
 #[derive(Debug, Default, Serialize)]
-struct Plan {
+struct SystemChanges {
     changes: Vec<Change>,
     notes: Vec<String>,
     /// Reasons not to make the changes.
@@ -143,7 +143,7 @@ impl UnitPaths {
     }
 
     /// Whether systemctl confirms `question`, such as `is-active`, for `unit`.
-    fn is(&self, question: &str, unit: &str) -> bool {
+    fn systemctl_confirms(&self, question: &str, unit: &str) -> bool {
         let command = self.systemctl(&[question, "--quiet", unit]);
         run_command(&command, Stdio::null()).is_ok_and(|status| status.success())
     }
@@ -156,7 +156,7 @@ impl UnitPaths {
     }
 
     /// The systemctl option that starts or stops a unit at once, if systemd runs.
-    fn now(&self) -> &'static [&'static str] {
+    fn now_option(&self) -> &'static [&'static str] {
         if self.systemd_runs() { &["--now"] } else { &[] }
     }
 
@@ -167,7 +167,7 @@ impl UnitPaths {
     }
 }
 
-async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<Plan, CommandFailure> {
+async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -200,7 +200,7 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<Plan, CommandF
         CommandFailure::Failed(format!("cannot find this program's file: {error}"))
     })?;
 
-    let mut plan = Plan::default();
+    let mut plan = SystemChanges::default();
     if let Some(user) = &run_as
         && named_user(args, &caller).is_none()
         && rustix::process::geteuid().is_root()
@@ -267,10 +267,15 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<Plan, CommandF
         plan.run(place.systemctl(&["daemon-reload"]));
     }
     for unit in &disabled {
-        plan.run(place.systemctl(&[&["disable"], place.now(), &[unit]].concat()));
+        plan.run(place.systemctl(&[&["disable"], place.now_option(), &[unit]].concat()));
     }
-    let is_running = place.systemd_runs() && UNITS.iter().all(|unit| place.is("is-active", unit));
-    let is_enabled = UNITS.iter().all(|unit| place.is("is-enabled", unit));
+    let is_running = place.systemd_runs()
+        && UNITS
+            .iter()
+            .all(|unit| place.systemctl_confirms("is-active", unit));
+    let is_enabled = UNITS
+        .iter()
+        .all(|unit| place.systemctl_confirms("is-enabled", unit));
     if is_changed && is_running {
         // The settings that say what runs, and as which user.
         let key = |text: &str| {
@@ -299,8 +304,8 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<Plan, CommandF
     Ok(plan)
 }
 
-fn uninstall(place: &UnitPaths) -> Plan {
-    let mut plan = Plan::default();
+fn uninstall(place: &UnitPaths) -> SystemChanges {
+    let mut plan = SystemChanges::default();
     let files = place.files();
     let dropin = fs::read_to_string(&files[2]).unwrap_or_default();
     let is_ours =
@@ -311,20 +316,20 @@ fn uninstall(place: &UnitPaths) -> Plan {
             .push("`rosrescue install` has installed nothing here".to_owned());
         return plan;
     }
-    plan.run(place.systemctl(&[&["disable"], place.now(), &UNITS].concat()));
+    plan.run(place.systemctl(&[&["disable"], place.now_option(), &UNITS].concat()));
     plan.changes
         .extend(ours.into_iter().map(|path| Change::Remove { path }));
     if place.systemd_runs() {
         plan.run(place.systemctl(&["daemon-reload"]));
     }
     for unit in units::disabled(&dropin) {
-        plan.run(place.systemctl(&[&["enable"], place.now(), &[&unit]].concat()));
+        plan.run(place.systemctl(&[&["enable"], place.now_option(), &[&unit]].concat()));
     }
     plan
 }
 
 /// Shows the plan, asks, and makes the changes.
-fn carry_out(plan: &Plan, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
+fn carry_out(plan: &SystemChanges, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
     if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
         print(plan, &args.output)?;
         return Ok(if plan.obstacles.is_empty() {
@@ -339,18 +344,18 @@ fn carry_out(plan: &Plan, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
         let text = "cannot ask here: look at the changes with --dry-run, then make them with --yes";
         return Err(CommandFailure::Usage(text.to_owned()));
     } else {
-        plan.to_string().lines().for_each(say);
+        plan.to_string().lines().for_each(eprint_line);
         if !agrees("Make these changes?").unwrap_or(false) {
             return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
     }
     for change in &plan.changes {
-        change.make()?;
+        change.apply()?;
     }
     Ok(Exit::Good)
 }
 
-impl Plan {
+impl SystemChanges {
     fn run(&mut self, command: Vec<String>) {
         self.changes.push(Change::Run { command });
     }
@@ -390,7 +395,7 @@ impl Plan {
     }
 
     fn start(&mut self, place: &UnitPaths, service: &Service, port_will_be_free: bool) {
-        let mut options = place.now().to_vec();
+        let mut options = place.now_option().to_vec();
         if !service.runs_rosmaster && place.systemd_runs() {
             // A proxy counts as started once it has a master, which can take long.
             options.push("--no-block");
@@ -420,7 +425,7 @@ impl Plan {
 }
 
 impl Change {
-    fn make(&self) -> Result<(), CommandFailure> {
+    fn apply(&self) -> Result<(), CommandFailure> {
         match self {
             Self::Write { path, text } => {
                 let folder = path.parent().unwrap_or(path);
@@ -457,7 +462,7 @@ impl Change {
     }
 }
 
-impl Lines for Plan {
+impl Lines for SystemChanges {
     fn lines(&self, f: &mut Page) -> fmt::Result {
         if self.changes.is_empty() {
             line!(f, "nothing to change")?;
@@ -484,7 +489,7 @@ impl Lines for Plan {
     }
 }
 
-display_lines!(Plan);
+display_lines!(SystemChanges);
 
 fn run_command(words: &[String], errors: Stdio) -> io::Result<system::ExitStatus> {
     let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;

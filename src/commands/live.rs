@@ -64,13 +64,13 @@ impl Live {
             CommandFailure::Failed(format!("cannot read the master at {uri}: {why}"))
         };
         let read = async {
-            let first = inspect::first(&mut self.connection, &token).await;
+            let first = inspect::read_first(&mut self.connection, &token).await;
             let first = first.map_err(|error| failed(&error))?;
             if !first.has_params() {
                 let why = "it holds a parameter that no master can return; delete that first";
                 return Err(failed(&why));
             }
-            let state = inspect::second(first, &mut self.connection, previous).await;
+            let state = inspect::read_second(first, &mut self.connection, previous).await;
             state.map_err(|error| failed(&error))
         };
         let limit = format!("no answer in {} s", ANSWER_LIMIT.as_secs());
@@ -80,7 +80,7 @@ impl Live {
     }
 
     /// Makes `calls` in one multicall. Each result is the error message, or `None` if the call succeeded.
-    pub(super) async fn make(
+    pub(super) async fn call_all(
         &mut self,
         calls: Vec<Request>,
     ) -> Result<Vec<Option<String>>, CommandFailure> {

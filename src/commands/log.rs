@@ -8,7 +8,7 @@ use checkpoint_store::log::{LogFile, files as log_files};
 use rescue_core::checkpoint::{
     compare::{Difference, What},
     format,
-    log::{Entry, LogReader},
+    log::{LogEntry, LogReader},
     putback::is_in,
 };
 use serde::Serialize;
@@ -32,7 +32,7 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
     let mut rescues = rescues(&path, &wanted);
     let mut found = false;
     let mut last = 0;
-    let mut show_all = |entries: Vec<Entry>| {
+    let mut show_all = |entries: Vec<LogEntry>| {
         found |= !entries.is_empty();
         for mut entry in entries {
             // A rescue has the number of the record before it.
@@ -84,8 +84,8 @@ pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
         // A file may be replaced while it is read. The next look finds what is missing.
         live.filter_map(|file| file.read().ok())
             .for_each(|text| drop(reader.read(&text)));
-        let new = reader.take().into_iter();
-        for entry in new.filter(|entry| wanted.has(entry)) {
+        let new = reader.take_entries().into_iter();
+        for entry in new.filter(|entry| wanted.selects(entry)) {
             if !show(&entry, args.json)? {
                 return Ok(Exit::Good);
             }
@@ -140,12 +140,12 @@ impl<'a> Wanted<'a> {
         self.all && self.since == 0 && self.until == u64::MAX
     }
 
-    fn has_time(&self, at: u64) -> bool {
+    fn selects_time(&self, at: u64) -> bool {
         (self.since..=self.until).contains(&at)
     }
 
-    fn has(&self, entry: &Entry) -> bool {
-        if !self.has_time(entry.at) {
+    fn selects(&self, entry: &LogEntry) -> bool {
+        if !self.selects_time(entry.at) {
             return false;
         }
         let Some(change) = &entry.change else {
@@ -188,7 +188,7 @@ impl<'a> Wanted<'a> {
         let thinned = framed.thinned(|line| {
             let body = std::str::from_utf8(line.body()).unwrap_or_default();
             let is_named = self.all || self.words.iter().any(|word| body.contains(word));
-            count += usize::from(is_named && self.has_time(line.time()));
+            count += usize::from(is_named && self.selects_time(line.time()));
             is_named || !line.is_about_param()
         });
         let text = thinned.map_err(|error| error.to_string())?;
@@ -236,7 +236,7 @@ fn newest(
     wanted: &Wanted<'_>,
     lines: usize,
     reader: &mut LogReader,
-) -> Result<Vec<Entry>, CommandFailure> {
+) -> Result<Vec<LogEntry>, CommandFailure> {
     let files = list(path)?;
     let mut thin: VecDeque<Thin> = VecDeque::new();
     let mut most = lines;
@@ -268,7 +268,7 @@ fn newest(
 }
 
 /// Reads the wanted entries of `files`, which follow each other.
-fn read_thin(files: &[Thin], wanted: &Wanted<'_>, reader: &mut LogReader) -> Vec<Entry> {
+fn read_thin(files: &[Thin], wanted: &Wanted<'_>, reader: &mut LogReader) -> Vec<LogEntry> {
     let mut found = Vec::new();
     for (index, file) in files.iter().enumerate() {
         let next = files.get(index + 1).map_or(0, |next| next.count);
@@ -278,7 +278,12 @@ fn read_thin(files: &[Thin], wanted: &Wanted<'_>, reader: &mut LogReader) -> Vec
             // It was reported when it was read.
             let _ = reader.read(&file.text);
         }
-        found.extend(reader.take().into_iter().filter(|entry| wanted.has(entry)));
+        found.extend(
+            reader
+                .take_entries()
+                .into_iter()
+                .filter(|entry| wanted.selects(entry)),
+        );
     }
     found
 }
@@ -315,8 +320,8 @@ fn thin_of(file: &LogFile, wanted: &Wanted<'_>) -> Thin {
 }
 
 /// The wanted rescues of which there is a report, oldest first.
-fn rescues(path: &Path, wanted: &Wanted<'_>) -> VecDeque<Entry> {
-    let rescues = report_file::read(path).into_iter().map(|kept| Entry {
+fn rescues(path: &Path, wanted: &Wanted<'_>) -> VecDeque<LogEntry> {
+    let rescues = report_file::read(path).into_iter().map(|kept| LogEntry {
         seq: 0,
         at: (kept.report.detected_at * 1e3) as u64,
         caller: None,
@@ -324,11 +329,11 @@ fn rescues(path: &Path, wanted: &Wanted<'_>) -> VecDeque<Entry> {
         change: None,
         event: Some(rescue(&kept.report)),
     });
-    rescues.filter(|entry| wanted.has(entry)).collect()
+    rescues.filter(|entry| wanted.selects(entry)).collect()
 }
 
 /// Takes each rescue that is earlier than one of `entries`, and puts it before that.
-fn with_rescues(entries: Vec<Entry>, rescues: &mut VecDeque<Entry>) -> Vec<Entry> {
+fn with_rescues(entries: Vec<LogEntry>, rescues: &mut VecDeque<LogEntry>) -> Vec<LogEntry> {
     let mut all = Vec::with_capacity(entries.len());
     for entry in entries {
         while rescues.front().is_some_and(|rescue| rescue.at < entry.at) {
@@ -356,11 +361,11 @@ struct Line<'a> {
     time: String,
     text: String,
     #[serde(flatten)]
-    entry: &'a Entry,
+    entry: &'a LogEntry,
 }
 
 /// Prints an entry. Returns false if the reader of the output has closed it.
-fn show(entry: &Entry, json: bool) -> Result<bool, CommandFailure> {
+fn show(entry: &LogEntry, json: bool) -> Result<bool, CommandFailure> {
     let time = match entry.at {
         0 => "at an unknown time       ".to_owned(),
         at => clock::wall_text_millis(at),
@@ -377,7 +382,7 @@ fn show(entry: &Entry, json: bool) -> Result<bool, CommandFailure> {
     print_line(&Printable::line(&format!("{time}  {who}{text}")))
 }
 
-fn text_of(entry: &Entry) -> String {
+fn text_of(entry: &LogEntry) -> String {
     let Some(change) = &entry.change else {
         return entry.event.clone().unwrap_or_default();
     };

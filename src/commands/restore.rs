@@ -20,7 +20,9 @@ use ros1_master::{
 };
 use serde::Serialize;
 
-use super::{CommandFailure, Exit, agrees, files, live::Live, print, running::Running, say};
+use super::{
+    CommandFailure, Exit, agrees, eprint_line, files, live::Live, print, running::Running,
+};
 use crate::{
     cli::RestoreArgs,
     printable::{Lines, Page, display_lines, line},
@@ -125,11 +127,11 @@ async fn set(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, Comm
             batch.push(call);
         }
         done += batch.len();
-        let refused = live.make(batch).await?;
+        let refused = live.call_all(batch).await?;
         let refused = texts.into_iter().zip(refused);
         failed.extend(refused.filter_map(|(text, why)| Some(format!("{text}: {}", why?))));
         if said.elapsed() >= Duration::from_secs(1) && io::stderr().is_terminal() {
-            say(&format!("{done} of {total} calls …"));
+            eprint_line(&format!("{done} of {total} calls …"));
             said = Instant::now();
         }
     }

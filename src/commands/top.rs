@@ -206,7 +206,7 @@ impl Lines for Top {
             ("not checked:", &self.nodes.unchecked_nodes),
         ] {
             if !names.is_empty() {
-                line!(head, "{what} {}", self.nodes.since(names))?;
+                line!(head, "{what} {}", self.nodes.with_times(names))?;
             }
         }
         if let Some(cluster) = &self.cluster {

@@ -102,7 +102,7 @@ impl Restarts {
     /// Before any worker has answered calls, an exit status is an error of the start, such as a missing rosmaster.
     /// Later the same error may be temporary. A worker that has answered calls is replaced at once, because calls wait.
     /// Only workers that fail earlier could keep the processor busy without use, so they are delayed.
-    pub fn ended(&mut self, end: End, served: bool, now: Instant) -> NextStart {
+    pub fn worker_ended(&mut self, end: End, served: bool, now: Instant) -> NextStart {
         self.served |= served;
         self.failures = match served {
             true => 0,
@@ -161,7 +161,7 @@ mod tests {
     fn pauses_grow_while_workers_fail_and_end_when_one_serves() {
         let mut restarts = Restarts::default();
         let now = Instant::now();
-        let mut die = |served| match restarts.ended(KILLED, served, now) {
+        let mut die = |served| match restarts.worker_ended(KILLED, served, now) {
             NextStart::Restart { pause, .. } => pause.as_millis(),
             NextStart::Exit(status) => panic!("exit {status}"),
         };
@@ -176,13 +176,14 @@ mod tests {
     fn workers_that_have_served_are_followed_at_once_and_many_deaths_are_told() {
         let mut restarts = Restarts::default();
         let start = Instant::now();
-        let mut die = |at| match restarts.ended(KILLED, true, start + Duration::from_secs(at)) {
-            NextStart::Restart {
-                pause,
-                again_and_again,
-            } => (pause.is_zero(), again_and_again),
-            NextStart::Exit(status) => panic!("exit {status}"),
-        };
+        let mut die =
+            |at| match restarts.worker_ended(KILLED, true, start + Duration::from_secs(at)) {
+                NextStart::Restart {
+                    pause,
+                    again_and_again,
+                } => (pause.is_zero(), again_and_again),
+                NextStart::Exit(status) => panic!("exit {status}"),
+            };
         // This takes longer than a minute.
         for number in 0..40 {
             assert_eq!(die(2 * number), (true, number >= 5), "{number}");
@@ -194,36 +195,54 @@ mod tests {
     fn errors_of_the_start_end_it_and_later_ones_do_not() {
         let now = Instant::now();
         let mut restarts = Restarts::default();
-        assert_eq!(restarts.ended(End::Code(1), false, now), NextStart::Exit(1));
-        assert_eq!(restarts.ended(KILLED, false, now), AT_ONCE);
-        assert_eq!(restarts.ended(End::Code(PANIC), false, now), AT_ONCE);
+        assert_eq!(
+            restarts.worker_ended(End::Code(1), false, now),
+            NextStart::Exit(1)
+        );
+        assert_eq!(restarts.worker_ended(KILLED, false, now), AT_ONCE);
+        assert_eq!(restarts.worker_ended(End::Code(PANIC), false, now), AT_ONCE);
         // No worker has answered calls yet.
-        assert_eq!(restarts.ended(End::Code(2), false, now), NextStart::Exit(2));
-        assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
-        assert_eq!(restarts.ended(End::Code(1), false, now), AT_ONCE);
+        assert_eq!(
+            restarts.worker_ended(End::Code(2), false, now),
+            NextStart::Exit(2)
+        );
+        assert_eq!(restarts.worker_ended(KILLED, true, now), AT_ONCE);
+        assert_eq!(restarts.worker_ended(End::Code(1), false, now), AT_ONCE);
     }
 
     #[test]
     fn a_stop_ends_it_with_the_status_of_the_worker() {
         let now = Instant::now();
         let mut restarts = Restarts::default();
-        assert_eq!(restarts.ended(End::Code(0), true, now), NextStart::Exit(0));
+        assert_eq!(
+            restarts.worker_ended(End::Code(0), true, now),
+            NextStart::Exit(0)
+        );
         restarts.stop(15);
         for (end, status) in [
             (End::Code(0), 0),
             (End::Code(130), 130),
             (End::Signal(15), 143),
         ] {
-            assert_eq!(restarts.ended(end, true, now), NextStart::Exit(status));
+            assert_eq!(
+                restarts.worker_ended(end, true, now),
+                NextStart::Exit(status)
+            );
         }
         // The worker died while it stopped, so its master still runs. One more worker is started to
         // end that master, but only one.
-        assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
-        assert_eq!(restarts.ended(KILLED, true, now), NextStart::Exit(137));
+        assert_eq!(restarts.worker_ended(KILLED, true, now), AT_ONCE);
+        assert_eq!(
+            restarts.worker_ended(KILLED, true, now),
+            NextStart::Exit(137)
+        );
         let mut restarts = Restarts::default();
         restarts.stop(15);
         let panicked = End::Code(PANIC);
-        assert_eq!(restarts.ended(panicked, true, now), AT_ONCE);
-        assert_eq!(restarts.ended(panicked, true, now), NextStart::Exit(PANIC));
+        assert_eq!(restarts.worker_ended(panicked, true, now), AT_ONCE);
+        assert_eq!(
+            restarts.worker_ended(panicked, true, now),
+            NextStart::Exit(PANIC)
+        );
     }
 }

@@ -53,7 +53,7 @@ impl Changes {
     }
 
     /// Waits for a change.
-    async fn next(&mut self) -> io::Result<()> {
+    async fn wait_for_change(&mut self) -> io::Result<()> {
         let mut buffer = [0; 16_384];
         loop {
             self.socket.readable().await?;
@@ -115,7 +115,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut looks = VecDeque::<Instant>::new();
     loop {
         tokio::select! {
-            changed = changes.next() => {
+            changed = changes.wait_for_change() => {
                 if let Err(error) = changed {
                     return log_no_events(&error);
                 }
@@ -124,7 +124,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
                 looks.truncate(1);
                 looks.extend(LOOKS.iter().map(|pause| now + *pause));
             }
-            () = wait::until(looks.front().map(|at| (*at).into())) => {
+            () = wait::sleep_until(looks.front().map(|at| (*at).into())) => {
                 looks.pop_front();
                 check_addresses(&nodes).await;
             }
@@ -230,7 +230,7 @@ mod tests {
     #[tokio::test]
     async fn the_kernel_can_be_listened_to() {
         let mut changes = Changes::open().unwrap();
-        let waited = tokio::time::timeout(Duration::ZERO, changes.next()).await;
+        let waited = tokio::time::timeout(Duration::ZERO, changes.wait_for_change()).await;
         assert!(waited.is_err() || waited.is_ok_and(|changed| changed.is_ok()));
     }
 }

@@ -20,12 +20,16 @@ pub(crate) use rescue_core::health::Reaction;
 const MAX_REPLY: usize = 16 << 20;
 
 /// Makes `call` to the node at `api`, and waits at most `limit` for a sign of life.
-pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Reaction {
-    ask_for(api, call, limit).await.0
+pub(crate) async fn call(api: &str, call: &Call, limit: Duration) -> Reaction {
+    call_for_value(api, call, limit).await.0
 }
 
-/// Like [`ask`], and also returns the value that the node answered.
-pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Reaction, Option<Value>) {
+/// Like [`call`], and also returns the value that the node answered.
+pub(crate) async fn call_for_value(
+    api: &str,
+    call: &Call,
+    limit: Duration,
+) -> (Reaction, Option<Value>) {
     let Ok(address) = MasterUri::parse(api) else {
         return (Reaction::Silent, None);
     };
@@ -70,7 +74,7 @@ impl Interview {
 /// publications and subscriptions, within another `limit`. `getName` would help more, but roscpp
 /// lacks it.
 pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
-    let (sign, pid) = ask_for(api, &master::get_pid(), limit).await;
+    let (sign, pid) = call_for_value(api, &master::get_pid(), limit).await;
     let mut interview = Interview {
         sign,
         pid: pid.as_ref().and_then(Value::as_int),
@@ -80,8 +84,8 @@ pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
         let (publications, subscriptions) =
             (question("getPublications"), question("getSubscriptions"));
         let answers = tokio::join!(
-            ask_for(api, &publications, limit),
-            ask_for(api, &subscriptions, limit)
+            call_for_value(api, &publications, limit),
+            call_for_value(api, &subscriptions, limit)
         );
         if let ((_, Some(publications)), (_, Some(subscriptions))) = answers {
             interview.claims = Claims::read(&publications, &subscriptions);

@@ -155,7 +155,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
             tokio::time::sleep(SECOND_QUESTION).await;
         }
         let admitted = nodes.visits.admit(port, nodes.timeout).await;
-        let asked = Asked::all(nodes, port, &nodes.reaches(port).await);
+        let asked = Asked::registered_at(nodes, port, &nodes.reaches(port).await);
         if asked.is_empty() {
             nodes.clear(port);
             break;
@@ -258,7 +258,7 @@ struct Findings {
 impl Asked {
     /// The names registered at this port, for each address that has it. `reaches` says what the address proves about
     /// each name. Names about which it proves nothing at all are left out.
-    fn all(nodes: &Nodes, port: &str, reaches: &BTreeMap<String, Reach>) -> Vec<Self> {
+    fn registered_at(nodes: &Nodes, port: &str, reaches: &BTreeMap<String, Reach>) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
             let mut all = BTreeMap::<_, Self>::new();
             for (node, api) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
@@ -353,7 +353,7 @@ async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     let Some(_admitted) = nodes.visits.admit(port_of(api), limit).await else {
         return false;
     };
-    let (_, named) = client::ask_for(api, &question("getMasterUri"), limit).await;
+    let (_, named) = client::call_for_value(api, &question("getMasterUri"), limit).await;
     let named = named.as_ref().and_then(Value::as_str);
     let named = named.map(MasterUri::parse).and_then(Result::ok);
     let own = MasterUri::parse(&nodes.ledger.uri());

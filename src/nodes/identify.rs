@@ -84,7 +84,7 @@ async fn identify(nodes: Arc<Nodes>, port: String) {
         let asks = admitted.is_some() && !names.is_empty() && !nodes.is_unreachable(&port);
         let answer = match asks {
             true => {
-                client::ask_for(&port, &master::get_pid(), nodes.timeout)
+                client::call_for_value(&port, &master::get_pid(), nodes.timeout)
                     .await
                     .1
             }

@@ -45,12 +45,12 @@ const AT_ONCE: usize = 8;
 /// What is known about which nodes are alive.
 #[derive(Debug)]
 pub(super) struct LivenessEvidence {
-    known: Mutex<Known>,
+    known: Mutex<HealthByNode>,
     permits: Semaphore,
 }
 
 #[derive(Debug, Default)]
-struct Known {
+struct HealthByNode {
     liveness: health::Liveness,
     /// Health of each node at the last look, and since when.
     since: BTreeMap<String, (Health, Instant)>,
@@ -78,7 +78,7 @@ impl Default for LivenessEvidence {
 }
 
 impl LivenessEvidence {
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, HealthByNode> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -100,11 +100,11 @@ impl Nodes {
         });
         let known = self.liveness.lock();
         let lives = nodes.into_iter().map(|(name, port, from, answered)| {
-            let seen = known.liveness.seen(&port);
+            let seen = known.liveness.last_seen(&port);
             let evidence = self.local.evidence(&name);
             let reach = self.local.reach(&port, from);
-            let health = Health::of(seen, unreachable.contains(&port), now);
-            let health = health.as_proved(reach, answered).with(evidence);
+            let health = Health::from_last_seen(seen, unreachable.contains(&port), now);
+            let health = health.as_proved(reach, answered).corrected_by(evidence);
             let noted = known.since.get(&name).filter(|(noted, _)| *noted == health);
             let life = Life {
                 process: self.local.process(&name, &port),
@@ -201,7 +201,7 @@ fn check_nodes(nodes: &Arc<Nodes>) {
     local::bury(nodes, &names);
     let listening = Arc::new(listening);
     for port in due {
-        crate::task::spawn(ask(nodes.clone(), port, listening.clone()));
+        crate::task::spawn(probe_port(nodes.clone(), port, listening.clone()));
     }
 }
 
@@ -212,7 +212,7 @@ fn is_among(addresses: &[SocketAddr], listening: &Listening) -> bool {
 }
 
 /// Asks the node at `port`, unless a process on this computer listens there.
-async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
+async fn probe_port(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
     // The semaphore is never closed.
     let permit = nodes.liveness.permits.acquire().await;
     let addresses = origin::addresses(&port, nodes.timeout).await;
@@ -228,13 +228,13 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) {
         Some(_) if reaches.is_empty() => None,
         Some(at) if is_among(&local_addresses(at), &listening) => Some(Reaction::Alive),
         Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {
-            Some(_admitted) => Some(client::ask(&port, &master::get_pid(), nodes.timeout).await),
+            Some(_admitted) => Some(client::call(&port, &master::get_pid(), nodes.timeout).await),
             None => None,
         },
     };
     drop(permit);
     let mut known = nodes.liveness.lock();
-    let has_died = known.liveness.answered(&port, sign, Instant::now());
+    let has_died = known.liveness.note_answer(&port, sign, Instant::now());
     drop(known);
     // Nothing is logged while the mirror stands in: the health check afterwards reports dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {

@@ -38,14 +38,14 @@ pub(super) type Listening = HashMap<SocketAddr, Vec<u64>>;
 pub(crate) struct LocalNodes {
     reap: Reap,
     stats: &'static Stats,
-    known: Mutex<Known>,
+    known: Mutex<KernelFacts>,
     feuds: Mutex<Feuds>,
     /// Wakes the task that reads the socket table, because a node has registered.
     pub(super) registered: Notify,
 }
 
 #[derive(Debug, Default)]
-struct Known {
+struct KernelFacts {
     /// For each port of a node, the addresses to which it led when it was last looked up.
     at: BTreeMap<String, Vec<IpAddr>>,
     /// For each port that leads to this computer, the addresses at which a node may listen.
@@ -108,7 +108,7 @@ impl LocalNodes {
         self.reap == Reap::All
     }
 
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, KernelFacts> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -307,10 +307,10 @@ impl LocalNodes {
     }
 }
 
-impl Known {
+impl KernelFacts {
     fn reach(&self, port: &str, from: Option<IpAddr>) -> Reach {
         let at = self.at.get(port).map_or(&[][..], Vec::as_slice);
-        Reach::of(from, at, resolver::is_own)
+        Reach::classify(from, at, resolver::is_own)
     }
 
     /// The facts about `name`, if nobody can reach the node at its address. `sockets` listen there. A container's port
@@ -336,11 +336,13 @@ impl Known {
 
 impl MoveJudge for LocalNodes {
     fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
-        calls.iter().position(|call| Moving::is_any(mirror, call))
+        calls
+            .iter()
+            .position(|call| Moving::moves_any(mirror, call))
     }
 
     fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
-        let moving = ledger.with_mirror(|mirror| Moving::by(mirror, call));
+        let moving = ledger.with_mirror(|mirror| Moving::caused_by(mirror, call));
         if moving.is_empty() {
             return None;
         }
@@ -360,7 +362,7 @@ impl MoveJudge for LocalNodes {
                 log_misdirected_shutdown(&moving);
             }
         }
-        Some(ledger.with_mirror(|mirror| Eviction::of(mirror, gone)))
+        Some(ledger.with_mirror(|mirror| Eviction::for_nodes(mirror, gone)))
     }
 
     fn registered(&self) {

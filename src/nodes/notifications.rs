@@ -131,7 +131,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 tokio::select! {
                     // The ledger lives as long as this task.
                     _ = changed.changed() => {}
-                    () = wait::until(until.map(Into::into)) => {}
+                    () = wait::sleep_until(until.map(Into::into)) => {}
                 }
                 continue;
             }
@@ -144,7 +144,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             true => MUTE.min(nodes.timeout),
             false => nodes.timeout,
         };
-        let mut asked = pin!(client::ask(&port, &call, limit));
+        let mut asked = pin!(client::call(&port, &call, limit));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
             Err(_) => {
@@ -153,7 +153,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             }
         };
         nodes.ledger.release(|order| order.taken(number));
-        if is_param && sign == Reaction::Silent && answers(&nodes, &port).await {
+        if is_param && sign == Reaction::Silent && is_answering(&nodes, &port).await {
             nodes.set_mute(&port, true);
             continue;
         }
@@ -169,8 +169,8 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
 }
 
 /// Whether the node at `port` answers a question.
-async fn answers(nodes: &Nodes, port: &str) -> bool {
-    client::ask(port, &master::get_pid(), nodes.timeout).await == Reaction::Alive
+async fn is_answering(nodes: &Nodes, port: &str) -> bool {
+    client::call(port, &master::get_pid(), nodes.timeout).await == Reaction::Alive
 }
 
 /// Asks a node to shut down because another node has taken its name, as a master does. Does nothing if a different node
@@ -218,7 +218,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                     "telling a node to shut down: another node has taken its name"
                 );
                 nodes.stats.notifications_sent.count();
-                client::ask(api, &master::shutdown(node), nodes.timeout).await;
+                client::call(api, &master::shutdown(node), nodes.timeout).await;
             }
             return;
         }
@@ -239,7 +239,7 @@ async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
         tokio::select! {
             // The ledger lives as long as this task.
             _ = changed.changed() => {}
-            () = wait::until(held.until.map(Into::into)) => {}
+            () = wait::sleep_until(held.until.map(Into::into)) => {}
         }
     }
 }

@@ -64,7 +64,7 @@ impl Nodes {
     /// Whether a notification for the node at `port` reaches that node, or nobody.
     pub(super) async fn leads_to_node(&self, port: &str) -> bool {
         let reaches = self.reaches(port).await;
-        reaches.is_empty() || reaches.into_values().any(Reach::may_be_told)
+        reaches.is_empty() || reaches.into_values().any(Reach::may_be_notified)
     }
 }
 

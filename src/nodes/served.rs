@@ -36,7 +36,7 @@ impl Served {
     }
 
     /// Whether nodes at the host of `api` use this rosrescue.
-    pub(crate) fn has(&self, api: &str) -> bool {
+    pub(crate) fn serves_host_of(&self, api: &str) -> bool {
         host_of(api).is_some_and(|host| self.lock().contains(&host))
     }
 }
@@ -54,12 +54,12 @@ mod tests {
     fn a_host_is_ours_once_a_node_there_has_registered_here() {
         let served = Served::default();
         let api = "http://arm:40001/";
-        assert!(!served.has(api));
+        assert!(!served.serves_host_of(api));
         served.add(&Request::new(Method::SetParam, ["/n", "/p", api]));
-        assert!(!served.has(api));
+        assert!(!served.serves_host_of(api));
         let publish = Request::new(Method::RegisterPublisher, ["/n", "/t", "x/Y", api]);
         served.add(&Request::multicall([publish]));
-        assert!(served.has(api) && served.has("http://arm:40002"));
-        assert!(!served.has("http://base:40001/"));
+        assert!(served.serves_host_of(api) && served.serves_host_of("http://arm:40002"));
+        assert!(!served.serves_host_of("http://base:40001/"));
     }
 }

@@ -50,7 +50,7 @@ impl Who {
         Some(Self::Process {
             name: program_of(pid),
             pid,
-            started: Stat::of(pid)?.started,
+            started: Stat::read(pid)?.started,
         })
     }
 
@@ -58,7 +58,7 @@ impl Who {
     fn counts(&self, since: Duration) -> bool {
         match self {
             Self::Process { pid, started, .. } => {
-                Stat::of(*pid).is_some_and(|stat| stat.started == *started && stat.is_alive())
+                Stat::read(*pid).is_some_and(|stat| stat.started == *started && stat.is_alive())
             }
             Self::User(_) | Self::Host(_) => since < REMEMBERED,
         }
@@ -136,10 +136,10 @@ pub(crate) struct Bypass {
 impl Bypass {
     /// Reads the socket table of this computer once, and returns the new clients. Blocks for milliseconds if it has to
     /// search for the owner of a new socket.
-    pub(crate) fn find_new_clients(&mut self, place: &MasterAddresses) -> Vec<Who> {
+    pub(crate) fn find_new_clients(&mut self, master: &MasterAddresses) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
-        let (clients, hosts) = split(table, place, &own, resolver::is_own);
+        let (clients, hosts) = split(table, master, &own, resolver::is_own);
         self.sockets.retain(|inode, _| clients.contains_key(inode));
         let mut unknown = clients.clone();
         unknown.retain(|inode, _| !self.sockets.contains_key(inode));
@@ -161,7 +161,7 @@ impl Bypass {
 
     /// Finds the owners of the sockets with these inodes and users.
     fn find_owners(&mut self, unknown: &mut HashMap<u64, u32>) {
-        for pid in super::all() {
+        for pid in super::all_pids() {
             let open = listeners::open_sockets(pid);
             let mine: Vec<_> = unknown
                 .keys()
@@ -190,7 +190,7 @@ impl Bypass {
             .extend(hidden.map(|(inode, user)| (inode, Who::User(user))));
     }
 
-    pub(crate) fn all(&self) -> Vec<String> {
+    pub(crate) fn names(&self) -> Vec<String> {
         self.seen.keys().map(ToString::to_string).collect()
     }
 }
@@ -249,7 +249,7 @@ pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: Strin
             );
         }
         board.update(|facts| {
-            facts.bypassing = bypass.all();
+            facts.bypassing = bypass.names();
             facts.master_is_open = is_open;
         });
     }

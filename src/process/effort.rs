@@ -10,7 +10,7 @@ const FAMILY_MOST: usize = 64;
 
 /// What the threads of the process `pid` and its descendants do: a wrapper may have started the master. `None` if there
 /// is no such process.
-pub(crate) fn of(pid: u32) -> Option<Effort> {
+pub(crate) fn measure(pid: u32) -> Option<Effort> {
     let mut threads = Threads::default();
     let mut family = vec![pid.to_string()];
     let mut next = 0;
@@ -141,18 +141,18 @@ mod tests {
         let busy = sh("(while :; do :; done) & wait");
         let pid = busy.0.id();
         eventually("it is busy", || {
-            of(pid).is_some_and(|it| it.runnable && it.ran > Duration::from_millis(100))
+            measure(pid).is_some_and(|it| it.runnable && it.ran > Duration::from_millis(100))
         });
-        assert!(!of(pid).unwrap().stopped);
+        assert!(!measure(pid).unwrap().stopped);
         let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap();
         let child: u32 = children.trim().parse().unwrap();
         for pid in [pid, child] {
             signal_process(pid, Signal::STOP);
         }
-        eventually("it is stopped", || of(pid).unwrap().stopped);
-        let before = of(pid).unwrap();
+        eventually("it is stopped", || measure(pid).unwrap().stopped);
+        let before = measure(pid).unwrap();
         std::thread::sleep(Duration::from_millis(20));
-        assert_eq!(of(pid).unwrap(), before, "no progress");
+        assert_eq!(measure(pid).unwrap(), before, "no progress");
         assert!(!before.runnable);
         signal_process(child, Signal::KILL);
     }
@@ -178,6 +178,6 @@ mod tests {
         assert!(effort.on_disk);
         assert_eq!(effort.ran, Duration::from_millis(750));
         assert_eq!(Threads::default().effort(), None);
-        assert_eq!(of(u32::MAX), None);
+        assert_eq!(measure(u32::MAX), None);
     }
 }

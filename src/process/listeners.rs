@@ -12,7 +12,7 @@ use crate::upstream::sockets;
 
 /// The program that listens at the port of a master that rosrescue started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Holder {
+pub(crate) enum PortHolder {
     /// The master, or a process that it has started.
     Master,
     /// Another program, with its process id if it can be seen. The master can never listen there.
@@ -21,15 +21,15 @@ pub(crate) enum Holder {
     Unknown,
 }
 
-impl Holder {
+impl PortHolder {
     /// Finds the program that listens at `port`, which the master `child` was given. `own` means that the master is
     /// ROS's own rosmaster, which never starts another one.
-    pub(crate) fn of(child: u32, port: u16, own: bool) -> Self {
+    pub(crate) fn find(child: u32, port: u16, own: bool) -> Self {
         let sockets = sockets(port);
         if holds_one(child, &sockets) {
             return Self::Master;
         }
-        choose_holder(!sockets.is_empty(), &at(port), own, |pid| {
+        choose_holder(!sockets.is_empty(), &listeners_at(port), own, |pid| {
             descends(pid, child)
         })
     }
@@ -37,13 +37,18 @@ impl Holder {
 
 /// Chooses the program that has the port from the listeners that were `seen`. `taken` says that a process other than
 /// the child listens.
-fn choose_holder(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
+fn choose_holder(
+    taken: bool,
+    seen: &[u32],
+    own: bool,
+    descends: impl Fn(u32) -> bool,
+) -> PortHolder {
     match seen.first() {
-        _ if !taken => Holder::Unknown,
-        _ if seen.iter().any(|pid| descends(*pid)) => Holder::Master,
+        _ if !taken => PortHolder::Unknown,
+        _ if seen.iter().any(|pid| descends(*pid)) => PortHolder::Master,
         // The listeners belong to another user, so they are invisible to this process.
-        None if !own => Holder::Unknown,
-        first => Holder::Stranger(first.copied()),
+        None if !own => PortHolder::Unknown,
+        first => PortHolder::Stranger(first.copied()),
     }
 }
 
@@ -55,7 +60,7 @@ fn descends(pid: u32, ancestor: u32) -> bool {
 
 /// The processes that listen at `port`, for people.
 pub(crate) fn named(port: u16) -> String {
-    let processes = at(port);
+    let processes = listeners_at(port);
     let named = processes
         .iter()
         .map(|pid| format!("{} (process {pid})", super::name_of(*pid)));
@@ -66,12 +71,12 @@ pub(crate) fn named(port: u16) -> String {
 }
 
 /// The processes in this network namespace that listen at `port`. Only root sees those of other users.
-pub(crate) fn at(port: u16) -> Vec<u32> {
+pub(crate) fn listeners_at(port: u16) -> Vec<u32> {
     let sockets = sockets(port);
     if sockets.is_empty() {
         return Vec::new();
     }
-    super::all()
+    super::all_pids()
         .filter(|pid| holds_one(*pid, &sockets))
         .collect()
 }
@@ -120,7 +125,7 @@ pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
 /// processes, which takes some milliseconds.
 pub(crate) fn owners(sockets: &BTreeSet<u64>) -> BTreeMap<u64, Option<Owner>> {
     let mut owners: BTreeMap<_, Option<Owner>> = sockets.iter().map(|it| (*it, None)).collect();
-    for pid in super::all() {
+    for pid in super::all_pids() {
         let open = open_sockets(pid);
         for socket in sockets.iter().filter(|socket| open.contains(socket)) {
             let Some(owner) = owner(pid) else { continue };
@@ -134,7 +139,7 @@ pub(crate) fn owners(sockets: &BTreeSet<u64>) -> BTreeMap<u64, Option<Owner>> {
 }
 
 fn owner(pid: u32) -> Option<Owner> {
-    let started = Stat::of(pid)?.started;
+    let started = Stat::read(pid)?.started;
     let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     // The last id is the one in the process's own namespace.
     let ids = status.lines().find_map(|line| line.strip_prefix("NSpid:"));
@@ -182,18 +187,21 @@ mod tests {
     #[test]
     fn a_stranger_at_the_masters_port_is_distinguished_from_its_processes() {
         let child = |pid| pid == 7;
-        assert_eq!(choose_holder(false, &[], true, child), Holder::Unknown);
-        assert_eq!(choose_holder(true, &[7], false, child), Holder::Master);
-        assert_eq!(choose_holder(true, &[8, 7], false, child), Holder::Master);
+        assert_eq!(choose_holder(false, &[], true, child), PortHolder::Unknown);
+        assert_eq!(choose_holder(true, &[7], false, child), PortHolder::Master);
+        assert_eq!(
+            choose_holder(true, &[8, 7], false, child),
+            PortHolder::Master
+        );
         assert_eq!(
             choose_holder(true, &[8], false, child),
-            Holder::Stranger(Some(8))
+            PortHolder::Stranger(Some(8))
         );
         assert_eq!(
             choose_holder(true, &[], true, child),
-            Holder::Stranger(None)
+            PortHolder::Stranger(None)
         );
-        assert_eq!(choose_holder(true, &[], false, child), Holder::Unknown);
+        assert_eq!(choose_holder(true, &[], false, child), PortHolder::Unknown);
     }
 
     #[test]
@@ -205,14 +213,17 @@ mod tests {
             .arg("60")
             .spawn()
             .unwrap();
-        assert_eq!(Holder::of(own, port, true), Holder::Master);
+        assert_eq!(PortHolder::find(own, port, true), PortHolder::Master);
         let parent = std::os::unix::process::parent_id();
-        assert_eq!(Holder::of(parent, port, true), Holder::Master);
-        let stranger = Holder::Stranger(Some(own));
-        assert_eq!(Holder::of(child.id(), port, true), stranger);
+        assert_eq!(PortHolder::find(parent, port, true), PortHolder::Master);
+        let stranger = PortHolder::Stranger(Some(own));
+        assert_eq!(PortHolder::find(child.id(), port, true), stranger);
         drop(listener);
         wait_closed(port);
-        assert_eq!(Holder::of(child.id(), port, true), Holder::Unknown);
+        assert_eq!(
+            PortHolder::find(child.id(), port, true),
+            PortHolder::Unknown
+        );
         child.kill().unwrap();
         child.wait().unwrap();
     }
@@ -224,7 +235,7 @@ mod tests {
             let port = listener.local_addr().unwrap().port();
             let own = std::process::id();
             assert!(listens(own, port));
-            assert!(at(port).contains(&own));
+            assert!(listeners_at(port).contains(&own));
             assert!(ports(own).contains(&port));
             assert!(!listens(1, port) || own == 1);
             drop(listener);

@@ -114,7 +114,7 @@ fn choose(
     let serving = known
         .find(|pid| listeners::holds_one(*pid, &sockets))
         .or_else(|| {
-            let mut others = listeners::at(port).into_iter();
+            let mut others = listeners::listeners_at(port).into_iter();
             others.find(|pid| is_orphan(*pid, owner))
         });
     serving.map(Orphan::Serving)
@@ -133,7 +133,9 @@ fn was_started_for(pid: u32, port: u16) -> bool {
 /// Living processes with this `owner` whose rosrescue is gone. Only this network namespace is searched: processes of
 /// other containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
-    super::all().filter(|pid| is_orphan(*pid, owner)).collect()
+    super::all_pids()
+        .filter(|pid| is_orphan(*pid, owner))
+        .collect()
 }
 
 fn is_orphan(pid: u32, owner: &OsStr) -> bool {
@@ -179,7 +181,7 @@ fn has_rosrescue(pid: u32) -> bool {
 /// # Errors
 ///
 /// If the process is gone, or if the kernel is older than 5.3 and cannot watch it.
-pub(super) async fn ended(pid: u32) -> io::Result<()> {
+pub(super) async fn wait_until_ended(pid: u32) -> io::Result<()> {
     let pid = i32::try_from(pid).map_err(io::Error::other)?;
     let process = pidfd::open(pid, PidfdFlags::empty())?;
     process.readable().await
@@ -224,7 +226,7 @@ mod tests {
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
-        let end = crate::task::spawn(ended(orphan));
+        let end = crate::task::spawn(wait_until_ended(orphan));
         unsent::kill(orphan);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is reported").unwrap().unwrap();
@@ -247,7 +249,7 @@ mod tests {
         };
         let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
         assert_eq!(rosmaster.claim(Last::Ended, Some(1)), None);
-        assert!(Stat::of(orphan).is_some_and(Stat::is_alive), "not found");
+        assert!(Stat::read(orphan).is_some_and(Stat::is_alive), "not found");
 
         let last = Last::Running {
             pid: orphan,
@@ -256,7 +258,7 @@ mod tests {
         let starting = Some(Orphan::Starting(orphan));
         assert_eq!(rosmaster.claim(last, Some(1)), starting);
         assert_eq!(rosmaster.claim(Last::Unknown, Some(1)), None);
-        while Stat::of(orphan).is_some_and(Stat::is_alive) {
+        while Stat::read(orphan).is_some_and(Stat::is_alive) {
             std::thread::sleep(Duration::from_millis(1));
         }
     }

@@ -50,7 +50,7 @@ impl Output {
     pub(super) async fn renew(&self) {
         self.set(None);
         let path = self.path.clone();
-        let file = match self.ask(move || regular_file::create(&path)).await {
+        let file = match self.run_on_disk(move || regular_file::create(&path)).await {
             Some(Ok(file)) => Some(file),
             Some(Err(error)) => {
                 self.report(&error.to_string());
@@ -96,13 +96,16 @@ impl Output {
         let Some(file) = self.file() else {
             return String::new();
         };
-        let tail = self.ask(move || tail_of(&file)).await;
+        let tail = self.run_on_disk(move || tail_of(&file)).await;
         let tail = tail.and_then(Result::ok).unwrap_or_default();
         String::from_utf8_lossy(&tail).trim().to_owned()
     }
 
     /// Runs `work` on the disk in another thread. `None` if `work` takes too long, or if earlier work has not ended.
-    async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+    async fn run_on_disk<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Option<T> {
         if self.shared.asked.swap(true, Ordering::AcqRel) {
             return None;
         }

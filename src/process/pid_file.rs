@@ -60,7 +60,7 @@ impl PidFile {
 
     /// Like [`Self::write`], but waits for the disk.
     pub(super) fn record(&self, pid: u32, port: u16) {
-        if let Some(stat) = Stat::of(pid) {
+        if let Some(stat) = Stat::read(pid) {
             let line = format!("{pid} {} {port} {}\n", stat.started, boot_id());
             let created = regular_file::create(&self.0);
             if let Err(error) = created.and_then(|mut file| file.write_all(line.as_bytes())) {
@@ -89,7 +89,7 @@ impl PidFile {
             return Last::Unknown;
         };
         let runs = |stat: Stat| stat.started == started && stat.is_alive();
-        match Stat::of(pid).is_some_and(runs) && boot.trim_end() == boot_id() {
+        match Stat::read(pid).is_some_and(runs) && boot.trim_end() == boot_id() {
             true => Last::Running { pid, port },
             false => Last::Ended,
         }
@@ -126,7 +126,7 @@ mod tests {
         for half in ["", &whole[..whole.len() - 1], &whole[..3]] {
             assert_eq!(after(half.to_owned()), Last::Unknown, "{half}");
         }
-        let started = Stat::of(pid).unwrap().started.to_string();
+        let started = Stat::read(pid).unwrap().started.to_string();
         assert_eq!(after(whole.replacen(&started, "1", 1)), Last::Ended);
         assert_eq!(after(whole.replace(&boot_id(), "another")), Last::Ended);
         assert_eq!(after(whole), Last::Running { pid, port: 7 });

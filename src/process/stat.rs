@@ -20,7 +20,7 @@ pub(crate) struct Stat {
 
 impl Stat {
     /// The state of the process `pid`. `None` if there is no such process.
-    pub(crate) fn of(pid: u32) -> Option<Self> {
+    pub(crate) fn read(pid: u32) -> Option<Self> {
         Self::parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
     }
 
@@ -100,16 +100,16 @@ mod tests {
 
     #[test]
     fn a_process_is_alive_until_it_has_ended() {
-        let own = Stat::of(std::process::id()).unwrap();
+        let own = Stat::read(std::process::id()).unwrap();
         assert!(own.is_alive());
         assert_eq!(own.parent, std::os::unix::process::parent_id());
         let mut child = std::process::Command::new("sleep")
             .arg("60")
             .spawn()
             .unwrap();
-        assert!(Stat::of(child.id()).unwrap().started >= own.started);
+        assert!(Stat::read(child.id()).unwrap().started >= own.started);
         child.kill().unwrap();
         child.wait().unwrap();
-        assert_eq!(Stat::of(child.id()), None);
+        assert_eq!(Stat::read(child.id()), None);
     }
 }

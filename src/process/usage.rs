@@ -10,7 +10,7 @@ use crate::status::metrics::ProcessMetric;
 /// The metrics of this process, which was `started` at this time in seconds since 1970. Those that the kernel does not
 /// tell are left out.
 pub(crate) fn usage(started: f64) -> Vec<ProcessMetric> {
-    let stat = Stat::of(std::process::id());
+    let stat = Stat::read(std::process::id());
     let memory = stat.map(Stat::memory);
     let open = fs::read_dir("/proc/self/fd").map(|open| open.count() as f64);
     let most = getrlimit(Resource::Nofile).current;

@@ -10,8 +10,8 @@ use rescue_core::{
     health::port_of,
     lifecycle::{Input, Supervision},
     replay::{
-        self, Authority, Bears, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, Treatment,
-        withheld_run_id,
+        self, Authority, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, TokenState,
+        Treatment, withheld_run_id,
     },
 };
 use ros1_master::{
@@ -236,8 +236,9 @@ impl Examiner {
     ) -> Result<Examination, ExamineError> {
         let start = master.now();
         let served = matches!(manner.known, KnownMaster::ServedIfPresent);
-        let resumes =
-            |first: &Inspection| served && first.bears() == Bears::Present && self.ledger.resume();
+        let resumes = |first: &Inspection| {
+            served && first.bears() == TokenState::Present && self.ledger.resume()
+        };
         let is_new = matches!(manner.known, KnownMaster::New { .. });
         let mut first = match manner.known {
             KnownMaster::New { pid } => Inspection::at_new(pid),
@@ -327,10 +328,10 @@ impl Examiner {
     ) -> Result<(), ExamineError> {
         let (bears, empty) = (first.bears(), first.is_empty());
         tracing::debug!(?bears, empty, pid = first.pid(), "inspected");
-        if let Bears::Later(number) = bears {
+        if let TokenState::Later(number) = bears {
             self.ledger.catch_up(number);
         }
-        let fresh = bears == Bears::Nothing && empty;
+        let fresh = bears == TokenState::Nothing && empty;
         let mut ready = match manner.prepared {
             Some(prepared) if fresh => prepared.await.ok(),
             _ => None,
@@ -340,7 +341,7 @@ impl Examiner {
             false => {
                 // If this master got the mirror's state, the mirror supplies what cannot be read back.
                 let previous = match bears {
-                    Bears::Nothing => Master::default(),
+                    TokenState::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
                 };
                 master.second_look(first, &previous).await?
@@ -415,7 +416,7 @@ impl Examiner {
         if state != mirror {
             say_difference(&self.ledger.adopt(state.clone()));
         }
-        if bears == Bears::Nothing {
+        if bears == TokenState::Nothing {
             // This master has no token of ours, so the previous master is gone and sends no more notifications. A
             // master that was only late finishes its own.
             self.ledger.with_order(|order, _| order.master_is_gone());
@@ -436,7 +437,7 @@ impl Examiner {
         &self,
         master: &mut impl Contact,
         may_be_roscores: bool,
-        bears: Bears,
+        bears: TokenState,
         found: &Master,
     ) {
         let to_ask = |mirror: &Master| {
@@ -495,7 +496,7 @@ impl Examiner {
             };
             // What the master holds now replaces what was expected, and the missing part is injected again.
             let first = self.first_look(master).await?;
-            if first.bears() != Bears::Present && deviation.failed.is_empty() {
+            if first.bears() != TokenState::Present && deviation.failed.is_empty() {
                 deviation.failed.push("the token is missing".to_owned());
             }
             let now = master.second_look(first, plan.expected()).await?;

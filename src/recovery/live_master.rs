@@ -100,7 +100,7 @@ impl Reach {
             Ok::<_, ExamineError>(reply)
         };
         let reply = within(self.probe_timeout, asked).await;
-        reply.is_ok_and(|reply| replay::says_run_id(&reply))
+        reply.is_ok_and(|reply| replay::is_run_id_set(&reply))
     }
 
     /// Waits for slow `work` while the master answers probes.
@@ -126,7 +126,7 @@ impl LiveMaster {
         let (keeps_alive, sentinel) = (self.keeps_alive(), &self.sentinel);
         let sees_master =
             !keeps_alive && sentinel.is_local() && listens(pid, sentinel.peer()).await;
-        Verification::of(keeps_alive, sees_master, sentinel)
+        Verification::choose(keeps_alive, sees_master, sentinel)
     }
 
     fn keeps_alive(&self) -> bool {
@@ -162,7 +162,7 @@ impl Contact for LiveMaster {
     }
 
     async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
-        let look = inspect::first(&mut self.connection, token);
+        let look = inspect::read_first(&mut self.connection, token);
         self.reach.while_alive(look).await
     }
 
@@ -171,7 +171,7 @@ impl Contact for LiveMaster {
         first: Inspection,
         previous: &Master,
     ) -> Result<Master, ExamineError> {
-        let look = inspect::second(first, &mut self.connection, previous);
+        let look = inspect::read_second(first, &mut self.connection, previous);
         self.reach.while_alive(look).await
     }
 
@@ -190,7 +190,7 @@ impl Contact for LiveMaster {
     }
 
     async fn is_dead(&mut self, port: &str) -> bool {
-        client::ask(port, &master::get_pid(), ROSOUT_LIMIT).await == Reaction::Dead
+        client::call(port, &master::get_pid(), ROSOUT_LIMIT).await == Reaction::Dead
     }
 
     async fn may_be_of_roscore(&mut self, pid: i32) -> bool {

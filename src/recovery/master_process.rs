@@ -69,7 +69,7 @@ impl MasterProcess {
             }
         };
         this.watch(pid, async move {
-            process::ended(pid).await;
+            process::wait_until_ended(pid).await;
             "exit status unknown: an earlier rosrescue started it".to_owned()
         });
         this
@@ -140,7 +140,7 @@ impl MasterProcess {
     /// own rosmaster.
     pub(crate) fn new_one(&self) -> Option<(u32, u16, bool)> {
         let pid = u32::try_from(self.new?).ok()?;
-        Some((pid, self.port?, self.rosmaster.is_own()))
+        Some((pid, self.port?, self.rosmaster.is_ros_rosmaster()))
     }
 
     /// Notes that another program has taken the master's port.
@@ -182,7 +182,7 @@ impl MasterProcess {
         // for a moment between its end and the report.
         if let Some(pid) = self.current {
             // A master that is ending does not answer either, but did not end because of rosrescue.
-            let runs = Stat::of(pid).is_some_and(Stat::is_alive);
+            let runs = Stat::read(pid).is_some_and(Stat::is_alive);
             if runs && self.port.is_some() {
                 alarm!(
                     warn,
@@ -257,7 +257,7 @@ mod tests {
             let mut child = Command::new("sleep").arg("60").spawn().unwrap();
             if has_ended {
                 child.kill().unwrap();
-                while Stat::of(child.id()).is_some_and(Stat::is_alive) {
+                while Stat::read(child.id()).is_some_and(Stat::is_alive) {
                     std::thread::sleep(Duration::from_millis(1));
                 }
             }

@@ -113,7 +113,7 @@ impl Driver {
     /// Reports what an examination of a master found and did, in the log, the status and the recovery report. The
     /// health check adds its results when it ends.
     pub(super) fn report(&mut self, mut examination: Examination, speaks: String) {
-        if self.lifecycle.begins() && examination.outcome == RecoveryOutcome::Injected {
+        if self.lifecycle.is_new_session() && examination.outcome == RecoveryOutcome::Injected {
             // The master holds only the session's initial state.
             examination.outcome = RecoveryOutcome::Begun;
         }
@@ -201,7 +201,7 @@ impl Driver {
             _ => REPEAT,
         };
         tracing::warn!("{text}");
-        AWAY.told();
+        AWAY.note_reported();
         let next = now + pause;
         self.said = Some(LastMessage { text, pause, next });
     }

@@ -35,7 +35,7 @@ pub(crate) struct Reader {
     counts: AtomicBool,
     close: Notify,
     /// Whether the connection was told to close and is still open.
-    told: AtomicBool,
+    close_requested: AtomicBool,
 }
 
 impl Default for Reader {
@@ -44,7 +44,7 @@ impl Default for Reader {
             fast_until: Mutex::new(Instant::now()),
             counts: AtomicBool::new(false),
             close: Notify::new(),
-            told: AtomicBool::new(false),
+            close_requested: AtomicBool::new(false),
         }
     }
 }
@@ -57,7 +57,7 @@ impl Reader {
     }
 
     /// Notes that the client has read this many bytes.
-    pub(crate) fn took(&self, bytes: usize) {
+    pub(crate) fn note_read(&self, bytes: usize) {
         if self.counts.load(Ordering::Relaxed) {
             let mut until = self.fast_until();
             *until = fast_until(*until, Instant::now(), bytes);
@@ -65,9 +65,9 @@ impl Reader {
     }
 
     /// Completes when the connection should close, unless it [is no longer slow](Self::is_slow).
-    pub(crate) async fn is_to_close(&self) {
+    pub(crate) async fn wait_until_closing(&self) {
         self.close.notified().await;
-        self.told.store(false, Ordering::Relaxed);
+        self.close_requested.store(false, Ordering::Relaxed);
     }
 
     /// Whether the client is too slow. The caller should first try to write once more, because rosrescue itself may
@@ -154,7 +154,7 @@ impl Answers {
     }
 
     /// Returns `room` if it is enough for `bytes`, or a new reservation if memory becomes free soon.
-    pub(crate) async fn enough(
+    pub(crate) async fn room_for(
         &self,
         room: Option<AnswerRoom>,
         bytes: usize,
@@ -206,7 +206,7 @@ impl Answers {
         let under_way = lock(&self.under_way);
         let readers = under_way
             .iter()
-            .filter(|(_, reader)| !reader.told.load(Ordering::Relaxed))
+            .filter(|(_, reader)| !reader.close_requested.load(Ordering::Relaxed))
             .map(|(number, reader)| (*reader.fast_until(), *number));
         let Some((until, number)) = readers.min() else {
             return now + AHEAD;
@@ -215,7 +215,7 @@ impl Answers {
             return until;
         }
         if let Some(reader) = under_way.get(&number) {
-            reader.told.store(true, Ordering::Relaxed);
+            reader.close_requested.store(true, Ordering::Relaxed);
             reader.close.notify_one();
         }
         // If this connection does not free enough memory, the next one is closed.
@@ -224,7 +224,7 @@ impl Answers {
 
     /// Returns `reply` in a form that keeps `room`, its share of the memory for large answers, until `reader` has read
     /// all of the reply.
-    pub(crate) async fn count(
+    pub(crate) async fn hold_room(
         self: &Arc<Self>,
         reply: HttpReply,
         room: AnswerRoom,
@@ -260,7 +260,7 @@ mod tests {
         let reply = text(StatusCode::OK, "x".repeat(LARGE));
         assert_eq!(size(&reply), Some(LARGE));
         let room = answers.reserve(LARGE).await;
-        answers.count(reply, room, reader).await
+        answers.hold_room(reply, room, reader).await
     }
 
     #[test]
@@ -289,9 +289,9 @@ mod tests {
         let _second = sent(&answers, &reader).await;
         assert_eq!(answers.room.available_permits(), 0);
         drop(bytes);
-        let room = answers.enough(None, LARGE).await.unwrap();
+        let room = answers.room_for(None, LARGE).await.unwrap();
         // An existing reservation is used if it is large enough.
-        assert!(answers.enough(Some(room), LARGE).await.is_some());
+        assert!(answers.room_for(Some(room), LARGE).await.is_some());
         assert_eq!(lock(&answers.under_way).len(), 1);
     }
 
@@ -305,12 +305,12 @@ mod tests {
         }
         // The first reader has just read something.
         let slow = async {
-            readers[1].is_to_close().await;
+            readers[1].wait_until_closing().await;
             held.pop();
         };
         let reading = async {
             loop {
-                readers[0].took(LARGE);
+                readers[0].note_read(LARGE);
                 tokio::time::sleep(Duration::from_millis(10)).await;
             }
         };
@@ -318,13 +318,13 @@ mod tests {
         tokio::select! {
             _ = waiting => {}
             () = reading => {}
-            () = readers[0].is_to_close() => panic!("it is fast enough"),
+            () = readers[0].wait_until_closing() => panic!("it is fast enough"),
         }
     }
 
     #[tokio::test]
     async fn there_is_room_for_an_answer_however_large_it_is() {
         let answers = Answers::within(2 * LARGE);
-        assert!(answers.enough(None, 100 * LARGE).await.is_some());
+        assert!(answers.room_for(None, 100 * LARGE).await.is_some());
     }
 }

@@ -22,7 +22,8 @@ use super::{
     hold::Hold,
     others::Others,
     replies::{
-        HttpReply, delivered, encoded, forwarded, made, no_shutdown, refused_by_rosmaster, xml,
+        HttpReply, delivered, encode_with_own_uri, encoded, forwarded, no_shutdown,
+        refused_by_rosmaster, xml,
     },
 };
 use crate::{
@@ -344,7 +345,7 @@ impl Calls {
         hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
         loop {
-            match gate.look() {
+            match gate.observe() {
                 State::Open { incarnation } => {
                     let read = call.filter(|_| head.is_for_rpc());
                     if let Some(reply) = self.exact_answer(read).await {
@@ -403,7 +404,7 @@ impl Calls {
             }
             tokio::select! {
                 () = gate.changed() => {}
-                () = hold.spent() => {
+                () = hold.wait_until_spent() => {
                     self.stats.calls_unanswered.count();
                     return Err(Closed(NOT_IN_TIME).into());
                 }
@@ -478,7 +479,7 @@ impl Calls {
     ) -> Result<HttpReply, Unanswered> {
         let reply = match answer {
             CallAnswer::Raw(raw) => forwarded(&self.uri, call, raw),
-            CallAnswer::Made(reply) => made(&self.uri, call, &reply),
+            CallAnswer::Made(reply) => encode_with_own_uri(&self.uri, call, &reply),
             CallAnswer::Close => return Err(Closed(UNANSWERED).into()),
             CallAnswer::Elsewhere => return Err(Unanswered::Elsewhere),
         };
@@ -503,7 +504,7 @@ impl Calls {
         let mut gate = self.gate.clone();
         let held = async {
             loop {
-                hold.spent_while_shut(&mut gate).await;
+                hold.wait_until_spent_while_shut(&mut gate).await;
                 // An injection ends by itself. If it fails, the mirror answers.
                 if !is_answerable || gate.state() != State::Injecting {
                     return;

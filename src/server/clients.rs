@@ -87,14 +87,14 @@ impl Clients {
         if let Some(mut seen) = self.present.get_mut(&peer) {
             seen.calls += 1;
             if seen.caller_id != caller_id {
-                self.keep(seen.caller(&peer), std::mem::take(&mut seen.times));
+                self.add_past(seen.caller(&peer), std::mem::take(&mut seen.times));
                 caller_id.clone_into(&mut seen.caller_id);
             }
         }
     }
 
     /// Notes that the call of `peer` that began at `start` has ended, with or without an answer. Returns its duration.
-    pub fn answered(&self, peer: SocketAddr, start: Instant) -> Duration {
+    pub fn end_call(&self, peer: SocketAddr, start: Instant) -> Duration {
         let now = Instant::now();
         let longest = now.duration_since(start);
         if let Some(mut seen) = self.present.get_mut(&peer) {
@@ -113,7 +113,7 @@ impl Clients {
     }
 
     /// Keeps how long the calls of a caller took. If there are too many, callers without a long call are dropped first.
-    fn keep(&self, caller: String, times: Times) {
+    fn add_past(&self, caller: String, times: Times) {
         if times.calls == 0 {
             return;
         }
@@ -172,7 +172,7 @@ pub struct ListedClient<'a> {
 impl Drop for ListedClient<'_> {
     fn drop(&mut self) {
         if let Some((peer, seen)) = self.clients.present.remove(&self.peer) {
-            self.clients.keep(seen.caller(&peer), seen.times);
+            self.clients.add_past(seen.caller(&peer), seen.times);
         }
     }
 }
@@ -209,7 +209,7 @@ mod tests {
             let peer = peer.parse().unwrap();
             let present = clients.enter(peer);
             clients.called(peer, caller_id);
-            clients.answered(peer, ago(ms));
+            clients.end_call(peer, ago(ms));
             present
         };
         let stays = call("127.0.0.1:1", "/slow", 1_000);
@@ -235,7 +235,7 @@ mod tests {
         let _present = clients.enter(peer);
         for caller_id in ["/a", "/b"] {
             clients.called(peer, caller_id);
-            clients.answered(peer, Instant::now());
+            clients.end_call(peer, Instant::now());
         }
         assert_eq!(clients.slowest(5).len(), 2);
         assert_eq!(clients.list()[0].calls, 2);

@@ -34,7 +34,7 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 /// The state of a connection within a request.
 #[derive(Clone, Default)]
 pub(crate) struct Deadlines {
-    place: Arc<AtomicU8>,
+    phase: Arc<AtomicU8>,
     /// Values that are dropped once the answer has been written.
     held: Arc<Mutex<Option<UntilWritten>>>,
     pub(super) reader: Arc<Reader>,
@@ -48,31 +48,31 @@ const REPLYING: u8 = 3;
 impl Deadlines {
     /// Notes that the head has been read. The body and the answer have their own limits.
     pub(crate) fn serving(&self) {
-        self.place.store(SERVING, Ordering::Relaxed);
+        self.phase.store(SERVING, Ordering::Relaxed);
     }
 
     /// Notes that the answer is ready. After it has been sent, `held` is dropped, and the next byte starts a new head.
     pub(crate) fn replying(&self, held: Option<UntilWritten>) {
-        *self.held() = held;
-        self.place.store(REPLYING, Ordering::Relaxed);
+        *self.lock_held() = held;
+        self.phase.store(REPLYING, Ordering::Relaxed);
     }
 
-    fn held(&self) -> MutexGuard<'_, Option<UntilWritten>> {
+    fn lock_held(&self) -> MutexGuard<'_, Option<UntilWritten>> {
         self.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether no request has begun since the last answer was sent.
     pub(crate) fn is_idle(&self) -> bool {
-        self.is(IDLE)
+        self.is_in(IDLE)
     }
 
     /// Whether an answer is ready and has not been sent in full.
     pub(crate) fn is_replying(&self) -> bool {
-        self.is(REPLYING)
+        self.is_in(REPLYING)
     }
 
-    fn is(&self, place: u8) -> bool {
-        self.place.load(Ordering::Relaxed) == place
+    fn is_in(&self, place: u8) -> bool {
+        self.phase.load(Ordering::Relaxed) == place
     }
 }
 
@@ -111,7 +111,7 @@ impl<'a, S> Timed<'a, S> {
     ) -> Poll<io::Result<usize>> {
         let was_stuck = std::mem::replace(&mut self.stuck, polled.is_pending());
         if let Poll::Ready(Ok(bytes)) = polled {
-            self.deadlines.reader.took(bytes);
+            self.deadlines.reader.note_read(bytes);
         }
         if !self.stuck {
             return polled;
@@ -141,13 +141,13 @@ impl<S: AsyncRead + Unpin> AsyncRead for Timed<'_, S> {
         let polled = Pin::new(&mut this.stream).poll_read(cx, buf);
         if buf.filled().len() > before {
             this.idling = None;
-            if this.deadlines.is(IDLE) {
-                this.deadlines.place.store(HEAD, Ordering::Relaxed);
+            if this.deadlines.is_in(IDLE) {
+                this.deadlines.phase.store(HEAD, Ordering::Relaxed);
                 this.deadline.as_mut().reset(Instant::now() + HEAD_TIME);
             }
         }
         if polled.is_pending()
-            && this.deadlines.is(HEAD)
+            && this.deadlines.is_in(HEAD)
             && this.deadline.as_mut().poll(cx).is_ready()
         {
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
@@ -170,9 +170,9 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Timed<'_, S> {
         let this = &mut *self;
         let polled = Pin::new(&mut this.stream).poll_flush(cx);
         // hyper flushes once the whole answer is written.
-        if polled.is_ready() && this.deadlines.is(REPLYING) {
-            this.deadlines.place.store(IDLE, Ordering::Relaxed);
-            let written = this.deadlines.held().take();
+        if polled.is_ready() && this.deadlines.is_in(REPLYING) {
+            this.deadlines.phase.store(IDLE, Ordering::Relaxed);
+            let written = this.deadlines.lock_held().take();
             drop(written);
             this.idling = Some(this.idle.enter(&this.close));
         }

@@ -10,27 +10,27 @@ use crate::gate;
 /// With several computers, the computer that has the master goes on with the clock of the one that forwards the call.
 #[derive(Debug)]
 pub(crate) struct Hold {
-    left: Duration,
+    time_left: Duration,
 }
 
 impl Hold {
     pub(crate) fn new(limit: Duration) -> Self {
-        Self { left: limit }
+        Self { time_left: limit }
     }
 
     /// How long the call may still wait.
-    pub(crate) fn left(&self) -> Duration {
-        self.left
+    pub(crate) fn time_left(&self) -> Duration {
+        self.time_left
     }
 
-    /// Counts `time`, in which no living master worked on the call.
-    pub(crate) fn count(&mut self, time: Duration) {
-        self.left = self.left.saturating_sub(time);
+    /// Takes off `time`, in which no living master worked on the call.
+    pub(crate) fn spend(&mut self, time: Duration) {
+        self.time_left = self.time_left.saturating_sub(time);
     }
 
     /// Waits until the time is over. Counts only while it is awaited, so it may be cancelled and called again.
-    pub(crate) async fn spent(&mut self) {
-        let left = self.left;
+    pub(crate) async fn wait_until_spent(&mut self) {
+        let left = self.time_left;
         let _counted = Counted {
             since: Instant::now(),
             hold: self,
@@ -38,15 +38,15 @@ impl Hold {
         tokio::time::sleep(left).await;
     }
 
-    /// Like [`Self::spent`], but counts only while no calls pass to a master.
-    pub(crate) async fn spent_while_shut(&mut self, gate: &mut gate::Rx) {
+    /// Like [`Self::wait_until_spent`], but counts only while no calls pass to a master.
+    pub(crate) async fn wait_until_spent_while_shut(&mut self, gate: &mut gate::Rx) {
         loop {
             gate.wait_for(|state| !state.is_open()).await;
             tokio::select! {
                 // On a busy computer both branches may be ready.
                 biased;
                 _ = gate.wait_for(gate::State::is_open) => {}
-                () = self.spent() => return,
+                () = self.wait_until_spent() => return,
             }
         }
     }
@@ -60,7 +60,7 @@ struct Counted<'a> {
 
 impl Drop for Counted<'_> {
     fn drop(&mut self) {
-        self.hold.count(self.since.elapsed());
+        self.hold.spend(self.since.elapsed());
     }
 }
 
@@ -86,22 +86,25 @@ mod tests {
             tx.set(State::Injecting);
         };
         let mut hold = Hold::new(8 * SECOND);
-        tokio::join!(opener, hold.spent_while_shut(&mut rx));
+        tokio::join!(opener, hold.wait_until_spent_while_shut(&mut rx));
         assert_eq!(start.elapsed(), 68 * SECOND);
     }
 
     #[tokio::test(start_paused = true)]
     async fn all_waits_of_a_call_count_together() {
         let mut hold = Hold::new(10 * SECOND);
-        tokio::time::timeout(4 * SECOND, hold.spent())
+        tokio::time::timeout(4 * SECOND, hold.wait_until_spent())
             .await
             .unwrap_err();
         tokio::time::sleep(60 * SECOND).await;
-        hold.count(SECOND);
-        assert_eq!(hold.left(), 5 * SECOND);
+        hold.spend(SECOND);
+        assert_eq!(hold.time_left(), 5 * SECOND);
         let start = Instant::now();
-        hold.spent().await;
-        assert_eq!((start.elapsed(), hold.left()), (5 * SECOND, Duration::ZERO));
+        hold.wait_until_spent().await;
+        assert_eq!(
+            (start.elapsed(), hold.time_left()),
+            (5 * SECOND, Duration::ZERO)
+        );
     }
 
     #[tokio::test(start_paused = true)]
@@ -109,7 +112,7 @@ mod tests {
         for _ in 0..50 {
             let (tx, mut rx) = gate();
             let mut hold = Hold::new(SECOND);
-            let mut spent = std::pin::pin!(hold.spent_while_shut(&mut rx));
+            let mut spent = std::pin::pin!(hold.wait_until_spent_while_shut(&mut rx));
             let mut context = Context::from_waker(Waker::noop());
             assert!(spent.as_mut().poll(&mut context).is_pending());
             tokio::time::advance(2 * SECOND).await;

@@ -222,7 +222,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
                     return;
                 }
             }
-            () = deadlines.reader.is_to_close() => {
+            () = deadlines.reader.wait_until_closing() => {
                 if deadlines.is_replying() && deadlines.reader.is_slow() {
                     tracing::debug!(%peer, "closed a connection that reads too slowly: other answers need its memory");
                     // A reset: the kernel drops the answer, and the client calls again.

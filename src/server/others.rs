@@ -105,10 +105,10 @@ impl Shown {
 /// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
 /// the answer, because some notifications must wait for that.
 #[derive(Default)]
-pub(crate) struct Passing(Mutex<Passed>);
+pub(crate) struct Passing(Mutex<Inner>);
 
 #[derive(Default)]
-struct Passed {
+struct Inner {
     last: u64,
     /// The answers by number, oldest first.
     held: VecDeque<(Instant, u64, UntilWritten)>,
@@ -121,7 +121,7 @@ impl std::fmt::Debug for Passing {
 }
 
 impl Passing {
-    fn lock(&self) -> MutexGuard<'_, Passed> {
+    fn lock(&self) -> MutexGuard<'_, Inner> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -130,7 +130,7 @@ impl Passing {
     fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
-        let Passed { last, held: kept } = &mut *passing;
+        let Inner { last, held: kept } = &mut *passing;
         while let Some((since, ..)) = kept.front()
             && now.duration_since(*since) > ANSWER_LIMIT
         {
@@ -152,13 +152,13 @@ impl Passing {
 }
 
 /// On drop, tells the leader that its answer has been passed on.
-struct PassOn {
+struct ConfirmOnDrop {
     leader: Arc<Peer>,
     term: u64,
     number: String,
 }
 
-impl Drop for PassOn {
+impl Drop for ConfirmOnDrop {
     fn drop(&mut self) {
         // Without a runtime, rosrescue is stopping.
         let Ok(runtime) = Handle::try_current() else {
@@ -206,7 +206,7 @@ impl Others {
         }
         // Any program that may call can claim to be a follower, but not one at a member's address. Only the log shows
         // this address.
-        let is_believed = asked_term.is_some() && self.members.has(peer.ip());
+        let is_believed = asked_term.is_some() && self.members.contains(peer.ip());
         let said = head.caller.take().filter(|_| is_believed);
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         if body.len() > RECORD_BYTES_MAX && kind.mutates() {
@@ -304,7 +304,7 @@ impl Others {
                 }
                 Standing::Follows { uri, term } => {
                     let uri = MasterUri::parse(&uri).map_err(|_| Closed(NO_ADDRESS))?;
-                    let leader = self.peers.at(&uri);
+                    let leader = self.peers.peer_at(&uri);
                     let removes = call.removes().await;
                     if unanswered.is_none() && call.kind.mutates() {
                         unanswered = call
@@ -315,10 +315,10 @@ impl Others {
                     // If the leader answers, its master has worked on the call, or its own clock counts.
                     let asked = Instant::now();
                     tokio::select! {
-                        answered = call.forward(&leader, term, hold.left()) => match answered {
+                        answered = call.forward(&leader, term, hold.time_left()) => match answered {
                             Ok(reply) => return Ok(instead(reply, removed)),
                             Err(may_have_run) => {
-                                hold.count(asked.elapsed());
+                                hold.spend(asked.elapsed());
                                 removed = removed.or_else(|| removes.filter(|_| may_have_run));
                                 Some(Instant::now() + RETRY_PAUSE)
                             }
@@ -326,7 +326,7 @@ impl Others {
                         // When the leader changes, the old leader's answer never comes or no longer counts. A computer
                         // that is alone answers reads itself.
                         _ = standing.changed() => {
-                            hold.count(asked.elapsed());
+                            hold.spend(asked.elapsed());
                             removed = removed.or(removes);
                             continue;
                         }
@@ -353,7 +353,7 @@ impl Others {
                 Some(reply) = call.by_mirror_when_fresh(), if by_mirror => return Ok(reply),
                 changed = standing.changed() => changed.map_err(|_| Closed("rosrescue is stopping"))?,
                 () = retry => {}
-                () = hold.spent() => {
+                () = hold.wait_until_spent() => {
                     call.calls.stats.calls_unanswered.count();
                     return Err(Closed(NOT_IN_TIME));
                 }
@@ -385,7 +385,7 @@ impl Call<'_> {
         let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);
         if let Some(number) = number {
             let leader = leader.clone();
-            let pass_on = PassOn {
+            let pass_on = ConfirmOnDrop {
                 leader,
                 term,
                 number,
@@ -524,9 +524,9 @@ fn instead(mut reply: HttpReply, removed: Option<Reply>) -> HttpReply {
     let Some(removed) = removed else {
         return reply;
     };
-    let mut told = xml(&removed);
-    std::mem::swap(told.extensions_mut(), reply.extensions_mut());
-    told
+    let mut answer = xml(&removed);
+    std::mem::swap(answer.extensions_mut(), reply.extensions_mut());
+    answer
 }
 
 fn not_leading(term: u64) -> HttpReply {

@@ -173,7 +173,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
             .await
         }
         "/live" => text(StatusCode::OK, "live\n".to_owned()),
-        "/ready" if pages.board.read().answers(pages.gate.state()) => {
+        "/ready" if pages.board.read().answers_calls(pages.gate.state()) => {
             text(StatusCode::OK, "ready\n".to_owned())
         }
         "/ready" => text(

@@ -104,7 +104,7 @@ impl Body for ReplyBody {
 
 /// A reply of the mirror, or one result from the master's answer to several calls at once, with rosrescue's address in
 /// place of the master's.
-pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
+pub(super) fn encode_with_own_uri(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
     match call.filter(|call| batch::asks_uri(call)) {
         Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),
         None => xml(reply),

@@ -57,7 +57,7 @@ pub(crate) async fn serve(
     let mut reply = match grant.check(peer.ip()) {
         Ok(()) => route(server, peer, grant, &deadlines, request).await,
         Err(refusal) => {
-            let mut reply = keep_out(&server, peer, &refusal);
+            let mut reply = refuse_peer(&server, peer, &refusal);
             // The connection must close to make room for others.
             let close = HeaderValue::from_static("close");
             reply.headers_mut().insert(CONNECTION, close);
@@ -153,7 +153,7 @@ async fn post(
     };
     let kind = call.as_ref().map(master::Request::kind);
     if let Err(refusal) = grant.check_call(peer.ip(), kind) {
-        return Ok(keep_out(&server, peer, &refusal));
+        return Ok(refuse_peer(&server, peer, &refusal));
     }
     server.stats.calls.count();
     if let Some(call) = &call {
@@ -174,7 +174,7 @@ async fn post(
     }
     let start = Instant::now();
     let answered = answer(&server, peer, deadlines, head, body, call).await;
-    let time = server.clients.answered(peer, start);
+    let time = server.clients.end_call(peer, start);
     server.stats.times.count(kind, time);
     answered
 }
@@ -196,8 +196,11 @@ async fn answer(
         let Some(size) = answers::size(&reply) else {
             return Ok(reply);
         };
-        if let Some(room) = server.answers.enough(room.take(), size).await {
-            return Ok(server.answers.count(reply, room, &deadlines.reader).await);
+        if let Some(room) = server.answers.room_for(room.take(), size).await {
+            return Ok(server
+                .answers
+                .hold_room(reply, room, &deadlines.reader)
+                .await);
         }
         call = match body.len() <= body::SMALL {
             true => {
@@ -224,8 +227,11 @@ async fn page(
     let Some(size) = answers::size(&page) else {
         return Ok(page);
     };
-    let room = server.answers.enough(None, size).await.ok_or(NO_ROOM)?;
-    Ok(server.answers.count(page, room, &deadlines.reader).await)
+    let room = server.answers.room_for(None, size).await.ok_or(NO_ROOM)?;
+    Ok(server
+        .answers
+        .hold_room(page, room, &deadlines.reader)
+        .await)
 }
 
 fn refuse(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
@@ -235,7 +241,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
 }
 
 /// Refuses a request, and logs each address at most once a minute, because a refused node calls again and again.
-fn keep_out(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
+fn refuse_peer(server: &Server, peer: SocketAddr, refusal: &Rejection) -> HttpReply {
     let mut said = server
         .refused
         .lock()

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Facts, Guarded, Mode,
-    summary::{IllNode, LostAddress, Misaddressed, some},
+    summary::{IllNode, LostAddress, Misaddressed, shortened},
 };
 use crate::{clock, gate::State};
 
@@ -230,7 +230,7 @@ impl NodesTrouble {
         }
         for LostAddress { address, nodes, .. } in &self.lost_addresses {
             all.push((
-                format!("This computer has lost the address {address}, so no node can connect to {}.", some(nodes)),
+                format!("This computer has lost the address {address}, so no node can connect to {}.", shortened(nodes)),
                 format!(
                     "give this computer the address {address} back, or restart these nodes with its present address in ROS_IP."
                 ),
@@ -244,7 +244,7 @@ impl NodesTrouble {
             all.push((
                 format!(
                     "No other computer can reach nodes of {from}, and they cannot be checked from here: they have registered under an address that means each computer itself ({}).",
-                    some(&addresses)
+                    shortened(&addresses)
                 ),
                 format!("run `export ROS_IP={from}` on {from}, and restart these nodes there."),
             ));
@@ -254,7 +254,7 @@ impl NodesTrouble {
             all.push((
                 format!(
                     "Programs take a node name from each other, and shut each other down: {}.",
-                    some(&names)
+                    shortened(&names)
                 ),
                 "stop one of the two programs, or give it another name (__name:=).".to_owned(),
             ));
@@ -277,9 +277,9 @@ fn listed(nodes: &[IllNode]) -> String {
     match times.first().filter(|_| times.len() == 1) {
         Some(time) => {
             let names: Vec<_> = nodes.iter().map(|it| it.node.clone()).collect();
-            format!("{} since {time}", some(&names))
+            format!("{} since {time}", shortened(&names))
         }
-        None => some(&nodes.iter().map(ToString::to_string).collect::<Vec<_>>()),
+        None => shortened(&nodes.iter().map(ToString::to_string).collect::<Vec<_>>()),
     }
 }
 
@@ -355,7 +355,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
             1 => ("1 client".to_owned(), "talks"),
             count => (format!("{count} clients"), "talk"),
         };
-        let who = some(&facts.bypassing);
+        let who = shortened(&facts.bypassing);
         text += &format!(" {count} {verb} directly to the master, unprotected: {who}.");
         action.get_or_insert_with(|| "restart it with the ROS_MASTER_URI of rosrescue.".to_owned());
     }
@@ -443,7 +443,7 @@ mod tests {
 
     const OPEN: State = State::Open { incarnation: 1 };
 
-    fn of(gate: State, unprotected: Option<&str>, facts: &Facts) -> Condition {
+    fn condition_for(gate: State, unprotected: Option<&str>, facts: &Facts) -> Condition {
         let situation = Situation {
             gate,
             gate_since: facts.started,
@@ -457,17 +457,17 @@ mod tests {
     #[test]
     fn the_worst_condition_gives_the_name_and_all_are_described() {
         let mut facts = Facts::new(Mode::Proxy);
-        let good = of(OPEN, None, &facts);
+        let good = condition_for(OPEN, None, &facts);
         assert!(good.is_good(), "{good:?}");
         assert_eq!(
             good.line(),
             "protected: Nodes work as usual: the master answers. Every change is recorded."
         );
         assert_eq!(
-            of(State::Unknown, None, &facts).name,
+            condition_for(State::Unknown, None, &facts).name,
             ConditionName::Waiting
         );
-        let away = of(State::StandingIn, None, &facts);
+        let away = condition_for(State::StandingIn, None, &facts);
         assert_eq!(away.name, ConditionName::StandingIn);
         assert!(away.text.starts_with("Nodes keep working"), "{away:?}");
         assert!(away.action.unwrap().contains("http://robot:11312/"));
@@ -475,10 +475,10 @@ mod tests {
         facts.crash_loop = Some(Instant::now());
         facts.deaths = 7;
         assert_eq!(
-            of(State::StandingIn, None, &facts).name,
+            condition_for(State::StandingIn, None, &facts).name,
             ConditionName::CrashLoop
         );
-        let between = of(OPEN, None, &facts);
+        let between = condition_for(OPEN, None, &facts);
         assert_eq!(between.name, ConditionName::CrashLoop);
         assert!(
             between.text.starts_with("Nodes work as usual"),
@@ -486,7 +486,7 @@ mod tests {
         );
         assert!(between.text.contains("7 times"), "{between:?}");
 
-        let line = of(OPEN, Some("the disk\nis full"), &facts).line();
+        let line = condition_for(OPEN, Some("the disk\nis full"), &facts).line();
         assert!(
             line.starts_with("UNPROTECTED: Nodes work as usual"),
             "{line}"
@@ -499,7 +499,7 @@ mod tests {
         let mut facts = Facts::new(Mode::Core);
         for guarded in [Guarded::NoLonger(7), Guarded::Stopped(7)] {
             facts.guarded = guarded;
-            let condition = of(OPEN, None, &facts);
+            let condition = condition_for(OPEN, None, &facts);
             assert_eq!(condition.name, ConditionName::Protected);
             assert!(!condition.is_good() && !guarded.is_guarded());
             assert!(condition.text.contains("process 7"), "{condition:?}");
@@ -510,7 +510,7 @@ mod tests {
     fn changes_that_bypass_rosrescue_are_not_protected() {
         let mut facts = Facts::new(Mode::Proxy);
         facts.bypassing = vec!["rosout (process 7)".to_owned()];
-        let condition = of(OPEN, None, &facts);
+        let condition = condition_for(OPEN, None, &facts);
         assert_eq!(condition.name, ConditionName::Protected);
         assert!(!condition.is_good());
         let said = "1 client talks directly to the master, unprotected: rosout (process 7).";
@@ -642,8 +642,8 @@ mod tests {
         let mut facts = Facts::new(Mode::Core);
         facts.started = facts.started.checked_sub(minute).unwrap();
         facts.disk.since = facts.started;
-        let before = of(OPEN, None, &facts).since;
+        let before = condition_for(OPEN, None, &facts).since;
         facts.calm_since = Some(facts.started + minute / 2);
-        assert!(of(OPEN, None, &facts).since > before + 29.0);
+        assert!(condition_for(OPEN, None, &facts).since > before + 29.0);
     }
 }

@@ -127,12 +127,12 @@ pub(crate) struct NodeHealth {
 
 impl NodesStatus {
     /// The names of `names`, each with the time since when its health has been the same.
-    pub(crate) fn since(&self, names: &[String]) -> String {
+    pub(crate) fn with_times(&self, names: &[String]) -> String {
         let with_time = |name: &String| match self.node_health.get(name) {
             Some(of) => format!("{name} since {}", clock::wall_text(of.since)),
             None => name.clone(),
         };
-        some(&names.iter().map(with_time).collect::<Vec<_>>())
+        shortened(&names.iter().map(with_time).collect::<Vec<_>>())
     }
 }
 
@@ -229,7 +229,7 @@ impl Status {
         ];
         write!(f, "nodes       {} alive", nodes.alive_nodes)?;
         for (names, what) in lists.into_iter().filter(|(names, _)| !names.is_empty()) {
-            write!(f, "; {} {what}: {}", names.len(), nodes.since(names))?;
+            write!(f, "; {} {what}: {}", names.len(), nodes.with_times(names))?;
         }
         line!(f)
     }
@@ -352,7 +352,7 @@ pub(crate) fn counted(count: usize, thing: &str) -> String {
 }
 
 /// Lists names for people, and shortens long lists.
-pub(crate) fn some(names: &[String]) -> String {
+pub(crate) fn shortened(names: &[String]) -> String {
     const MOST: usize = 10;
     let shown = names
         .iter()

@@ -20,7 +20,7 @@ pub(crate) enum InspectError {
 
 /// Makes the first of two requests that read a master. Repeats it without the parameters if the master cannot return
 /// one of them.
-pub(crate) async fn first(
+pub(crate) async fn read_first(
     connection: &mut Connection,
     token: &Token,
 ) -> Result<Inspection, InspectError> {
@@ -54,7 +54,7 @@ fn is_broken_document(error: &InspectError) -> bool {
 }
 
 /// Makes the second request, and returns the master's state.
-pub(crate) async fn second(
+pub(crate) async fn read_second(
     first: Inspection,
     connection: &mut Connection,
     previous: &Master,

@@ -24,7 +24,7 @@ pub(crate) enum NextConnection {
 impl NextConnection {
     /// The connection for the next call, after `reply` has arrived on `verified`: the same connection if the master
     /// leaves it open, or a new one made by `connect`. `None` if the next call has to connect.
-    pub(crate) fn after(
+    pub(crate) fn after_reply(
         verified: Verified,
         reply: &RawReply,
         connect: impl Future<Output = Result<Verified, VerifyError>> + Send + 'static,
@@ -98,7 +98,7 @@ mod tests {
             let last = connect(upstream.clone()).await.unwrap();
             let (last_end, _) = listener.accept().await.unwrap();
             (
-                NextConnection::after(last, &reply, connect(upstream.clone())),
+                NextConnection::after_reply(last, &reply, connect(upstream.clone())),
                 last_end,
             )
         };

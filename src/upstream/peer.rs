@@ -112,7 +112,7 @@ impl Peer {
         let mut may_have_run = false;
         if let Some(mut connection) = idle {
             match connection.forward(&head, body.clone()).await {
-                Ok(reply) => return self.answered(term, connection, reply, may_have_run),
+                Ok(reply) => return self.take_reply(term, connection, reply, may_have_run),
                 Err(_) => may_have_run = true,
             }
         }
@@ -126,10 +126,10 @@ impl Peer {
             why: error.into(),
             may_have_run: true,
         })?;
-        self.answered(term, connection, reply, may_have_run)
+        self.take_reply(term, connection, reply, may_have_run)
     }
 
-    fn answered(
+    fn take_reply(
         &self,
         term: u64,
         connection: Connection,
@@ -173,7 +173,7 @@ impl Peers {
     }
 
     /// The rosrescue at `uri`. Drops the connections to any other rosrescue.
-    pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
+    pub(crate) fn peer_at(&self, uri: &MasterUri) -> Arc<Peer> {
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {
             return peer.clone();

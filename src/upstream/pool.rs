@@ -87,7 +87,7 @@ impl Pool {
 
     fn put_idle(&self, incarnation: u64, token: Token, verified: Verified, reply: &RawReply) {
         let connect = connect(self.upstream.clone(), token);
-        if let Some(next) = NextConnection::after(verified, reply, connect) {
+        if let Some(next) = NextConnection::after_reply(verified, reply, connect) {
             let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
             idle.push((incarnation, next));
         }

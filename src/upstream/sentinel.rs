@@ -76,7 +76,7 @@ impl Sentinel {
     }
 
     /// Waits until the connection has ended, or until the other end sends data without a request, which no master does.
-    pub(crate) async fn ended(&self) {
+    pub(crate) async fn wait_until_ended(&self) {
         let mut renewed = self.stream.subscribe();
         loop {
             let stream = renewed.borrow_and_update().clone();
@@ -109,13 +109,14 @@ mod tests {
         assert!(sentinel.is_local() && sentinel.peer() == address);
         assert!(sentinel.is_open() && waiting.is_open(), "not accepted yet");
         let (accepted, _) = listener.accept().await.unwrap();
-        let early = tokio::time::timeout(Duration::from_millis(20), sentinel.ended()).await;
+        let early =
+            tokio::time::timeout(Duration::from_millis(20), sentinel.wait_until_ended()).await;
         assert!(early.is_err() && sentinel.is_open());
         drop(accepted);
         assert!(!sentinel.is_open(), "without a turn of the runtime");
-        sentinel.ended().await;
+        sentinel.wait_until_ended().await;
         assert!(waiting.is_open());
-        let silent = tokio::time::timeout(Duration::from_millis(20), waiting.ended());
+        let silent = tokio::time::timeout(Duration::from_millis(20), waiting.wait_until_ended());
         assert!(silent.await.is_err());
         drop(listener);
         assert!(!waiting.is_open(), "nobody can accept it any more");
@@ -130,7 +131,7 @@ mod tests {
         let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
         let ended = crate::task::spawn({
             let sentinel = sentinel.clone();
-            async move { sentinel.ended().await }
+            async move { sentinel.wait_until_ended().await }
         });
         let (first, _) = listener.accept().await.unwrap();
         sentinel.renew(&upstream).await.unwrap();

@@ -41,7 +41,7 @@ pub(crate) enum Verification {
 impl Verification {
     /// Chooses how to verify calls. `keeps_alive` says that the master answers more than one call on a connection.
     /// `sees_master` says that the sentinel is connected to the master's own process and not to a tunnel.
-    pub(crate) fn of(keeps_alive: bool, sees_master: bool, sentinel: &Arc<Sentinel>) -> Self {
+    pub(crate) fn choose(keeps_alive: bool, sees_master: bool, sentinel: &Arc<Sentinel>) -> Self {
         match (keeps_alive, sees_master) {
             (true, _) => Self::TokenFirst,
             (false, true) => Self::Sentinel(sentinel.clone()),
@@ -88,7 +88,7 @@ impl Verified {
             Verification::Sentinel(sentinel) => is_open(sentinel),
             // The process that has the token now has held the port since it got the token.
             Verification::TokenAfterwards => match upstream.connect().await {
-                Ok(mut connection) => look_up(&mut connection, token).await,
+                Ok(mut connection) => verify_token(&mut connection, token).await,
                 Err(error) => Err(error.into()),
             },
         };
@@ -104,7 +104,7 @@ pub(crate) async fn connection(
 ) -> Result<Verified, VerifyError> {
     let by = upstream.verification().ok_or(VerifyError::Ended)?;
     match &by {
-        Verification::TokenFirst => look_up(&mut connection, token).await?,
+        Verification::TokenFirst => verify_token(&mut connection, token).await?,
         // The sentinel is still open after connecting, so the connection leads to the same process.
         Verification::Sentinel(sentinel) => is_open(sentinel)?,
         Verification::TokenAfterwards => {}
@@ -119,11 +119,11 @@ pub(crate) async fn probe(
     sentinel: &Sentinel,
 ) -> Result<(), VerifyError> {
     let _open = upstream.begin_call();
-    look_up(&mut upstream.connect().await?, token).await?;
+    verify_token(&mut upstream.connect().await?, token).await?;
     Ok(sentinel.renew(upstream).await?)
 }
 
-async fn look_up(connection: &mut Connection, token: &Token) -> Result<(), VerifyError> {
+async fn verify_token(connection: &mut Connection, token: &Token) -> Result<(), VerifyError> {
     match Token::is_found(&connection.call(&token.lookup()).await?) {
         true => Ok(()),
         false => Err(VerifyError::OtherIncarnation),

@@ -96,7 +96,7 @@ impl Drain {
                 _ = lease.changed() => Input::Wake,
                 _ = patience.changed() => Input::Patience(patience.borrow_and_update().clone()),
                 () = wait::tick(&mut interval) => Input::Compare,
-                () = wait::until(deadline.map(Into::into)) => Input::Wake,
+                () = wait::sleep_until(deadline.map(Into::into)) => Input::Wake,
             };
             // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = self.gate.look_changed();

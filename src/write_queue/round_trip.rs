@@ -110,7 +110,9 @@ pub(super) async fn round_trip(
         }
     };
     let connection = match &result {
-        Ok(Received::Reply(reply)) => NextConnection::after(verified, reply, connect(link, token)),
+        Ok(Received::Reply(reply)) => {
+            NextConnection::after_reply(verified, reply, connect(link, token))
+        }
         Ok(Received::Held(_)) => Some(NextConnection::Kept(Box::new(verified))),
         Err(_) => None,
     };
@@ -132,11 +134,11 @@ async fn read_state(
     verified: &mut Verified,
 ) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
-    let mut first = inspect::first(&mut verified.connection, token).await?;
+    let mut first = inspect::read_first(&mut verified.connection, token).await?;
     if !verified.connection.keeps_order() {
         first.arrange_like(&previous);
     }
-    let state = inspect::second(first, &mut verified.connection, &previous).await?;
+    let state = inspect::read_second(first, &mut verified.connection, &previous).await?;
     verified.confirm(&link.upstream, token).await?;
     Ok(state)
 }

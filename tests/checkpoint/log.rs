@@ -105,7 +105,7 @@ fn a_long_log_has_every_record_once() {
         .filter_map(|file| Some(file.path.metadata().ok()?.len()))
         .sum();
     let begun = Instant::now();
-    let entries = read_all(&path).take();
+    let entries = read_all(&path).take_entries();
     println!(
         "{seconds} records of {} bytes; the log has {:.1} MiB, and is read in {:.1?}",
         bytes / seconds,

@@ -94,7 +94,7 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     fleet.await_same_state();
     fleet.network.cut_port(leader, rest[0], old.it().port());
     publish(1, &new);
-    let told = |node: &Named| !node.it().heard("shutdown").is_empty();
+    let told = |node: &Named| !node.it().received("shutdown").is_empty();
     assert!(!told(&old), "the leader has reached it");
     fleet.computers[leader].power_off();
     fleet.await_leader_of(&rest);

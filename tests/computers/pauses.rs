@@ -37,7 +37,7 @@ fn count(key: &str, mut number: i32, stop: &AtomicBool) -> i32 {
 /// The values of each parameter that the node was notified of, in order.
 fn told(node: &FakeNode) -> BTreeMap<String, Vec<i32>> {
     let mut told: BTreeMap<String, Vec<i32>> = BTreeMap::new();
-    for update in node.heard("paramUpdate") {
+    for update in node.received("paramUpdate") {
         let key = update[1].as_str().unwrap().trim_end_matches('/').to_owned();
         told.entry(key).or_default().extend(update[2].as_int());
     }

@@ -151,7 +151,7 @@ impl Traffic {
             );
         }
         for node in &self.nodes {
-            let told = node.it().heard("shutdown");
+            let told = node.it().received("shutdown");
             assert!(told.is_empty(), "{node:?} is told to shut down: {told:?}");
         }
         assert!(total > 0, "nothing was written in round {round}");

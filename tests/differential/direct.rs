@@ -1,6 +1,6 @@
 //! Compares the model with a bare rosmaster.
 
-use rescue_core::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
+use rescue_core::replay::{Inspection, NotAMaster, Plan, Skipped, Token, TokenState, difference};
 use ros1_master::{
     master::{Master, Notice, Request},
     xmlrpc::{Call, decode_call},
@@ -164,7 +164,7 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     if unordered() {
         look.arrange_like(model);
     }
-    if look.bears() != Bears::Nothing {
+    if look.bears() != TokenState::Nothing {
         return Err("the master has a token, although none was set".to_owned());
     }
     let second = match look.second_call(model) {

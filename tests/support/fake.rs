@@ -18,7 +18,7 @@ use super::scratch::free_port;
 
 /// A call that a fake node received.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Heard {
+pub(crate) struct ReceivedCall {
     pub(crate) method: String,
     pub(crate) params: Vec<Value>,
     /// Whether rosrescue itself made the call, under the name of the master, as nodes expect.
@@ -30,7 +30,7 @@ pub(crate) struct Heard {
 
 #[derive(Debug, Default)]
 struct Inner {
-    heard: Mutex<Vec<Heard>>,
+    received: Mutex<Vec<ReceivedCall>>,
     holding: Mutex<bool>,
     released: Condvar,
     publications: Mutex<BTreeMap<String, String>>,
@@ -109,9 +109,9 @@ impl FakeNode {
     }
 
     /// The parameters of each call of `method` that the node received, in order.
-    pub(crate) fn heard(&self, method: &str) -> Vec<Vec<Value>> {
-        let heard = lock(&self.inner.heard);
-        heard
+    pub(crate) fn received(&self, method: &str) -> Vec<Vec<Value>> {
+        let received = lock(&self.inner.received);
+        received
             .iter()
             .filter(|call| call.method == method)
             .map(|call| call.params.clone())
@@ -119,13 +119,13 @@ impl FakeNode {
     }
 
     /// All calls that the node received, in order.
-    pub(crate) fn calls(&self) -> Vec<Heard> {
-        lock(&self.inner.heard).clone()
+    pub(crate) fn calls(&self) -> Vec<ReceivedCall> {
+        lock(&self.inner.received).clone()
     }
 
     /// The list of publishers in each publisherUpdate for `topic`, in order.
     pub(crate) fn updates(&self, topic: &str) -> Vec<Vec<String>> {
-        self.heard("publisherUpdate")
+        self.received("publisherUpdate")
             .into_iter()
             .filter(|params| params[1] == Value::from(topic))
             .map(|params| {
@@ -241,7 +241,7 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
         // The flag is read before the call is recorded: a test that sees the call and then sets the flag means later
         // calls.
         let is_held = *lock(&inner.holding);
-        lock(&inner.heard).push(Heard {
+        lock(&inner.received).push(ReceivedCall {
             method: call.method.clone(),
             params: call.params,
             from_rosrescue: head.contains("\nuser-agent: rosrescue/"),

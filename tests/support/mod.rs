@@ -49,7 +49,7 @@ pub(crate) use blocks::{blocks, documents};
 pub(crate) use browser::Browser;
 pub(crate) use disk::{FailingDisk, SmallDisk, Trouble};
 pub(crate) use failing::{Failing, Failures, Forkserver, page};
-pub(crate) use fake::{FakeMaster, FakeNode, Heard, read_request};
+pub(crate) use fake::{FakeMaster, FakeNode, ReceivedCall, read_request};
 pub(crate) use feed::{feed, gzip};
 pub(crate) use kinds::{kinds, sorted, unordered};
 pub(crate) use name_server::NameServer;

@@ -155,7 +155,7 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
     within(SOON, "a notification of a parameter", || {
         client.set_param("/gain", 7);
         eventually("a living node is told of a parameter", || {
-            !watcher.heard("paramUpdate").is_empty()
+            !watcher.received("paramUpdate").is_empty()
         });
     });
     // If the master sends an outdated list late, it is corrected soon.
@@ -174,6 +174,6 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
             mode == Mode::Proxy || updates.is_sorted_by_key(Vec::len),
             "{updates:?}"
         );
-        assert_eq!(fake.heard("shutdown").len(), 0);
+        assert_eq!(fake.received("shutdown").len(), 0);
     }
 }

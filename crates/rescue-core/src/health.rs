@@ -86,11 +86,11 @@ impl Claims {
 
     /// Whether the node reports one of `topics`. Topics that most nodes have, such as `/rosout`, do not count.
     pub fn shares(&self, topics: &[String]) -> bool {
-        let mut own = self.all().filter(|topic| !COMMON.contains(topic));
+        let mut own = self.topics().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
     }
 
-    fn all(&self) -> impl Iterator<Item = &str> {
+    fn topics(&self) -> impl Iterator<Item = &str> {
         let both = self.publications.keys().chain(self.subscriptions.keys());
         both.map(String::as_str)
     }
@@ -142,7 +142,7 @@ pub fn judge_node(
     pid: Option<i32>,
     claims: Option<&Claims>,
 ) -> Vec<IdentityVerdict> {
-    let said = claims.into_iter().flat_map(Claims::all);
+    let said = claims.into_iter().flat_map(Claims::topics);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
     // How many of the node's topics the answer reports, and whether it reports all of them.
     let match_of = |node: &str| {

@@ -189,7 +189,7 @@ impl Lifecycle {
     }
 
     /// Whether this is a new session in which no master has served yet.
-    pub fn begins(&self) -> bool {
+    pub fn is_new_session(&self) -> bool {
         !self.served && !self.restored
     }
 
@@ -272,7 +272,7 @@ impl Lifecycle {
             }
             Input::CaughtUp if self.phase == Phase::CatchingUp => {
                 self.phase = Phase::Serving;
-                self.answered(now);
+                self.note_answer(now);
                 vec![Action::OpenGate]
             }
             Input::NotCaughtUp if self.phase == Phase::CatchingUp => {
@@ -298,12 +298,12 @@ impl Lifecycle {
                 (self.served, self.known) = (true, true);
                 self.seeking_since = None;
                 self.serving_since = Some(now);
-                self.answered(now);
+                self.note_answer(now);
                 let report = if died { self.their_death(now) } else { None };
                 std::iter::once(Action::OpenGate).chain(report).collect()
             }
             Input::ProbeAnswered => {
-                self.answered(now);
+                self.note_answer(now);
                 Vec::new()
             }
             Input::ProbeMissed => self.probe_missed(now),
@@ -314,7 +314,7 @@ impl Lifecycle {
                 self.seeking_since = Some(now);
                 vec![Action::Connect]
             }
-            Input::SpawnFailed { pending: false } if self.begins() => vec![Action::GiveUp],
+            Input::SpawnFailed { pending: false } if self.is_new_session() => vec![Action::GiveUp],
             Input::SpawnFailed { .. } => {
                 let pause = pause_after(self.failed_spawns).max(self.pause_before_spawn());
                 self.failed_spawns += 1;
@@ -369,7 +369,7 @@ impl Lifecycle {
     }
 
     /// Notes that the master has answered.
-    fn answered(&mut self, now: Instant) {
+    fn note_answer(&mut self, now: Instant) {
         self.missed = 0;
         self.evidence.clear();
         self.timer = Some((now + self.probing.interval, Timer::Probe));
@@ -429,7 +429,7 @@ impl Lifecycle {
         since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
     }
 
-    /// Kills the silent child if it [hangs](Evidence::judge). Connects again if it does not.
+    /// Kills the silent child if it [hangs](Evidence::judge_silence). Connects again if it does not.
     fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
         match self.evidence.judge_silence(busy_limit) {
             SilenceVerdict::Hung => self.give_up(now),

@@ -28,6 +28,8 @@ pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Deviation, Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
-pub use roscore::{ROSOUT, RUN_ID_AFTER, has_run_id, rosout_to_ask, says_run_id, withheld_run_id};
-pub use token::{Bears, Token};
+pub use roscore::{
+    ROSOUT, RUN_ID_AFTER, has_run_id, is_run_id_set, rosout_to_ask, withheld_run_id,
+};
+pub use token::{Token, TokenState};
 pub use treatment::{KnownMaster, Treatment, treatment};

@@ -42,7 +42,7 @@ pub(in crate::commands::check) enum Unusable {
 
 /// The part of a computer's entry in etcd that the check needs.
 #[derive(Deserialize)]
-struct Entry {
+struct MemberEntry {
     uri: String,
 }
 
@@ -55,12 +55,12 @@ impl Cluster {
         hostname: &str,
     ) -> Option<Result<Self, Unusable>> {
         match ClusterConfig::new(args, usual, hostname) {
-            Ok(config) => Some(Self::ask(config?).await),
+            Ok(config) => Some(Self::read_etcd(config?).await),
             Err(error) => Some(Err(error.into())),
         }
     }
 
-    async fn ask(config: ClusterConfig) -> Result<Self, Unusable> {
+    async fn read_etcd(config: ClusterConfig) -> Result<Self, Unusable> {
         let client = Etcd::new(&Options {
             endpoints: config.endpoints,
             access: Credentials {
@@ -102,7 +102,7 @@ async fn namesake_of(client: &Etcd, keys: &Keys, name: &str, own: &MasterUri) ->
         .range(&(key.clone()..format!("{key}\0")), LIMIT)
         .await;
     let found = found.ok()?.kvs.pop()?;
-    let Entry { uri } = serde_json::from_slice(&found.value).ok()?;
+    let MemberEntry { uri } = serde_json::from_slice(&found.value).ok()?;
     let at = MasterUri::parse(&uri).ok()?;
     (at != *own && !running::is_here(&at).await).then_some(uri)
 }

@@ -254,7 +254,7 @@ impl SetupFacts {
         };
         let (mut proxied, mut proxied_speaks) = (None, None);
         if let Some(uri) = master {
-            let server = ros::Responder::ask(&uri).await;
+            let server = ros::Responder::identify(&uri).await;
             if matches!(server, ros::Responder::Master(_)) {
                 proxied_speaks = ros::speaks(&uri).await;
             }
@@ -269,7 +269,7 @@ impl SetupFacts {
         let is_far = |host: &Host| host.addresses.is_ok() && !host.is_here;
         let far = master_uri.filter(|_| master_host.as_ref().is_some_and(is_far));
         let elsewhere = match &far {
-            Some(uri) if proxied.is_none() => Some(ros::Responder::ask(uri).await),
+            Some(uri) if proxied.is_none() => Some(ros::Responder::identify(uri).await),
             _ => None,
         };
         let (mut nodes_of, mut elsewhere_host) = (None, None);
@@ -293,7 +293,7 @@ impl SetupFacts {
             node_hosts = hosts_of(&nodes).await;
             ports.extend(nodes);
         }
-        let reached = reach::all(ports).await;
+        let reached = reach::try_all(ports).await;
         let mut others = Vec::new();
         for (process, uri) in environment
             .master_uri
@@ -411,11 +411,11 @@ impl Port {
                     port: number,
                 };
                 taken = Some(PortInUse {
-                    by: listeners::at(number)
+                    by: listeners::listeners_at(number)
                         .into_iter()
                         .map(Process::read)
                         .collect(),
-                    server: ros::Responder::ask(&at).await,
+                    server: ros::Responder::identify(&at).await,
                 });
             }
             Err(ListenError::Other { source, .. }) => error = Some(source.to_string()),
@@ -449,7 +449,7 @@ impl UpstreamMaster {
         if let Some(place) = &place {
             bypass.find_new_clients(place);
         }
-        let all: BTreeSet<_> = bypass.all().into_iter().chain(known).collect();
+        let all: BTreeSet<_> = bypass.names().into_iter().chain(known).collect();
         Self {
             uri,
             bypassing: all.into_iter().collect(),
@@ -519,7 +519,7 @@ impl Clock {
         .filter_map(|path| rustix::fs::stat(path).ok())
         .map(|stat| stat.st_mtime as f64);
         let synchronized = Path::new("/run/systemd/timesync/synchronized").exists();
-        let service = process::all()
+        let service = process::all_pids()
             .map(Process::of_name)
             .find(|name| CLOCKS.contains(&&**name));
         Self {
@@ -541,7 +541,7 @@ impl Process {
 
 /// Masters in this network namespace that were not started by rosrescue.
 fn masters() -> Vec<Process> {
-    process::all()
+    process::all_pids()
         .filter(|pid| ["rosmaster", "roscore"].contains(&&*Process::of_name(*pid)))
         .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
         .map(Process::read)
@@ -552,7 +552,7 @@ fn masters() -> Vec<Process> {
 /// sees the processes of other users.
 fn strays(own: &str) -> Vec<(Process, String)> {
     const NAME: &[u8] = b"ROS_MASTER_URI=";
-    let strays = process::all().filter_map(|pid| {
+    let strays = process::all_pids().filter_map(|pid| {
         let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
         let mut variables = environment.split(|byte| *byte == 0);
         let uri = variables.find_map(|variable| variable.strip_prefix(NAME))?;

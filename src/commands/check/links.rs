@@ -18,7 +18,7 @@ use crate::{
     cli::{CheckArgs, TargetArgs},
     commands::{CommandFailure, counted, live::Live, running::Running},
     nodes::client::{self, Reaction},
-    status::summary::some,
+    status::summary::shortened,
 };
 
 const SUBJECT: &str = "links";
@@ -35,11 +35,11 @@ pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, Comman
     let mut running = Running::find(&TargetArgs { uri })?;
     running.address.port = args.port.unwrap_or(running.address.port);
     let mut live = Live::connect(&running).await?;
-    let mut found = ask(&mut live).await?;
+    let mut found = read_connections(&mut live).await?;
     if !found.missing.is_empty() || !found.silent.is_empty() {
         sleep(LOOK_AGAIN).await;
         let before = found;
-        found = ask(&mut live).await?;
+        found = read_connections(&mut live).await?;
         found.missing.retain(|link| before.missing.contains(link));
     }
     let mut findings = found.findings();
@@ -50,7 +50,7 @@ pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, Comman
     Ok(findings)
 }
 
-async fn ask(live: &mut Live) -> Result<Found, CommandFailure> {
+async fn read_connections(live: &mut Live) -> Result<Found, CommandFailure> {
     let state = live.state(&Master::default()).await?;
     let permits = Arc::new(Semaphore::new(AT_ONCE));
     let mut answers = JoinSet::new();
@@ -59,7 +59,7 @@ async fn ask(live: &mut Live) -> Result<Found, CommandFailure> {
         answers.spawn(async move {
             // The semaphore is never closed.
             let _permit = permits.acquire().await;
-            let answer = client::ask_for(&api, &question("getBusInfo"), ANSWER_LIMIT).await;
+            let answer = client::call_for_value(&api, &question("getBusInfo"), ANSWER_LIMIT).await;
             (name, Answer::read(answer))
         });
     }
@@ -222,7 +222,7 @@ impl Found {
             let what = format!(
                 "{} without an answer: {}",
                 counted(silent.len(), "node"),
-                some(&silent)
+                shortened(&silent)
             );
             let todo =
                 "`rosrescue status` shows which are dead; `rosnode cleanup` unregisters those";
@@ -271,7 +271,7 @@ mod tests {
     }
 
     /// Numbers of seen, missing and unknown connections and of silent nodes.
-    fn found(talker: Answer, other: Answer, listener: Answer) -> [usize; 4] {
+    fn counts(talker: Answer, other: Answer, listener: Answer) -> [usize; 4] {
         let names = ["/talker", "/other", "/listener"].map(str::to_owned);
         let answers = names.into_iter().zip([talker, other, listener]).collect();
         let found = compare(&state(), &answers);
@@ -291,16 +291,16 @@ mod tests {
             ("http://robot:2/", "i"),
             ("/rosout", "o"),
         ]);
-        assert_eq!(found(none(), none(), both), [2, 0, 0, 0]);
+        assert_eq!(counts(none(), none(), both), [2, 0, 0, 0]);
         let one = || answer_with(&[("http://robot:1/", "i")]);
-        assert_eq!(found(none(), none(), one()), [1, 1, 0, 0]);
+        assert_eq!(counts(none(), none(), one()), [1, 1, 0, 0]);
         // A publisher may still list a connection that its subscriber has closed.
         let claims = || answer_with(&[("/listener", "o")]);
-        assert_eq!(found(claims(), claims(), one()), [1, 1, 0, 0]);
-        assert_eq!(found(claims(), none(), none()), [0, 1, 1, 0]);
-        assert_eq!(found(none(), Answer::Silent, one()), [1, 0, 0, 1]);
-        assert_eq!(found(none(), none(), Answer::Silent), [0, 0, 0, 1]);
-        assert_eq!(found(none(), none(), Answer::Other), [0, 0, 2, 0]);
+        assert_eq!(counts(claims(), claims(), one()), [1, 1, 0, 0]);
+        assert_eq!(counts(claims(), none(), none()), [0, 1, 1, 0]);
+        assert_eq!(counts(none(), Answer::Silent, one()), [1, 0, 0, 1]);
+        assert_eq!(counts(none(), none(), Answer::Silent), [0, 0, 0, 1]);
+        assert_eq!(counts(none(), none(), Answer::Other), [0, 0, 2, 0]);
     }
 
     #[test]

@@ -38,7 +38,7 @@ pub(super) enum Outcome {
 }
 
 /// Tries `ports`, each with its owner. Leaves out hosts without an address and this computer.
-pub(super) async fn all(ports: Vec<(String, MasterUri)>) -> Vec<Reached> {
+pub(super) async fn try_all(ports: Vec<(String, MasterUri)>) -> Vec<Reached> {
     let permits = Arc::new(Semaphore::new(AT_ONCE));
     let mut tries = JoinSet::new();
     for (of, address) in ports.into_iter().take(MOST) {

@@ -3,7 +3,7 @@
 use super::{Finding, Severity};
 use crate::{
     commands::counted,
-    status::summary::{Status, some},
+    status::summary::{Status, shortened},
 };
 
 /// The nodes that are in trouble.
@@ -17,7 +17,7 @@ pub(super) fn findings(status: &Status) -> Vec<Finding> {
     };
     let mut all = Vec::new();
     if !nodes.dead_nodes.is_empty() {
-        let (count, names) = (nodes.dead_nodes.len(), nodes.since(&nodes.dead_nodes));
+        let (count, names) = (nodes.dead_nodes.len(), nodes.with_times(&nodes.dead_nodes));
         let what = format!(
             "{} died without unregistering: {names}",
             counted(count, "node")
@@ -31,7 +31,7 @@ pub(super) fn findings(status: &Status) -> Vec<Finding> {
         let what = format!(
             "{} died, now unregistered: {}",
             counted(names.len(), "node"),
-            some(&names)
+            shortened(&names)
         );
         all.push(finding(what, "restart these nodes".to_owned()));
     }

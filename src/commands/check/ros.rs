@@ -63,7 +63,7 @@ struct Page {
 }
 
 impl Responder {
-    pub(super) async fn ask(address: &MasterUri) -> Self {
+    pub(super) async fn identify(address: &MasterUri) -> Self {
         let running = Running {
             address: address.clone(),
         };
@@ -82,7 +82,7 @@ impl Responder {
             };
         }
         let (uri, get_pid) = (address.to_string(), master::get_pid());
-        match client::ask_for(&uri, &get_pid, ANSWER_LIMIT).await {
+        match client::call_for_value(&uri, &get_pid, ANSWER_LIMIT).await {
             (Reaction::Alive, pid) => Self::Master(pid.as_ref().and_then(Value::as_int)),
             (Reaction::Dead, _) => Self::Nobody,
             (Reaction::Silent, _) if page.is_err() => Self::Silent,
@@ -113,7 +113,7 @@ pub(super) async fn nodes(uri: &str) -> Vec<(String, MasterUri)> {
     let ask = async |method: &str, params: Vec<Value>| {
         let params = std::iter::once("/rosrescue_check".into()).chain(params);
         let call = Call::new(method, params.collect());
-        client::ask_for(uri, &call, ANSWER_LIMIT).await.1
+        client::call_for_value(uri, &call, ANSWER_LIMIT).await.1
     };
     let mut nodes = Vec::new();
     let state = ask("getSystemState", Vec::new()).await;

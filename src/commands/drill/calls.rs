@@ -36,13 +36,13 @@ struct Answer {
 }
 
 impl Api {
-    async fn ask(&self, method: &str, params: &[Value]) -> Answer {
+    async fn timed_call(&self, method: &str, params: &[Value]) -> Answer {
         let own = std::iter::once(Value::from(self.caller.as_str()));
         let call = Call::new(method, own.chain(params.iter().cloned()).collect());
         let start = Instant::now();
         let mut again = false;
         loop {
-            let (sign, value) = client::ask_for(&self.uri, &call, LIMIT).await;
+            let (sign, value) = client::call_for_value(&self.uri, &call, LIMIT).await;
             let took = start.elapsed();
             let value = match (sign, value) {
                 (_, Some(value)) => Ok(value),
@@ -66,7 +66,7 @@ impl Api {
     }
 
     pub(super) async fn call(&self, method: &str, params: &[Value]) -> Result<Value, String> {
-        self.ask(method, params).await.value
+        self.timed_call(method, params).await.value
     }
 }
 
@@ -83,7 +83,7 @@ pub(super) struct Waits {
 }
 
 impl Waits {
-    fn took(&mut self, took: Duration) {
+    fn succeed(&mut self, took: Duration) {
         self.calls += 1;
         self.longest_ms = self.longest_ms.max(took.as_secs_f64() * 1e3);
     }
@@ -96,7 +96,7 @@ impl Waits {
     }
 
     fn add(&mut self, answer: Answer) -> Option<Value> {
-        self.took(answer.took);
+        self.succeed(answer.took);
         self.again += u64::from(answer.again);
         answer.value.map_err(|why| self.fail(why)).ok()
     }
@@ -127,7 +127,7 @@ pub(super) struct Callers {
     pub(super) api: Api,
     /// Address of the drill's node.
     pub(super) node_api: String,
-    pub(super) heard: Arc<NodeLog>,
+    pub(super) log: Arc<NodeLog>,
     /// A parameter that no other node uses.
     pub(super) key: String,
     /// A topic that no other node uses.
@@ -151,7 +151,7 @@ impl Callers {
         let mut waits = Waits::default();
         let name = [self.api.caller.as_str().into()];
         while !stop.is_cancelled() {
-            let answer = self.api.ask("lookupNode", &name).await;
+            let answer = self.api.timed_call("lookupNode", &name).await;
             if let Some(found) = waits.add(answer)
                 && found.as_str() != Some(&self.node_api)
             {
@@ -165,7 +165,7 @@ impl Callers {
     /// Sets a parameter, waits for the notification, and reads the parameter back, in a loop.
     async fn write(&self, stop: &CancellationToken) -> (Waits, Waits, Waits) {
         let (mut written, mut read, mut told) = <(Waits, Waits, Waits)>::default();
-        let mut seen = self.heard.param.subscribe();
+        let mut seen = self.log.param.subscribe();
         let mut number = 0;
         // The master does not notify a node of its own writes, so a second node writes.
         let another = Api {
@@ -176,12 +176,15 @@ impl Callers {
             number += 1;
             let start = Instant::now();
             let set = [self.key.as_str().into(), number.into()];
-            let answer = another.ask("setParam", &set).await;
+            let answer = another.timed_call("setParam", &set).await;
             if written.add(answer).is_none() {
                 sleep(PAUSE).await;
                 continue;
             }
-            let answer = self.api.ask("getParam", &[self.key.as_str().into()]).await;
+            let answer = self
+                .api
+                .timed_call("getParam", &[self.key.as_str().into()])
+                .await;
             if let Some(value) = read.add(answer)
                 && value.as_int() != Some(number)
             {
@@ -189,7 +192,7 @@ impl Callers {
             }
             let notified = timeout(LIMIT, seen.wait_for(|seen| *seen >= number));
             match notified.await {
-                Ok(_) => told.took(start.elapsed()),
+                Ok(_) => told.succeed(start.elapsed()),
                 Err(_) => told.fail(format!(
                     "no paramUpdate in {} s: nobody reaches nodes at {}",
                     LIMIT.as_secs(),
@@ -209,13 +212,16 @@ impl Callers {
             let register = [topic.into(), "*".into(), api.into()];
             // The node claims the subscription before it registers, and until it has unregistered. Otherwise a health
             // check could remove the registration, which would count as a failure here.
-            self.heard.subscribes(topic, true);
-            let answer = self.api.ask("registerSubscriber", &register).await;
+            self.log.subscribes(topic, true);
+            let answer = self.api.timed_call("registerSubscriber", &register).await;
             waits.add(answer);
             sleep(PAUSE).await;
             let unregister = [topic.into(), api.into()];
-            let answer = self.api.ask("unregisterSubscriber", &unregister).await;
-            self.heard.subscribes(topic, false);
+            let answer = self
+                .api
+                .timed_call("unregisterSubscriber", &unregister)
+                .await;
+            self.log.subscribes(topic, false);
             // The first call may have run although its answer was lost with the connection.
             let again = answer.again;
             if waits.add(answer) == Some(Value::Int(0)) && !again {

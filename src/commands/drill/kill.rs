@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     cli::Victim,
-    commands::{CommandFailure, say},
+    commands::{CommandFailure, eprint_line},
     process,
 };
 
@@ -38,7 +38,7 @@ impl Drill<'_> {
             let fifth = times.iter().rev().nth(DEATHS - 1);
             let pause = fifth.map(|then| DEATHS_WITHIN.saturating_sub(then.elapsed()));
             if let Some(pause) = pause.filter(|pause| !pause.is_zero()) {
-                say(&format!(
+                eprint_line(&format!(
                     "waiting {} s, because more deaths now would be a crash loop",
                     pause.as_secs()
                 ));
@@ -47,7 +47,7 @@ impl Drill<'_> {
             // Each kill replaces the processes, so they are looked up again.
             let victims = self.target.victims(kill).await?;
             let signal = if self.args.hang { "SIGSTOP" } else { "SIGKILL" };
-            say(&format!(
+            eprint_line(&format!(
                 "{number} of {}: {signal} to {}",
                 self.args.times,
                 names(&victims)
@@ -74,7 +74,7 @@ impl Drill<'_> {
                 recovered_ms,
             });
             if failed {
-                say("calls do not pass again: the drill stops");
+                eprint_line("calls do not pass again: the drill stops");
                 break;
             }
             sleep(AFTER).await;

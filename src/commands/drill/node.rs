@@ -133,7 +133,7 @@ pub(super) struct DrillNode {
     pub(super) name: String,
     /// The address that this node registers.
     pub(super) api: String,
-    pub(super) heard: Arc<NodeLog>,
+    pub(super) log: Arc<NodeLog>,
     server: tokio::task::JoinHandle<()>,
 }
 
@@ -150,12 +150,12 @@ impl DrillNode {
             host: ros_env::advertised_host(&env, &hostname, listener::local_address()),
             port: listener.local_addr()?.port(),
         };
-        let heard = Arc::new(NodeLog::default());
-        let server = crate::task::spawn(serve(listener, heard.clone()));
+        let log = Arc::new(NodeLog::default());
+        let server = crate::task::spawn(serve(listener, log.clone()));
         Ok(Self {
             name,
             api: api.to_string(),
-            heard,
+            log,
             server,
         })
     }
@@ -167,28 +167,28 @@ impl Drop for DrillNode {
     }
 }
 
-async fn serve(listener: TcpListener, heard: Arc<NodeLog>) {
+async fn serve(listener: TcpListener, log: Arc<NodeLog>) {
     loop {
         let Ok((stream, _)) = listener.accept().await else {
             tokio::task::yield_now().await;
             continue;
         };
-        let heard = heard.clone();
-        let service = service_fn(move |request| answer(heard.clone(), request));
+        let log = log.clone();
+        let service = service_fn(move |request| answer(log.clone(), request));
         // It does not matter if a caller closes the connection.
         crate::task::spawn(http1::Builder::new().serve_connection(TokioIo::new(stream), service));
     }
 }
 
 async fn answer(
-    heard: Arc<NodeLog>,
+    log: Arc<NodeLog>,
     request: Request<Incoming>,
 ) -> Result<Response<Full<Bytes>>, Infallible> {
     let body = Limited::new(request.into_body(), MAX_CALL).collect().await;
     let call = body
         .ok()
         .and_then(|body| xmlrpc::decode_call(&body.to_bytes()).ok());
-    let reply = match call.and_then(|call| heard.answer(call)) {
+    let reply = match call.and_then(|call| log.answer(call)) {
         Some(answer) => Reply::Value(Value::Array(answer.into())),
         None => Reply::Fault {
             code: 1,
@@ -210,26 +210,26 @@ mod tests {
     #[tokio::test]
     async fn the_node_answers_for_itself_and_keeps_its_notifications() {
         let node = DrillNode::start("/drill".to_owned()).await.unwrap();
-        node.heard.subscribes("/chatter", true);
+        node.log.subscribes("/chatter", true);
         let ask = async |call| {
             let limit = std::time::Duration::from_secs(60);
-            client::ask_for(&node.api, &call, limit).await.1
+            client::call_for_value(&node.api, &call, limit).await.1
         };
         let pid = i32::try_from(std::process::id()).unwrap();
         assert_eq!(ask(master::get_pid()).await, Some(pid.into()));
         let pairs = Value::Array(vec![vec!["/chatter", "*"].into()]);
         assert_eq!(ask(master::question("getSubscriptions")).await, Some(pairs));
         ask(master::param_update("/rosrescue_drill_1/", 7.into())).await;
-        assert_eq!(*node.heard.param.borrow(), 7);
+        assert_eq!(*node.log.param.borrow(), 7);
         ask(master::param_update("/robot/wheels/", 4.into())).await;
-        assert_eq!(node.heard.changed(), ["/robot/wheels".to_owned()].into());
-        assert_eq!(*node.heard.param.borrow(), 7);
+        assert_eq!(node.log.changed(), ["/robot/wheels".to_owned()].into());
+        assert_eq!(*node.log.param.borrow(), 7);
         let publishers = ["http://a:1/".to_owned()];
         ask(master::publisher_update("/chatter", &publishers)).await;
         let updates = [("/chatter".to_owned(), publishers.to_vec())];
-        assert_eq!(node.heard.updates(), updates);
+        assert_eq!(node.log.updates(), updates);
         ask(master::shutdown("/drill")).await;
-        assert!(node.heard.shutdown().is_some());
+        assert!(node.log.shutdown().is_some());
         assert_eq!(ask(master::question("getName")).await, None);
     }
 }

@@ -183,7 +183,7 @@ impl RobotState {
 
 /// The process id of the node at `api`, if it answers.
 async fn pid_at(api: &str) -> Option<i32> {
-    match client::ask_for(api, &master::get_pid(), NODE_LIMIT).await {
+    match client::call_for_value(api, &master::get_pid(), NODE_LIMIT).await {
         (Reaction::Alive, Some(pid)) => pid.as_int(),
         _ => None,
     }

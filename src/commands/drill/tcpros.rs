@@ -49,7 +49,7 @@ impl Link {
     }
 
     /// Waits for the next message, and returns its sequence number if it has one.
-    pub(super) async fn next(&mut self) -> io::Result<Option<u32>> {
+    pub(super) async fn next_message(&mut self) -> io::Result<Option<u32>> {
         let mut length = u64::from(self.stream.read_u32_le().await?);
         let mut number = None;
         if self.is_numbered && length >= 4 {

@@ -148,7 +148,7 @@ impl Topic {
     ) -> Result<Self, String> {
         let register = [topic.into(), "*".into(), node.api.as_str().into()];
         let publishers = api.call("registerSubscriber", &register).await?;
-        node.heard.subscribes(topic, true);
+        node.log.subscribes(topic, true);
         let publishers = publishers.as_array().unwrap_or_default();
         let mut links = Vec::new();
         for publisher in publishers.iter().filter_map(Value::as_str) {
@@ -239,7 +239,7 @@ impl Topic {
 
 /// Unregisters the subscriber of `topic`.
 pub(super) async fn unregister(api: &Api, node: &DrillNode, topic: &str) -> Result<(), String> {
-    node.heard.subscribes(topic, false);
+    node.log.subscribes(topic, false);
     let params = [topic.into(), node.api.as_str().into()];
     api.call("unregisterSubscriber", &params).await.map(drop)
 }
@@ -262,7 +262,7 @@ async fn connect(api: &Api, publisher: &str, topic: &str) -> Result<Link, String
 
 async fn read(mut link: Link, seen: Arc<Mutex<Seen>>) {
     loop {
-        match link.next().await {
+        match link.next_message().await {
             Ok(number) => lock(&seen).message(Instant::now(), number),
             Err(error) => {
                 lock(&seen).ended = Some(error.to_string());

@@ -87,8 +87,8 @@ impl DrillVerdict {
         if let Some(why) = shutdown {
             failures.push(format!("the drill's node was told to shut down: {why}"));
         }
-        failures.extend(some(difference.lost));
-        self.notes.extend(some(difference.new));
+        failures.extend(shorten(difference.lost));
+        self.notes.extend(shorten(difference.new));
         if self.topics.iter().all(|topic| topic.messages == 0) {
             self.notes.push(
                 "no topic carried messages: only calls, nodes and state were watched".to_owned(),
@@ -100,7 +100,7 @@ impl DrillVerdict {
 }
 
 /// Keeps the first sentences, and says how many more there are.
-fn some(mut all: Vec<String>) -> Vec<String> {
+fn shorten(mut all: Vec<String>) -> Vec<String> {
     let more = all.len().saturating_sub(MOST);
     all.truncate(MOST);
     if more > 0 {

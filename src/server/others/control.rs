@@ -113,7 +113,7 @@ impl Others {
         let now = now.map_err(|_| Closed("rosrescue is stopping"))?.clone();
         if let Standing::Follows { uri, term } = now {
             let uri = MasterUri::parse(&uri).map_err(|_| Closed(NO_ADDRESS))?;
-            let leader = self.peers.at(&uri);
+            let leader = self.peers.peer_at(&uri);
             // The request is sent only once, because after a failure the next leader would hand over too.
             let silent = || handed_over(Err("the leader does not answer".to_owned()));
             let answered = call.forward(&leader, term, self.hold).await;

@@ -42,7 +42,7 @@ impl MemberAddresses {
         self.lock().insert(name, addresses);
     }
 
-    pub(super) fn has(&self, address: IpAddr) -> bool {
+    pub(super) fn contains(&self, address: IpAddr) -> bool {
         let address = address.to_canonical();
         self.lock().values().flatten().any(|of| *of == address)
     }
@@ -55,7 +55,7 @@ mod tests {
     #[test]
     fn only_the_present_addresses_of_members_count() {
         let members = MemberAddresses::default();
-        let has = |address: &str| members.has(address.parse().unwrap());
+        let has = |address: &str| members.contains(address.parse().unwrap());
         members.set_address("pc-1", Some("http://10.0.0.1:11311/"));
         members.set_address("pc-2", Some("http://[fd00::2]:11311/"));
         assert!(has("10.0.0.1") && has("::ffff:10.0.0.1") && has("fd00::2"));

@@ -164,7 +164,7 @@ async fn watch_for_changes(server: Arc<Server>) {
     let pages = &server.pages;
     let mut gate = pages.gate.clone();
     let mut last = LastCheck::default();
-    let mut shut = gate.look();
+    let mut shut = gate.observe();
     loop {
         let asked = server.clone();
         let look = move || {
@@ -189,7 +189,7 @@ async fn watch_for_changes(server: Arc<Server>) {
                 let _ = tokio::time::timeout(PAUSE - SHORT_PAUSE, gate.changed()).await;
             } => {}
         }
-        shut = gate.look();
+        shut = gate.observe();
         if pages.state.feed.latest.receiver_count() == 0 {
             pages.state.feed.running.store(false, Ordering::Release);
             // A listener may have been added just before.

@@ -8,7 +8,7 @@ use rescue_core::{
     checkpoint::{
         compare::What,
         format,
-        log::{Entry, LogReader},
+        log::{LogEntry, LogReader},
     },
     replay::Token,
 };
@@ -102,7 +102,7 @@ fn read(path: &Path, since: u64, mut reader: LogReader) -> std::io::Result<Histo
         // A damaged file leaves a gap.
         let _ = reader.read(text);
     }
-    let mut nodes = events(&reader.take());
+    let mut nodes = events(&reader.take_entries());
     nodes.retain(|event| event.at >= since as f64 / 1e3);
     let left_out = nodes.len().saturating_sub(EVENTS);
     let nodes: Vec<_> = nodes.split_off(left_out);
@@ -118,7 +118,7 @@ fn read(path: &Path, since: u64, mut reader: LogReader) -> std::io::Result<Histo
 }
 
 /// The events in `entries`, which are the complete log of a time, oldest first.
-fn events(entries: &[Entry]) -> Vec<NodeEvent> {
+fn events(entries: &[LogEntry]) -> Vec<NodeEvent> {
     // Nodes that were registered before.
     let mut gone = BTreeSet::new();
     let mut events = Vec::new();
@@ -152,8 +152,8 @@ mod tests {
     use super::*;
     use rescue_core::checkpoint::compare::Difference;
 
-    fn entry(at: u64, from: &str, [a, b]: [Option<&str>; 2]) -> Entry {
-        Entry {
+    fn entry(at: u64, from: &str, [a, b]: [Option<&str>; 2]) -> LogEntry {
+        LogEntry {
             seq: at,
             at: 1000 * at,
             caller: Some("/a".to_owned()),

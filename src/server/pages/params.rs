@@ -77,7 +77,7 @@ fn list(namespace: &Struct, name: &str, hide: &Hide, room: &mut usize) -> Member
                     ..ParamEntry::named((*part).clone(), "namespace")
                 }
             }
-            value => ParamEntry::of((*part).clone(), &name, value, hide),
+            value => ParamEntry::new((*part).clone(), &name, value, hide),
         }
     });
     Members {
@@ -116,7 +116,7 @@ fn collect(namespace: &Struct, above: &str, text: &str, hide: &Hide, found: &mut
             _ if found.members.len() == FOUND => found.more += 1,
             value => found
                 .members
-                .push(ParamEntry::of(name.clone(), &name, value, hide)),
+                .push(ParamEntry::new(name.clone(), &name, value, hide)),
         }
     }
 }
@@ -135,7 +135,7 @@ impl ParamEntry {
     }
 
     /// Makes the entry of a parameter. `name` is the name to show, `full` the parameter's full name.
-    fn of(name: String, full: &str, value: &Value, hide: &Hide) -> Self {
+    fn new(name: String, full: &str, value: &Value, hide: &Hide) -> Self {
         let kind = match value {
             Value::Nil => "none",
             Value::Bool(_) => "bool",

@@ -110,7 +110,7 @@ fn answer(
             .collect(),
     };
     Ok(asked.answer(state.params(), &pages.hide, |params| {
-        let robot = Robot::of(state.snapshot());
+        let robot = Robot::from_snapshot(state.snapshot());
         WholeState::new(found.moment.seq, robot, params, Some(past))
     }))
 }

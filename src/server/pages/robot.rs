@@ -68,7 +68,7 @@ impl Robot {
             let pids: BTreeMap<String, i32> = pids.collect();
             (mirror.snapshot(), pids)
         });
-        let mut robot = Self::of(snapshot);
+        let mut robot = Self::from_snapshot(snapshot);
         for node in &mut robot.nodes {
             node.pid = pids.get(&node.name).copied();
             if let Some(life) = lives.get(&node.name) {
@@ -94,8 +94,8 @@ impl Robot {
         robot
     }
 
-    /// The content of a snapshot, without the [`Token`](rescue_core::replay::Token) by which rosrescue recognises a master.
-    pub(super) fn of(snapshot: Snapshot) -> Self {
+    /// The content of a snapshot, without the [`Token`] by which rosrescue recognises a master.
+    pub(super) fn from_snapshot(snapshot: Snapshot) -> Self {
         let mut nodes: BTreeMap<String, NodeRow> = BTreeMap::new();
         for (name, node) in snapshot.nodes {
             if !Token::is_ours(&name) {
@@ -204,7 +204,7 @@ mod tests {
         master.apply(&Request::new(Method::RegisterService, service));
         let subscription = ["/viewer", "/image", "*", "http://robot:3/"];
         master.apply(&Request::new(Method::RegisterSubscriber, subscription));
-        let robot = Robot::of(master.snapshot());
+        let robot = Robot::from_snapshot(master.snapshot());
         let shown = serde_json::to_value(&robot).unwrap();
         let expected = serde_json::json!({
             "nodes": [
@@ -225,6 +225,6 @@ mod tests {
             Method::UnregisterSubscriber,
             ["/viewer", "/image", "http://robot:3/"],
         ));
-        assert_ne!(Robot::of(master.snapshot()).digest(), before);
+        assert_ne!(Robot::from_snapshot(master.snapshot()).digest(), before);
     }
 }

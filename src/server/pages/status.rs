@@ -49,7 +49,7 @@ impl Rate {
     }
 
     /// The rate at `now`, when `calls` is the total number of calls.
-    fn at(&self, now: Instant, calls: u64) -> f64 {
+    fn rate_at(&self, now: Instant, calls: u64) -> f64 {
         let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let seconds = now.saturating_duration_since(last.at).as_secs_f64();
         if seconds >= SAMPLE {
@@ -69,7 +69,7 @@ impl Pages {
         let counters = self.stats.list().into_iter();
         let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
         let gate = self.gate.state();
-        let gate_since = self.gate.since().into_std();
+        let gate_since = self.gate.opened_or_shut_at().into_std();
         let stands_in = matches!(gate, State::StandingIn | State::Late | State::Injecting);
         let facts = self.board.read();
         let unprotected = self.ledger.unprotected();
@@ -101,7 +101,7 @@ impl Pages {
             bypassing: facts.bypassing.clone(),
             master_is_open: facts.master_is_open,
             open: gate.is_open(),
-            ready: facts.answers(gate),
+            ready: facts.answers_calls(gate),
             elsewhere: gate == State::Elsewhere,
             standing_in_since: stands_in.then(|| clock::wall_time_of(gate_since)),
             pending_writes: self.ledger.pending(),
@@ -120,7 +120,7 @@ impl Pages {
             rescues: facts.rescues,
             last_rescues: rescues.cloned().collect(),
             late_answers: facts.late_answers.clone(),
-            calls_per_second: self.rate.at(Instant::now(), self.stats.calls.value()),
+            calls_per_second: self.rate.rate_at(Instant::now(), self.stats.calls.value()),
             slowest_callers: self.clients.slowest(SLOWEST),
             clients: self.clients.list(),
             counters: counters.collect(),
@@ -185,7 +185,7 @@ mod tests {
     fn calls_a_second_are_counted_between_two_that_ask() {
         let start = Instant::now();
         let rate = Rate::new(start);
-        let at = |ms, calls| rate.at(start + Duration::from_millis(ms), calls);
+        let at = |ms, calls| rate.rate_at(start + Duration::from_millis(ms), calls);
         assert_eq!(at(100, 50), 0.0, "too early to say");
         assert_eq!(at(2_000, 100), 50.0);
         assert_eq!(at(2_500, 900), 50.0, "what was said last");

@@ -14,7 +14,7 @@ use crate::computer::{NAMES, PORT};
 use crate::fleet::Fleet;
 use crate::network::{COUNT, enter};
 use crate::support::links::Dice;
-use crate::support::{Client, Finish, Heard, State, eventually, params, request};
+use crate::support::{Client, Finish, ReceivedCall, State, eventually, params, request};
 use crate::traffic::{Named, TYPE};
 
 /// Pause between two calls of a client.
@@ -188,7 +188,7 @@ impl Clients {
             let mut updates = node.it().calls();
             updates.retain(|call| call.method == "paramUpdate");
             self.shared.keys().into_iter().map(move |key| {
-                let of_key = |update: &&Heard| {
+                let of_key = |update: &&ReceivedCall| {
                     let name = update.params[1].as_str().unwrap_or_default();
                     name.trim_end_matches('/') == key
                 };
@@ -239,7 +239,7 @@ impl Clients {
                     node.name
                 ));
             }
-            let calls = node.heard("shutdown");
+            let calls = node.received("shutdown");
             if !calls.is_empty() {
                 wrong.push(format!("{} is told to end: {calls:?}", node.name));
             }
@@ -390,8 +390,8 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
 }
 
 /// When and by whom a subscriber was notified, as in `2026-11-26T07:03:01.250Z by rosrescue at 10.77.0.1: Int(7)`.
-fn trail<'a>(updates: impl Iterator<Item = &'a &'a Heard>) -> String {
-    let line = |update: &&Heard| {
+fn trail<'a>(updates: impl Iterator<Item = &'a &'a ReceivedCall>) -> String {
+    let line = |update: &&ReceivedCall| {
         let at = rosrescue::clock::wall_text_millis(update.at);
         let by = if update.from_rosrescue {
             "rosrescue"

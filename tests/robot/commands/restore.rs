@@ -58,7 +58,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert_eq!(client.param("/extra"), Some(true.into()));
     assert_eq!(client.param("/run_id"), run_id);
     eventually("the watcher is notified", || {
-        let heard = watcher.heard("paramUpdate");
+        let heard = watcher.received("paramUpdate");
         heard
             .iter()
             .any(|update| update[1..] == params!["/gains/i/", 2])

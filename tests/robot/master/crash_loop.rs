@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use ros1_master::xmlrpc::Value;
 
 use crate::support::{
-    Failing, FakeNode, Heard, State, eventually, holds, page, params, status, tree, unreadable,
-    within,
+    Failing, FakeNode, ReceivedCall, State, eventually, holds, page, params, status, tree,
+    unreadable, within,
 };
 
 /// Maximum time for a call on a busy computer.
@@ -103,25 +103,25 @@ impl Robot {
     }
 
     /// Number of calls that each node has received, once all pending notifications have been sent.
-    fn heard(&self) -> Vec<usize> {
-        let heard = || {
+    fn questions(&self) -> Vec<usize> {
+        let counts = || {
             let nodes = self.nodes.iter();
             nodes.map(|node| node.calls().len()).collect::<Vec<_>>()
         };
         eventually("all pending notifications have been sent", || {
-            let before = heard();
-            holds(Duration::from_millis(500), || heard() == before)
+            let before = counts();
+            holds(Duration::from_millis(500), || counts() == before)
         });
-        heard()
+        counts()
     }
 
-    /// Panics if a master has called a node after its first `heard` calls, or if rosrescue has sent a node anything but
+    /// Panics if a master has called a node after its first `counts` calls, or if rosrescue has sent a node anything but
     /// the present state, which has not changed.
     #[track_caller]
-    fn assert_no_node_disturbed(&self, heard: &[usize]) {
-        for (node, heard) in self.nodes.iter().zip(heard) {
+    fn assert_no_node_disturbed(&self, counts: &[usize]) {
+        for (node, counts) in self.nodes.iter().zip(counts) {
             let calls = node.calls();
-            let (before, since) = calls.split_at(*heard);
+            let (before, since) = calls.split_at(*counts);
             let told: Vec<_> = since.iter().filter(|call| !is_question(call)).collect();
             assert!(told.iter().all(|call| call.from_rosrescue), "{told:?}");
             for call in told {
@@ -136,7 +136,7 @@ impl Robot {
 }
 
 /// Whether the call belongs to the health check.
-fn is_question(call: &Heard) -> bool {
+fn is_question(call: &ReceivedCall) -> bool {
     ["getPid", "getPublications", "getSubscriptions"].contains(&call.method.as_str())
 }
 
@@ -235,14 +235,14 @@ fn a_record_that_kills_masters_causes_no_outage() {
     for name in ["/robot/arm/gain", "/topic0"] {
         let robot = Robot::new(&[]);
         let client = robot.client();
-        let heard = robot.heard();
+        let questions = robot.questions();
         robot.fail_with(&format!("name {name}"));
         robot.await_crash_loop(true);
         let away = |state: &State| state.assert_same(&State::read(&client), "in the mirror");
         away(&robot.before);
         client.set_param("/while/it/dies", 1);
         client.ok("deleteParam", params!["/test", "/while"]);
-        robot.assert_no_node_disturbed(&heard);
+        robot.assert_no_node_disturbed(&questions);
         let after = match name {
             "/topic0" => {
                 robot.nodes[0].unpublish(&client, name);
@@ -262,7 +262,7 @@ fn a_record_that_kills_masters_causes_no_outage() {
             robot
                 .nodes
                 .iter()
-                .all(|node| node.heard("shutdown").is_empty())
+                .all(|node| node.received("shutdown").is_empty())
         );
     }
 }

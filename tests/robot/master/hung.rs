@@ -175,7 +175,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
         told(&node, "/standing").contains(&(4, false))
     });
     for node in [&node, &watcher, &coming] {
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+        assert_eq!(node.received("shutdown"), Vec::<Vec<Value>>::new());
     }
 }
 
@@ -254,7 +254,7 @@ fn ten_hangs_under_writes_lose_nothing() {
     }
     let state = robot.state();
     state.assert_same(&State::read(&client), "through rosrescue");
-    assert_eq!(watcher.heard("shutdown"), Vec::<Vec<Value>>::new());
+    assert_eq!(watcher.received("shutdown"), Vec::<Vec<Value>>::new());
 }
 
 /// The call is under way in the master when the master hangs, and the mirror answers the call. If the hung master dies,

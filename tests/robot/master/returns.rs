@@ -66,7 +66,7 @@ fn a_service_unregistered_during_a_hang_stays_unregistered_if_rosrescue_is_kille
         });
         assert_eq!(robot.master_pid(), pid, "the same master stays in use");
         assert_eq!(robot.bare().param("/set"), Some(Value::Int(7)));
-        assert_eq!(staying.heard("shutdown"), Vec::<Vec<Value>>::new());
+        assert_eq!(staying.received("shutdown"), Vec::<Vec<Value>>::new());
     }
 }
 
@@ -170,7 +170,7 @@ fn the_old_state_of_a_superseded_master_is_not_adopted() {
         wanted.assert_same(&State::read(&client), "after all");
     }
     for node in [&staying, &coming] {
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+        assert_eq!(node.received("shutdown"), Vec::<Vec<Value>>::new());
         // Each list contains the publisher that stays.
         let updates = node.updates("/topic");
         assert!(
@@ -218,7 +218,7 @@ fn writes_that_bypassed_rosrescue_are_found_and_kept() {
     settles(&bare, &rescue, |state| {
         is("/both", 4) && is("/newer", 4) && state.knows("/past_us")
     });
-    assert_eq!(past_us.heard("shutdown"), Vec::<Vec<Value>>::new());
+    assert_eq!(past_us.received("shutdown"), Vec::<Vec<Value>>::new());
 }
 
 /// Number of rounds of the random test. `ROSRESCUE_RETURNS` changes it.
@@ -305,6 +305,9 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
     }
     println!("{} rounds, {:?}", rounds(), start.elapsed());
     assert_eq!(status(&client)["counters"]["divergences"], 0);
-    let shut_down = nodes.iter().flat_map(|node| node.heard("shutdown")).count();
+    let shut_down = nodes
+        .iter()
+        .flat_map(|node| node.received("shutdown"))
+        .count();
     assert_eq!(shut_down, 0);
 }

@@ -71,7 +71,7 @@ fn calls_during_an_outage_are_answered_so_that_nodes_keep_working() {
 
 /// The values of a parameter in a node's notifications, in order.
 fn told(node: &FakeNode, key: &str) -> Vec<i32> {
-    let updates = node.heard("paramUpdate").into_iter();
+    let updates = node.received("paramUpdate").into_iter();
     let of_key = updates.filter(|update| update[1].as_str() == Some(&format!("{key}/")));
     of_key.map(|update| update[2].as_int().unwrap()).collect()
 }

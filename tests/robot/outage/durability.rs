@@ -186,9 +186,9 @@ fn an_unsubscription_under_way_in_a_hung_master_takes_effect_when_it_continues()
     signal(pid, Signal::CONT);
     eventually("the gate is open", || robot.is_open());
     assert_eq!(robot.master_pid(), pid);
-    let told = node.heard("paramUpdate").len();
+    let told = node.received("paramUpdate").len();
     client.set_param("/key", 1);
-    let quiet = || node.heard("paramUpdate").len() == told;
+    let quiet = || node.received("paramUpdate").len() == told;
     assert!(holds(Duration::from_millis(500), quiet));
     assert_eq!(robot.state().publishers_of("/topic"), ["/node"]);
     assert_eq!(status(&client)["counters"]["divergences"], 0);
@@ -208,7 +208,7 @@ fn a_new_registration_is_not_removed_because_of_an_older_report_of_the_node() {
     }
     let subscriber = FakeNode::start("/subscriber");
     subscriber.subscribe(&client, "/topic", "std_msgs/String");
-    let asked = |method: &str| node.heard(method).len();
+    let asked = |method: &str| node.received(method).len();
     eventually("the node has been asked after it registered", || {
         asked("getPid") == 1
     });

@@ -64,11 +64,11 @@ fn a_core_answers_at_once_and_gives_its_master_all_writes_later() {
         eventually("the parameter's subscriber is notified", || {
             // The node gets the value twice if another node had not answered yet, because then rosrescue notifies nodes
             // too.
-            let heard = publisher.heard("paramUpdate");
+            let heard = publisher.received("paramUpdate");
             heard.last().is_some_and(|update| update[2] == 2.5.into())
         });
-        assert!(publisher.heard("shutdown").is_empty());
-        assert!(subscriber.heard("shutdown").is_empty());
+        assert!(publisher.received("shutdown").is_empty());
+        assert!(subscriber.received("shutdown").is_empty());
     }
 }
 

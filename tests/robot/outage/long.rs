@@ -102,7 +102,7 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     during.assert_whole(&robot);
     // A health check, or wrong notifications by a new master, would happen within seconds.
     assert!(holds(Duration::from_secs(5), || witness
-        .heard("shutdown")
+        .received("shutdown")
         .is_empty()));
     mirror.assert_same(&robot.state(), "some seconds later");
     before.assert_whole(&robot);

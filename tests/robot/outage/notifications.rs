@@ -78,12 +78,12 @@ fn a_subscriber_of_a_parameter_is_told_values_in_order_and_the_last_one() {
     // The second node gets two updates for the last two states, and perhaps each twice.
     for (node, twice) in [(exact, last), (above, last - 1)] {
         eventually("the last value arrives", || {
-            let heard = node.heard("paramUpdate");
+            let heard = node.received("paramUpdate");
             heard.last().is_some_and(|it| states[last].contains(it))
         });
         // A value may be left out if there is a newer one.
         let mut at = 0;
-        for heard in node.heard("paramUpdate") {
+        for heard in node.received("paramUpdate") {
             let found = states.iter().position(|updates| updates.contains(&heard));
             let position = found.unwrap_or_else(|| panic!("{heard:?} was never set"));
             assert!(

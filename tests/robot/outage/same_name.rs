@@ -124,7 +124,7 @@ fn other_node_at(robot: &Robot, port: u16, is_registered: bool) -> FakeNode {
 fn assert_unharmed(other: &FakeNode) {
     assert!(
         holds(Duration::from_secs(3), || other
-            .heard("shutdown")
+            .received("shutdown")
             .is_empty()),
         "{:?}",
         other.calls()
@@ -172,7 +172,7 @@ fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
         robot.rescue.wait_serving();
         assert_eq!(robot.master_pid(), master);
     }
-    let heard = || nodes.each_ref().map(|node| node.heard("shutdown"));
+    let heard = || nodes.each_ref().map(|node| node.received("shutdown"));
     let none = Vec::<Vec<Value>>::new;
     let wanted = [
         vec![goodbye("/twin")],
@@ -209,12 +209,12 @@ fn a_node_displaced_during_an_outage_is_told_exactly_once() {
     let second = FakeNode::start("/twin");
     second.publish(&client, "/chatter", "std_msgs/String");
     eventually("the first node is told to shut down", || {
-        !first.heard("shutdown").is_empty()
+        !first.received("shutdown").is_empty()
     });
     robot.revive_master();
     robot.await_recovery(dead);
     assert!(holds(Duration::from_secs(3), || {
-        first.heard("shutdown") == [goodbye("/twin")] && second.heard("shutdown").is_empty()
+        first.received("shutdown") == [goodbye("/twin")] && second.received("shutdown").is_empty()
     }));
     let api = robot.bare().ok("lookupNode", params!["/test", "/twin"]);
     assert_eq!(api, Value::from(second.api.as_str()));

@@ -7,7 +7,7 @@ use std::thread;
 use ros1_master::xmlrpc::Value;
 
 use crate::support::{
-    FakeNode, Heard, Library, Mode, Node, Robot, eventually, in_both_modes, status,
+    FakeNode, Library, Mode, Node, ReceivedCall, Robot, eventually, in_both_modes, status,
 };
 
 const TOPIC: &str = "/chatter";
@@ -51,7 +51,7 @@ impl Audience {
 }
 
 /// The lists of publishers in `calls`, and whether each came from rosrescue.
-fn lists(calls: &[Heard]) -> Vec<(Vec<&str>, bool)> {
+fn lists(calls: &[ReceivedCall]) -> Vec<(Vec<&str>, bool)> {
     let updates = calls.iter().filter(|call| call.method == "publisherUpdate");
     let lists = updates.map(|call| {
         let uris = call.params[2].as_array().unwrap().iter();
@@ -162,7 +162,7 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
     println!("{once} fake nodes were notified without a repeat");
     let nodes = audience.fakes.iter().chain(&there).chain(&gone);
     for node in nodes {
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+        assert_eq!(node.received("shutdown"), Vec::<Vec<Value>>::new());
     }
     drop(audience);
     robot.kill_master();

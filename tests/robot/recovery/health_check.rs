@@ -62,7 +62,7 @@ fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mod
         names(&report["removed"]) == ["/dead"]
     });
     for node in [&living, &subscriber] {
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+        assert_eq!(node.received("shutdown"), Vec::<Vec<_>>::new());
     }
 }
 
@@ -81,7 +81,7 @@ fn another_process_at_the_port_counts_as_another_node() {
     });
     for node in [&old, &same] {
         eventually("the node is asked for its process id", || {
-            !node.heard("getPid").is_empty()
+            !node.received("getPid").is_empty()
         });
     }
     let after = robot.settled_state().without_node("/old");
@@ -93,8 +93,8 @@ fn another_process_at_the_port_counts_as_another_node() {
     report(&robot, "the removed node", |report| {
         names(&report["removed"]) == ["/old"]
     });
-    assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
-    assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(taker.received("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(same.received("shutdown"), Vec::<Vec<_>>::new());
 }
 
 /// Some client libraries report invented process ids.
@@ -107,7 +107,7 @@ fn matching_topics_count_for_more_than_a_changed_process_id() {
     node.publish(&client, "/topic", "std_msgs/String");
     node.offer(&client, "/service");
     eventually("the node is asked for its process id", || {
-        !node.heard("getPid").is_empty()
+        !node.received("getPid").is_empty()
     });
     let before = robot.settled_state();
     for _ in 0..2 {
@@ -158,8 +158,8 @@ fn different_topics_at_the_port_count_as_another_node() {
     let after = robot.settled_state().without_node("/old");
     robot.crash_master();
     robot.await_state(&after, "after the old node was unregistered");
-    assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
-    assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(taker.received("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(same.received("shutdown"), Vec::<Vec<_>>::new());
 }
 
 /// Ends `node` and starts another node at its port.
@@ -196,7 +196,7 @@ fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again() {
         silent.updates("/topic").last() == Some(&vec![late.api.clone()])
     });
     eventually("the node knows the parameter", || {
-        let told = silent.heard("paramUpdate");
+        let told = silent.received("paramUpdate");
         told.last().is_some_and(|told| told[2] == 2.into())
     });
 }

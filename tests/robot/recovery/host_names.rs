@@ -83,7 +83,7 @@ fn host_names_that_resolve_slowly_delay_no_other_node() {
                 .is_some_and(|list| list.len() == 2)
         });
     });
-    assert_eq!(living.heard("shutdown").len(), 0);
+    assert_eq!(living.received("shutdown").len(), 0);
     // Stopping does not wait for a name server either.
     let mut rescue = rescue;
     within(Duration::from_secs(5), "a stop", || rescue.terminate());
@@ -137,7 +137,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
         unreachable.len() == COUNT - 1 && !unreachable.contains(&found.name)
     });
     for node in unresolvable.iter().chain([&living]) {
-        assert_eq!(node.heard("shutdown").len(), 0);
+        assert_eq!(node.received("shutdown").len(), 0);
     }
 }
 
@@ -193,5 +193,5 @@ fn a_node_is_found_again_when_its_host_name_gets_another_address() {
         third.updates("/chatter").last() == Some(&all)
     });
     assert!(kept());
-    assert!(holds(SOON, || third.heard("shutdown").is_empty()));
+    assert!(holds(SOON, || third.received("shutdown").is_empty()));
 }

@@ -24,7 +24,7 @@ fn rounds(mode: Mode, usual: usize) -> usize {
 #[track_caller]
 fn assert_not_shut_down(node: &FakeNode, round: usize) {
     assert_eq!(
-        node.heard("shutdown"),
+        node.received("shutdown"),
         Vec::<Vec<Value>>::new(),
         "{} in round {round}",
         node.name
@@ -44,11 +44,11 @@ impl Witness {
 
     #[track_caller]
     fn hear(&self, client: &Client) {
-        let before = self.0.heard("paramUpdate").len();
+        let before = self.0.received("paramUpdate").len();
         let number = i32::try_from(before).unwrap() + 1_000_000;
         client.set_param("/round", number);
         eventually("the master notifies the witness", || {
-            let heard = self.0.heard("paramUpdate");
+            let heard = self.0.received("paramUpdate");
             heard.iter().any(|told| told[2] == Value::Int(number))
         });
     }
@@ -57,7 +57,7 @@ impl Witness {
 /// Checks for a while that no node is shut down, because the master makes its calls in other threads.
 #[track_caller]
 fn assert_none_shut_down(nodes: &[FakeNode]) {
-    let spared = |node: &FakeNode| node.heard("shutdown").is_empty();
+    let spared = |node: &FakeNode| node.received("shutdown").is_empty();
     let all = holds(Duration::from_secs(2), || nodes.iter().all(spared));
     let shut_down = nodes.iter().filter(|node| !spared(node));
     let names: Vec<_> = shut_down.map(|node| node.name.as_str()).collect();
@@ -116,7 +116,7 @@ fn a_node_restarted_during_an_outage_is_not_shut_down(mode: Mode) {
         assert_eq!(api_of(&robot, &node.name), Some(api), "round {round}");
         if let Some(old) = old {
             eventually("the old node is told to shut down", || {
-                old.heard("shutdown").len() == 1
+                old.received("shutdown").len() == 1
             });
         }
         let state = robot.state();

@@ -115,7 +115,7 @@ fn reap_local_never_lets_the_master_shut_down_an_innocent_node(mode: Mode) {
     let robot = Robot::start_with(mode, &["--reap", "local"]);
     let innocent = with_taken_port(&robot);
     let _again = start_again(&robot);
-    assert!(holds(A_WHILE, || innocent.heard("shutdown").is_empty()));
+    assert!(holds(A_WHILE, || innocent.received("shutdown").is_empty()));
     let state = robot.settled_state();
     assert_eq!(state.publishers_of("/topic"), ["/innocent", "/killed"]);
     assert_eq!(robot.counter("shutdowns_prevented"), 1);
@@ -135,7 +135,7 @@ fn a_program_that_has_not_registered_is_not_shut_down_either() {
     let innocent = FakeNode::start_at("/innocent", port);
     let again = FakeNode::start("/talker");
     again.publish(&robot.client(), "/topic", "std_msgs/String");
-    assert!(holds(A_WHILE, || innocent.heard("shutdown").is_empty()));
+    assert!(holds(A_WHILE, || innocent.received("shutdown").is_empty()));
     assert!(robot.settled_state().publishers_of("/topic") == ["/talker"]);
 }
 
@@ -145,7 +145,7 @@ fn by_default_a_shutdown_of_the_wrong_node_is_reported() {
     let innocent = with_taken_port(&robot);
     let _again = start_again(&robot);
     eventually("the master shuts down the wrong node", || {
-        innocent.heard("shutdown").len() == 1
+        innocent.received("shutdown").len() == 1
     });
     eventually("the log reports the shutdown", || {
         has_logged(
@@ -178,7 +178,7 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
         if let Some(last) = last.replace(program) {
             // This is an ordinary displacement, as with a bare master.
             eventually("the displaced program is told to shut down", || {
-                last.heard("shutdown").len() == 1
+                last.received("shutdown").len() == 1
             });
         }
         let feuds = robot.status().unwrap_or_default()["feuds"].clone();

@@ -50,7 +50,7 @@ fn subscribers_hear_of_a_change_although_master_and_rosrescue_die() {
         eventually(
             &format!("all subscribers know the parameter, point {point}"),
             || {
-                let mut told = fakes.iter().map(|fake| fake.heard("paramUpdate"));
+                let mut told = fakes.iter().map(|fake| fake.received("paramUpdate"));
                 told.all(|told| told.last().is_some_and(|told| told[2] == point.into()))
             },
         );
@@ -89,7 +89,7 @@ fn subscribers_hear_of_a_parameter_although_the_master_dies_at_any_callback() {
             &format!("all subscribers know the parameter, point {point}"),
             || {
                 let told = fakes.iter().all(|fake| {
-                    let heard = fake.heard("paramUpdate");
+                    let heard = fake.received("paramUpdate");
                     heard.last().is_some_and(|told| {
                         told[1] == Value::from("/gain/") && told[2] == Value::Int(point)
                     })

@@ -98,7 +98,7 @@ fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
     robot.crash_master();
     state.assert_same(&robot.settled_state(), "after everything was killed");
     assert!(innocent.exited().is_none());
-    assert_eq!(watcher.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(watcher.received("shutdown"), Vec::<Vec<_>>::new());
     assert_eq!(robot.counter("divergences"), 0);
 }
 
@@ -141,7 +141,7 @@ fn a_living_node_stays_when_another_name_at_its_address_moves() {
                 client.ok("registerPublisher", params);
             }
         }
-        assert!(holds(A_WHILE, || victim.heard("shutdown").is_empty()));
+        assert!(holds(A_WHILE, || victim.received("shutdown").is_empty()));
         let state = robot.settled_state();
         assert_eq!(state.publishers_of("/topic"), ["/victim"], "{reap}");
         assert_eq!(robot.counter("shutdowns_misdirected"), 0);

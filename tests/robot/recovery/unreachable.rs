@@ -67,7 +67,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     for value in 1..=3 {
         client.set_param("/gain", value);
         eventually("the node is notified of the parameter", || {
-            let told = node.heard("paramUpdate");
+            let told = node.received("paramUpdate");
             told.iter().any(|told| told[2] == value.into())
         });
         let publisher = FakeNode::start(&format!("/publisher{value}"));

@@ -151,7 +151,7 @@ fn a_killed_worker_costs_no_connection_and_no_state() {
     );
     assert_eq!(process_of(&scratch, "rosout/rosout"), rosout);
     before.assert_same(&State::read(&client), "after five deaths");
-    assert_eq!(node.heard("publisherUpdate").len(), 0);
+    assert_eq!(node.received("publisherUpdate").len(), 0);
     let said = rescue.stderr().join("\n");
     assert_eq!(said.matches("the worker has ended").count(), 5, "{said}");
 }

@@ -71,7 +71,7 @@ fn assert_goes_on(rescue: &Rescue, bare: &Client, pid: u32, wanted: &State, node
     wanted.assert_same(&State::read(&client), "through rosrescue");
     let moved = nodes.moved.as_ref().unwrap();
     for node in [&nodes.staying, moved] {
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+        assert_eq!(node.received("shutdown"), Vec::<Vec<Value>>::new());
     }
 }
 

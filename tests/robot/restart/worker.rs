@@ -29,7 +29,7 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
     listener.wait_messages("/talker", 5);
     let before = robot.settled_state();
     let master = robot.master_pid();
-    let updates = node.heard("publisherUpdate").len();
+    let updates = node.received("publisherUpdate").len();
 
     robot.rescue.kill();
     robot.rescue.start_again();
@@ -42,7 +42,7 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
     );
     before.assert_same(&robot.state(), "after rosrescue's own restart");
     assert_eq!(
-        node.heard("publisherUpdate").len(),
+        node.received("publisherUpdate").len(),
         updates,
         "the living master was injected"
     );
@@ -52,11 +52,11 @@ fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
     before.assert_same(&robot.state(), "after the master's crash that followed");
     client.set_param("/watched", 2);
     eventually("the parameter's subscriber is notified", || {
-        node.heard("paramUpdate")
+        node.received("paramUpdate")
             .last()
             .is_some_and(|call| call[2] == Value::Int(2))
     });
-    assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(node.received("shutdown"), Vec::<Vec<_>>::new());
     listener.wait_messages("/talker", 5);
     listener.assert_no_message_lost("/talker");
     talker.assert_no_link_lost();
@@ -108,12 +108,12 @@ fn nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master(mode: 
     robot.rescue.start_again();
     eventually("the listener knows the talker and the value", || {
         let updates = listener.updates("/topic");
-        let values = listener.heard("paramUpdate");
+        let values = listener.received("paramUpdate");
         let value = values.last().map(|params| &params[2]);
         updates.last() == Some(&vec![talker.api.clone()]) && value == Some(&2.into())
     });
     assert!(!robot.is_open(), "there is a master");
-    assert!(listener.heard("shutdown").is_empty());
+    assert!(listener.received("shutdown").is_empty());
     robot.revive_master();
     robot.await_gate();
     assert_eq!(robot.state().publishers_of("/topic"), ["/talker"]);

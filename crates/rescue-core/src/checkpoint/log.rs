@@ -108,7 +108,7 @@ pub fn moment(text: &[u8], time: u64) -> Result<Option<Moment>, String> {
 
 /// A line of the log.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Entry {
+pub struct LogEntry {
     /// Number of the record, or of the last record before a change that has none.
     pub seq: u64,
     /// Wall clock time in milliseconds since 1970. 0 if it is unknown.
@@ -129,7 +129,7 @@ pub struct LogReader {
     hide: Hide,
     state: Option<(Master, Session)>,
     seq: u64,
-    entries: Vec<Entry>,
+    entries: Vec<LogEntry>,
 }
 
 impl LogReader {
@@ -149,7 +149,7 @@ impl LogReader {
     }
 
     /// Takes the entries that were read since the last call.
-    pub fn take(&mut self) -> Vec<Entry> {
+    pub fn take_entries(&mut self) -> Vec<LogEntry> {
         std::mem::take(&mut self.entries)
     }
 
@@ -190,7 +190,7 @@ impl LogReader {
             self.session(at, &before, &session);
             if old != state {
                 for change in compare(&old, &state, &self.hide) {
-                    self.entries.push(Entry {
+                    self.entries.push(LogEntry {
                         change: Some(change),
                         ..self.entry(at)
                     });
@@ -224,7 +224,7 @@ impl LogReader {
             return;
         }
         for change in changes(state, call, &self.hide) {
-            self.entries.push(Entry {
+            self.entries.push(LogEntry {
                 caller: call.caller().map(str::to_owned),
                 from: match label.origin {
                     Origin::Unknown => None,
@@ -264,15 +264,15 @@ impl LogReader {
             events.push("rosrescue was stopped".to_owned());
         }
         for event in events {
-            self.entries.push(Entry {
+            self.entries.push(LogEntry {
                 event: Some(event),
                 ..self.entry(at)
             });
         }
     }
 
-    fn entry(&self, at: u64) -> Entry {
-        Entry {
+    fn entry(&self, at: u64) -> LogEntry {
+        LogEntry {
             seq: self.seq,
             at,
             caller: None,

@@ -50,7 +50,7 @@ impl ParamChanges {
             let name = format!("{path}/{key}");
             if OF_THE_SESSION.contains(&name.as_str()) {
                 if live.get(key) != Some(value) {
-                    self.leave(name, "it belongs to the running session");
+                    self.leave_out(name, "it belongs to the running session");
                 }
                 continue;
             }
@@ -58,7 +58,7 @@ impl ParamChanges {
                 (value, Some(there)) if value == there => {}
                 // Setting an empty namespace would delete everything in it.
                 (Value::Struct(none), Some(Value::Struct(_))) if none.is_empty() && !exact => {}
-                _ if !is_plain(key) => self.leave(
+                _ if !is_plain(key) => self.leave_out(
                     name,
                     "its name is empty or has a slash, so no call can set it alone",
                 ),
@@ -68,7 +68,7 @@ impl ParamChanges {
                     self.below(&name, members, there, exact);
                 }
                 (value, _) if !master::is_readable(value) => {
-                    self.leave(name, "rosmaster could store it but never return it");
+                    self.leave_out(name, "rosmaster could store it but never return it");
                 }
                 (value, there) => self.set.push((name, there.cloned(), value.clone())),
             }
@@ -82,7 +82,7 @@ impl ParamChanges {
         }
     }
 
-    fn leave(&mut self, name: String, why: &str) {
+    fn leave_out(&mut self, name: String, why: &str) {
         self.left_out
             .push((format!("parameter {name}"), why.to_owned()));
     }

@@ -87,7 +87,7 @@ impl Liveness {
     }
 
     /// Notes the answer from a port, if there was one. Returns whether the port has just been found dead.
-    pub fn answered(&mut self, port: &str, sign: Option<Reaction>, now: Instant) -> bool {
+    pub fn note_answer(&mut self, port: &str, sign: Option<Reaction>, now: Instant) -> bool {
         let Some(port) = self.0.get_mut(port) else {
             return false;
         };
@@ -100,7 +100,7 @@ impl Liveness {
         sign == Some(Reaction::Dead) && !was_dead
     }
 
-    pub fn seen(&self, port: &str) -> Option<Seen> {
+    pub fn last_seen(&self, port: &str) -> Option<Seen> {
         self.0.get(port)?.seen
     }
 }
@@ -119,7 +119,7 @@ impl Port {
 impl Health {
     /// The health of a node whose port was last seen as in `seen`. `unreachable` says whether the node left a health
     /// check or a notification unanswered. That may be because its port refuses connections.
-    pub fn of(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
+    pub fn from_last_seen(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {
             Some(Reaction::Dead) => Self::Dead,
@@ -141,7 +141,7 @@ impl Health {
     }
 
     /// This health of a node's port, corrected by what the kernel shows about the node itself.
-    pub fn with(self, evidence: Evidence) -> Self {
+    pub fn corrected_by(self, evidence: Evidence) -> Self {
         match evidence {
             Evidence::Ended(_) => Self::Dead,
             // The process at the port may be another one.
@@ -166,12 +166,14 @@ mod tests {
         let mut now = Instant::now();
         let mut liveness = Liveness::default();
         let all = ports(&["here"]);
-        let health = |liveness: &Liveness, now| Health::of(liveness.seen("here"), false, now);
+        let health = |liveness: &Liveness, now| {
+            Health::from_last_seen(liveness.last_seen("here"), false, now)
+        };
         assert_eq!(health(&liveness, now), Health::Unchecked);
         // The socket table has not been read yet.
         assert_eq!(liveness.round(&all, |_| None, now), ["here"]);
         assert!(liveness.round(&all, |_| None, now).is_empty(), "once");
-        assert!(!liveness.answered("here", Some(Reaction::Alive), now));
+        assert!(!liveness.note_answer("here", Some(Reaction::Alive), now));
         for _ in 0..100 {
             now += SECOND;
             assert!(liveness.round(&all, |_| Some(true), now).is_empty());
@@ -179,14 +181,14 @@ mod tests {
         }
         now += SECOND;
         assert_eq!(liveness.round(&all, |_| Some(false), now), ["here"]);
-        assert!(liveness.answered("here", Some(Reaction::Dead), now));
+        assert!(liveness.note_answer("here", Some(Reaction::Dead), now));
         assert_eq!(health(&liveness, now), Health::Dead);
         now += SECOND;
         assert!(liveness.round(&all, |_| Some(false), now).is_empty());
         now += ASK_AGAIN;
         assert_eq!(liveness.round(&all, |_| Some(false), now), ["here"]);
         assert!(
-            !liveness.answered("here", Some(Reaction::Dead), now),
+            !liveness.note_answer("here", Some(Reaction::Dead), now),
             "told once"
         );
         // Another process uses the same port now.
@@ -200,20 +202,22 @@ mod tests {
         let mut liveness = Liveness::default();
         let all = ports(&["far", "nowhere"]);
         assert_eq!(liveness.round(&all, |_| None, now), ["far", "nowhere"]);
-        liveness.answered("far", Some(Reaction::Silent), now);
-        liveness.answered("nowhere", None, now);
-        let health = |port, liveness: &Liveness, now| Health::of(liveness.seen(port), false, now);
+        liveness.note_answer("far", Some(Reaction::Silent), now);
+        liveness.note_answer("nowhere", None, now);
+        let health = |port, liveness: &Liveness, now| {
+            Health::from_last_seen(liveness.last_seen(port), false, now)
+        };
         assert_eq!(health("far", &liveness, now), Health::Unreachable);
         assert_eq!(health("nowhere", &liveness, now), Health::Unchecked);
         now += ASK_AGAIN;
         assert_eq!(liveness.round(&all, |_| None, now), ["far", "nowhere"]);
-        liveness.answered("far", Some(Reaction::Alive), now);
+        liveness.note_answer("far", Some(Reaction::Alive), now);
         assert_eq!(health("far", &liveness, now), Health::Alive);
         assert_eq!(health("far", &liveness, now + STALE), Health::Unchecked);
         // The health check's result takes precedence.
-        let seen = liveness.seen("far");
-        assert_eq!(Health::of(seen, true, now), Health::Unreachable);
+        let seen = liveness.last_seen("far");
+        assert_eq!(Health::from_last_seen(seen, true, now), Health::Unreachable);
         liveness.round(&ports(&[]), |_| None, now);
-        assert_eq!(liveness.seen("far"), None, "not registered any more");
+        assert_eq!(liveness.last_seen("far"), None, "not registered any more");
     }
 }

@@ -36,9 +36,9 @@ pub struct Moving {
 impl Moving {
     /// The names that `call` moves. A master tells the nodes at their old addresses to shut down. A registration that the
     /// master would refuse moves nothing.
-    pub fn by(mirror: &Master, call: &Request) -> Vec<Self> {
+    pub fn caused_by(mirror: &Master, call: &Request) -> Vec<Self> {
         let mut all: Vec<Self> = Vec::new();
-        if !Self::is_any(mirror, call) {
+        if !Self::moves_any(mirror, call) {
             return all;
         }
         let mut after = mirror.clone();
@@ -73,7 +73,7 @@ impl Moving {
     }
 
     /// Whether `call` moves a name.
-    pub fn is_any(mirror: &Master, call: &Request) -> bool {
+    pub fn moves_any(mirror: &Master, call: &Request) -> bool {
         let mut names = Write::all(call).filter_map(|write| write.registrant());
         names.any(|(node, to)| {
             let from = mirror.api_of(node);
@@ -84,7 +84,7 @@ impl Moving {
     /// What the kernel shows about the node at the old address if that is a loopback address, and the node is on another
     /// computer. `None` otherwise. `listens` says whether a process of this computer listens there.
     pub fn evidence_elsewhere(reach: Reach, listens: bool) -> Option<Evidence> {
-        (!reach.may_be_told()).then_some(match listens {
+        (!reach.may_be_notified()).then_some(match listens {
             true => Evidence::Replaced,
             false => Evidence::Unknown,
         })
@@ -117,7 +117,7 @@ pub struct Eviction {
 
 impl Eviction {
     /// The eviction of these nodes. `None` if none of them has registrations.
-    pub fn of(mirror: &Master, nodes: impl IntoIterator<Item = String>) -> Option<Self> {
+    pub fn for_nodes(mirror: &Master, nodes: impl IntoIterator<Item = String>) -> Option<Self> {
         let nodes: Vec<_> = nodes.into_iter().collect();
         let calls: Vec<_> = nodes
             .iter()
@@ -145,17 +145,17 @@ mod tests {
         for (node, port) in [("/a", 1), ("/b", 1), ("/c", 2)] {
             mirror.apply(&publish(node, &format!("http://h:{port}/")));
         }
-        let moved = |call: &Request| Moving::by(&mirror, call);
+        let moved = |call: &Request| Moving::caused_by(&mirror, call);
         for call in [publish("/a", "http://h:1"), publish("/new", "http://h:1/")] {
             assert_eq!(moved(&call), []);
-            assert!(!Moving::is_any(&mirror, &call));
+            assert!(!Moving::moves_any(&mirror, &call));
         }
         let both = Request::multicall([
             publish("/a", "http://h:3/"),
             publish("/a", "http://h:3/"),
             publish("/c", "http://h:3/"),
         ]);
-        assert!(Moving::is_any(&mirror, &both));
+        assert!(Moving::moves_any(&mirror, &both));
         let [a, c] = moved(&both).try_into().unwrap();
         assert_eq!((a.node.as_str(), a.from.as_str()), ("/a", "http://h:1/"));
         assert_eq!((a.others, c.others), (vec!["/b".to_owned()], vec![]));
@@ -218,7 +218,7 @@ mod tests {
             publish("/old", "http://h:10/"),
         ]);
         let before = master([offer("/heir", "/s", 21)]).snapshot().services;
-        let eviction = Eviction::of(&mirror, ["/old".to_owned()]).unwrap();
+        let eviction = Eviction::for_nodes(&mirror, ["/old".to_owned()]).unwrap();
         let applied = mirror.apply(&eviction.call);
         assert_eq!(mirror.api_of("/old"), None);
         assert_eq!(mirror.snapshot().services, before);

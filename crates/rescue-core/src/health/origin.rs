@@ -25,7 +25,7 @@ pub enum Reach {
 impl Reach {
     /// Judges a node that has registered from the computer `from`; `None` for this one, and if it is unknown. `at` are
     /// the addresses to which the node's host leads from here.
-    pub fn of(from: Option<IpAddr>, at: &[IpAddr], is_own: impl Fn(IpAddr) -> bool) -> Self {
+    pub fn classify(from: Option<IpAddr>, at: &[IpAddr], is_own: impl Fn(IpAddr) -> bool) -> Self {
         let Some(from) = from.filter(|from| !is_own(*from)) else {
             return Self::Certain;
         };
@@ -57,7 +57,7 @@ impl Reach {
     }
 
     /// Whether the node may be notified at its address. At a loopback address a stranger would get the notification.
-    pub fn may_be_told(self) -> bool {
+    pub fn may_be_notified(self) -> bool {
         self != Self::Elsewhere { loopback: true }
     }
 }
@@ -71,7 +71,7 @@ mod tests {
         let at: Vec<_> = at.iter().map(address).collect();
         let own = ["10.0.0.7", "fd00::7", "127.0.1.1"];
         let is_own = |it: IpAddr| it.is_loopback() || own.iter().any(|own| address(own) == it);
-        Reach::of(from.as_ref().map(address), &at, is_own)
+        Reach::classify(from.as_ref().map(address), &at, is_own)
     }
 
     #[test]
@@ -114,7 +114,7 @@ mod tests {
         assert!(Reach::Doubtful.refusal_proves(true) && !Reach::Doubtful.refusal_proves(false));
         assert!(!ours.refusal_proves(true) && !ours.answer_counts());
         // A container's port may be forwarded from this address.
-        assert!(ours.may_be_told());
-        assert!(!Reach::Elsewhere { loopback: true }.may_be_told());
+        assert!(ours.may_be_notified());
+        assert!(!Reach::Elsewhere { loopback: true }.may_be_notified());
     }
 }

@@ -67,7 +67,7 @@ impl<K: Ord + Clone> Repeats<K> {
 
     /// The notifications to send now. `holding_up` says whether there are unreachable nodes. A topic or parameter is
     /// dropped if all nodes have been reachable since its change, because the master then notifies nodes in time.
-    pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
+    pub fn take_due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
             if wait.backoff.next() > now {
@@ -100,7 +100,7 @@ mod tests {
         let mut repeats = Repeats::default();
         repeats.changed("/t", start);
         let next = repeats.next().unwrap();
-        assert_eq!(repeats.due(next, false), Vec::<&str>::new());
+        assert_eq!(repeats.take_due(next, false), Vec::<&str>::new());
         assert_eq!(repeats.next(), None);
     }
 
@@ -112,7 +112,7 @@ mod tests {
         let mut told = Vec::new();
         while let Some(next) = repeats.next() {
             // The repeats continue when all nodes answer again, because a thread of the master may still hang.
-            told.extend(repeats.due(next, told.is_empty()).iter().map(|_| next));
+            told.extend(repeats.take_due(next, told.is_empty()).iter().map(|_| next));
         }
         let times: Vec<_> = told.iter().map(|at| (*at - start).as_millis()).collect();
         let first = [300, 1300, 3300, 7300, 15_300, 25_300, 35_300];
@@ -128,7 +128,7 @@ mod tests {
         let mut told = Vec::new();
         for i in 0..20 {
             let now = start + step * i;
-            told.extend(repeats.due(now, true).iter().map(|_| i));
+            told.extend(repeats.take_due(now, true).iter().map(|_| i));
             repeats.changed("/t", now);
         }
         assert_eq!(told, [6, 12, 18]);

@@ -25,7 +25,7 @@ const EVENTS: usize = 500;
 
 /// How the kernel of this computer sees a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
+enum Setup {
     Plain,
     /// In a container with the host's network: the program sees another process id.
     OwnPids,
@@ -43,7 +43,7 @@ enum Place {
 /// A program that listens at a port and may be a node.
 #[derive(Clone, Debug)]
 struct Program {
-    place: Place,
+    setup: Setup,
     port: u64,
     process: Process,
     own_pid: i32,
@@ -122,8 +122,8 @@ impl World {
     }
 
     fn host(program: &Program) -> &'static str {
-        match program.place {
-            Place::Elsewhere => "far",
+        match program.setup {
+            Setup::Elsewhere => "far",
             _ => "here",
         }
     }
@@ -134,9 +134,9 @@ impl World {
 
     /// The computer from which a program registers; `None` for this one.
     fn from(program: &Program) -> Option<IpAddr> {
-        match program.place {
-            Place::OtherNetwork => Some([10, 0, 0, 9].into()),
-            Place::Elsewhere => Some([10, 0, 0, 8].into()),
+        match program.setup {
+            Setup::OtherNetwork => Some([10, 0, 0, 9].into()),
+            Setup::Elsewhere => Some([10, 0, 0, 8].into()),
             _ => None,
         }
     }
@@ -149,11 +149,11 @@ impl World {
             true => [127, 0, 0, 1].into(),
             false => [10, 0, 0, 8].into(),
         };
-        Reach::of(from, &[at], |address| address.is_loopback())
+        Reach::classify(from, &[at], |address| address.is_loopback())
     }
 
     /// A random program that fits.
-    fn any(&mut self, fits: impl Fn(&Program) -> bool) -> Option<usize> {
+    fn random_program(&mut self, fits: impl Fn(&Program) -> bool) -> Option<usize> {
         let fitting = self.programs.iter().enumerate();
         let fitting: Vec<_> = fitting.filter(|(_, it)| fits(it)).map(|it| it.0).collect();
         match fitting.len() {
@@ -198,7 +198,7 @@ impl World {
         let socket = Socket {
             port: program.port,
             owner,
-            hidden: program.place == Place::Hidden,
+            hidden: program.setup == Setup::Hidden,
             program: index,
         };
         self.sockets.insert(self.clock, socket);
@@ -206,20 +206,20 @@ impl World {
 
     fn start(&mut self) {
         let port = self.dice.below(PORTS);
-        let place = match self.dice.below(10) {
-            0 => Place::OwnPids,
-            1 => Place::Forwarded,
-            2 => Place::Hidden,
-            3 => Place::Elsewhere,
-            4 => Place::OtherNetwork,
-            _ => Place::Plain,
+        let setup = match self.dice.below(10) {
+            0 => Setup::OwnPids,
+            1 => Setup::Forwarded,
+            2 => Setup::Hidden,
+            3 => Setup::Elsewhere,
+            4 => Setup::OtherNetwork,
+            _ => Setup::Plain,
         };
-        let is_free = match place {
-            Place::OtherNetwork => true,
-            Place::Elsewhere => !self
+        let is_free = match setup {
+            Setup::OtherNetwork => true,
+            Setup::Elsewhere => !self
                 .programs
                 .iter()
-                .any(|it| it.runs && it.place == place && it.port == port),
+                .any(|it| it.runs && it.setup == setup && it.port == port),
             _ => self.sockets_at(port).is_empty(),
         };
         if !is_free {
@@ -228,15 +228,15 @@ impl World {
         let Some(process) = self.new_process() else {
             return;
         };
-        let own_pid = match place {
-            Place::OwnPids | Place::Forwarded | Place::OtherNetwork => {
+        let own_pid = match setup {
+            Setup::OwnPids | Setup::Forwarded | Setup::OtherNetwork => {
                 100 + self.dice.below(3) as i32
             }
             _ => process.pid as i32,
         };
         let index = self.programs.len();
         self.programs.push(Program {
-            place,
+            setup,
             port,
             process,
             own_pid,
@@ -248,9 +248,9 @@ impl World {
         if self.mirror.nodes().any(|(_, held)| held == api) {
             self.counts.reused_ports += 1;
         }
-        match place {
-            Place::Elsewhere | Place::OtherNetwork => {}
-            Place::Forwarded => self.forward(index),
+        match setup {
+            Setup::Elsewhere | Setup::OtherNetwork => {}
+            Setup::Forwarded => self.forward(index),
             _ => self.listen(index, Owner { process, own_pid }),
         }
         if self.dice.below(4) > 0 {
@@ -274,7 +274,7 @@ impl World {
         let params = [name.as_str(), "/t", "x/Y", api.as_str()];
         let call = Request::new(Method::RegisterPublisher, params);
         let mut gone = BTreeSet::new();
-        for moving in Moving::by(&self.mirror, &call) {
+        for moving in Moving::caused_by(&self.mirror, &call) {
             let evidence = self.evidence(&moving.node, &moving.from);
             if moving.is_unregistered_first(self.reap, evidence) {
                 self.counts.prevented += u64::from(moving.hits_another(evidence));
@@ -283,7 +283,7 @@ impl World {
                 self.shut_down(&moving);
             }
         }
-        if let Some(eviction) = Eviction::of(&self.mirror, gone) {
+        if let Some(eviction) = Eviction::for_nodes(&self.mirror, gone) {
             self.mirror.apply(&eviction.call);
         }
         self.mirror.apply(&call);
@@ -315,8 +315,8 @@ impl World {
             return;
         }
         // Nothing shows what listens on another computer, or behind a forwarded port, before it registers.
-        let holder = was.map(|was| self.programs[was].place);
-        let is_hidden = |place| matches!(place, Place::Elsewhere | Place::Forwarded);
+        let holder = was.map(|was| self.programs[was].setup);
+        let is_hidden = |setup| matches!(setup, Setup::Elsewhere | Setup::Forwarded);
         let excused = program.names.is_empty() && holder.is_some_and(is_hidden);
         assert!(excused, "an innocent node is shut down: {moving:?}");
         self.counts.unproved += 1;
@@ -325,7 +325,7 @@ impl World {
     /// The program that a call to `api` reaches.
     fn listener(&self, api: &str) -> Option<usize> {
         let far = self.programs.iter().position(|it| {
-            it.runs && it.place == Place::Elsewhere && port_of(&Self::api(it)) == port_of(api)
+            it.runs && it.setup == Setup::Elsewhere && port_of(&Self::api(it)) == port_of(api)
         });
         let mut sockets = self.sockets.values();
         let near = sockets
@@ -339,10 +339,10 @@ impl World {
         if !std::mem::take(&mut program.runs) {
             return;
         }
-        let (process, place) = (program.process, program.place);
+        let (process, setup) = (program.process, program.setup);
         self.end_process(process);
         // A forwarder goes on, and sometimes a child holds the socket for a while.
-        if place != Place::Forwarded && !self.dice.one_in(8) {
+        if setup != Setup::Forwarded && !self.dice.one_in(8) {
             self.sockets.retain(|_, socket| socket.program != index);
         }
     }
@@ -396,7 +396,7 @@ impl World {
             }
             let holder = &mut self.programs[self.holder[&name]];
             // A forwarder may be started again.
-            let far = holder.place == Place::Forwarded;
+            let far = holder.setup == Setup::Forwarded;
             let lives = holder.runs && !holder.closed;
             assert!(
                 !lives || far,
@@ -415,12 +415,12 @@ impl World {
         match self.dice.below(12) {
             0..=2 => self.start(),
             3 => {
-                if let Some(index) = self.any(|it| it.runs && !it.closed) {
+                if let Some(index) = self.random_program(|it| it.runs && !it.closed) {
                     self.register(index);
                 }
             }
             4 | 5 => {
-                if let Some(index) = self.any(|it| it.runs) {
+                if let Some(index) = self.random_program(|it| it.runs) {
                     self.kill(index);
                     if self.dice.one_in(4) {
                         self.assert_known(index);
@@ -429,14 +429,18 @@ impl World {
             }
             // A node closes its port and runs on, or opens it again.
             6 => {
-                if let Some(index) = self.any(|it| it.runs && it.place != Place::Elsewhere) {
+                if let Some(index) =
+                    self.random_program(|it| it.runs && it.setup != Setup::Elsewhere)
+                {
                     self.programs[index].closed = true;
                     self.sockets.retain(|_, socket| socket.program != index);
                 }
             }
             // A forwarder is started again, and the node behind it lives.
             7 => {
-                if let Some(index) = self.any(|it| it.runs && it.place == Place::Forwarded) {
+                if let Some(index) =
+                    self.random_program(|it| it.runs && it.setup == Setup::Forwarded)
+                {
                     let mut owners = self.sockets.values();
                     let owner = owners.find(|socket| socket.program == index);
                     if let Some(owner) = owner.map(|socket| socket.owner) {
@@ -454,7 +458,7 @@ impl World {
                 let programs = &self.programs;
                 self.sockets.retain(|_, socket| {
                     let program = &programs[socket.program];
-                    program.runs || program.place == Place::Forwarded
+                    program.runs || program.setup == Setup::Forwarded
                 });
             }
             _ => {
@@ -588,7 +592,7 @@ impl World {
         // A program that never registers may listen at a port that is forwarded later.
         let clash = (name.to_owned(), death.process);
         let is_program = self.programs.iter().any(|it| it.process == death.process);
-        let is_elsewhere = holder.place == Place::Forwarded && is_program;
+        let is_elsewhere = holder.setup == Setup::Forwarded && is_program;
         let excused = is_elsewhere && !self.clashes.contains(&clash);
         assert!(
             !holder.runs || excused,

@@ -80,7 +80,7 @@ impl Unreachable {
 
     /// The ports to ask now. Returns a port again only after another call of [`Self::add`], so no port is asked twice
     /// at the same time. The pauses grow.
-    pub fn due(&mut self, now: Instant) -> Vec<String> {
+    pub fn take_due(&mut self, now: Instant) -> Vec<String> {
         let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
         let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);
         due.map(|(port, wait)| {
@@ -109,12 +109,12 @@ mod tests {
         let mut asked = Vec::new();
         while asked.len() < 9 {
             let next = unreachable.next().unwrap();
-            assert_eq!(unreachable.due(next), ["a"]);
+            assert_eq!(unreachable.take_due(next), ["a"]);
             assert!(!unreachable.add("a", next, true));
             asked.push((next - start).as_secs());
         }
         assert_eq!(asked, [1, 3, 7, 15, 31, 63, 123, 183, 243]);
-        assert_eq!(unreachable.due(start), Vec::<String>::new());
+        assert_eq!(unreachable.take_due(start), Vec::<String>::new());
         assert!(unreachable.remove("a") && unreachable.is_empty());
         assert_eq!(unreachable.next(), None);
     }
@@ -125,9 +125,9 @@ mod tests {
         let mut unreachable = Unreachable::default();
         unreachable.add("a", start, true);
         let late = start + Duration::from_secs(100);
-        assert_eq!(unreachable.due(late), ["a"]);
+        assert_eq!(unreachable.take_due(late), ["a"]);
         assert_eq!(unreachable.next(), None);
-        assert_eq!(unreachable.due(late), Vec::<String>::new());
+        assert_eq!(unreachable.take_due(late), Vec::<String>::new());
         unreachable.add("a", late, true);
         assert_eq!(unreachable.next(), Some(late + FIRST_PAUSE * 2));
     }
@@ -139,11 +139,15 @@ mod tests {
         unreachable.add("a", start, true);
         unreachable.add("b", start, true);
         let late = start + Duration::from_secs(100);
-        assert_eq!(unreachable.due(late), ["a", "b"]);
+        assert_eq!(unreachable.take_due(late), ["a", "b"]);
         unreachable.add("a", late, true);
         let back = late + Duration::from_millis(1);
         unreachable.ask_all_at(back);
-        assert_eq!(unreachable.due(back), ["a"], "the other one is being asked");
+        assert_eq!(
+            unreachable.take_due(back),
+            ["a"],
+            "the other one is being asked"
+        );
         unreachable.add("b", back, true);
         assert_eq!(unreachable.next(), Some(back + FIRST_PAUSE));
     }

@@ -13,13 +13,13 @@ pub struct OpenCalls {
 
 impl OpenCalls {
     /// Notes that a call begins.
-    pub fn begins(&mut self, now: Instant) {
+    pub fn begin(&mut self, now: Instant) {
         self.calls += 1;
         self.silent_since.get_or_insert(now);
     }
 
     /// Notes that a call has ended, with or without an answer.
-    pub fn ended(&mut self, now: Instant) {
+    pub fn end(&mut self, now: Instant) {
         self.calls = self.calls.saturating_sub(1);
         self.silent_since = (self.calls > 0).then_some(now);
     }
@@ -42,20 +42,20 @@ mod tests {
         let at = |ms| start + Duration::from_millis(ms);
         let mut open_calls = OpenCalls::default();
         assert_eq!(open_calls.silent_since(), None);
-        open_calls.begins(at(1));
-        open_calls.begins(at(2));
-        open_calls.begins(at(3));
+        open_calls.begin(at(1));
+        open_calls.begin(at(2));
+        open_calls.begin(at(3));
         assert_eq!(open_calls.silent_since(), Some(at(1)));
         // A slow call does not count against a master that answers others.
-        open_calls.ended(at(90));
+        open_calls.end(at(90));
         assert_eq!(open_calls.silent_since(), Some(at(90)));
-        open_calls.ended(at(91));
-        open_calls.begins(at(95));
+        open_calls.end(at(91));
+        open_calls.begin(at(95));
         assert_eq!(open_calls.silent_since(), Some(at(91)));
-        open_calls.ended(at(100));
-        open_calls.ended(at(101));
+        open_calls.end(at(100));
+        open_calls.end(at(101));
         assert_eq!(open_calls.silent_since(), None);
-        open_calls.begins(at(200));
+        open_calls.begin(at(200));
         assert_eq!(open_calls.silent_since(), Some(at(200)));
     }
 }

@@ -41,7 +41,7 @@ impl Patience {
     }
 
     /// How long a write waits now.
-    pub fn at(&mut self, now: Instant) -> Duration {
+    pub fn limit_at(&mut self, now: Instant) -> Duration {
         self.forget(now);
         let further = self.alarms.len().saturating_sub(FREE);
         let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
@@ -60,7 +60,7 @@ impl Patience {
         silent_since: Option<Instant>,
     ) -> Instant {
         let since = silent_since.map_or(sent, |since| since.min(sent));
-        (since + self.at(now)).max(sent + CHANCE)
+        (since + self.limit_at(now)).max(sent + CHANCE)
     }
 
     fn forget(&mut self, now: Instant) {
@@ -83,18 +83,18 @@ mod tests {
         let mut patience = Patience::new(BASE);
         let mut now = Instant::now();
         for _ in 0..FREE {
-            assert_eq!(patience.at(now), BASE);
+            assert_eq!(patience.limit_at(now), BASE);
             patience.was_late(now);
         }
-        assert_eq!(patience.at(now), BASE);
+        assert_eq!(patience.limit_at(now), BASE);
         for doublings in 1..=6 {
             patience.was_late(now);
-            assert_eq!(patience.at(now), BASE * 2_u32.pow(doublings));
+            assert_eq!(patience.limit_at(now), BASE * 2_u32.pow(doublings));
         }
         (0..100).for_each(|_| patience.was_late(now));
-        assert_eq!(patience.at(now), LONGEST);
+        assert_eq!(patience.limit_at(now), LONGEST);
         now += MEMORY + Duration::from_secs(1);
-        assert_eq!(patience.at(now), BASE);
+        assert_eq!(patience.limit_at(now), BASE);
     }
 
     #[test]
@@ -128,7 +128,7 @@ mod tests {
             let end = now + 10 * MEMORY;
             let mut flaps = Vec::new();
             while now < end {
-                if patience.at(now) < late {
+                if patience.limit_at(now) < late {
                     flaps.push(now);
                     now += late;
                     patience.was_late(now);

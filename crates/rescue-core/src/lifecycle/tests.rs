@@ -392,6 +392,6 @@ fn the_mirror_stands_in_once_it_is_known_to_be_a_masters_state() {
         assert_eq!(machine.may_stand_in(), expected);
         machine.on(Instant::now(), Input::Connected);
         machine.on(Instant::now(), Input::Examined { new: true });
-        assert!(machine.may_stand_in() && machine.has_served() && !machine.begins());
+        assert!(machine.may_stand_in() && machine.has_served() && !machine.is_new_session());
     }
 }

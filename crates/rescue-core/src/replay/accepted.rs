@@ -274,7 +274,7 @@ mod tests {
     }
 
     /// The accepted writes of `call`, according to the model's own answer.
-    fn of<'a>(master: &Master, call: &'a Request) -> Accepted<'a> {
+    fn accepted_by_model<'a>(master: &Master, call: &'a Request) -> Accepted<'a> {
         let reply = master.clone().apply(call).reply;
         accepted(master, call, &reply)
     }
@@ -282,12 +282,18 @@ mod tests {
     #[test]
     fn refused_calls_and_reads_are_not_accepted() {
         let master = Master::default();
-        assert_eq!(executed(of(&master, &set("/a", 1))), [set("/a", 1)]);
-        assert_eq!(executed(of(&master, &set("/", 1))), []);
-        assert_eq!(executed(of(&master, &set("/a", Value::Nil))), []);
+        assert_eq!(
+            executed(accepted_by_model(&master, &set("/a", 1))),
+            [set("/a", 1)]
+        );
+        assert_eq!(executed(accepted_by_model(&master, &set("/", 1))), []);
+        assert_eq!(
+            executed(accepted_by_model(&master, &set("/a", Value::Nil))),
+            []
+        );
         let read = Request::new(Method::GetParamNames, [Value::from("/n")]);
         assert_eq!(
-            of(&master, &Request::multicall([read.clone(), read])).calls,
+            accepted_by_model(&master, &Request::multicall([read.clone(), read])).calls,
             []
         );
     }
@@ -296,7 +302,7 @@ mod tests {
     fn each_entry_of_a_multicall_is_judged_by_its_own_result() {
         let inner = Request::multicall([set("/b", 2), set("/", 3)]);
         let call = Request::multicall([set("/a", 1), set("", 1), inner]);
-        let found = of(&Master::default(), &call);
+        let found = accepted_by_model(&Master::default(), &call);
         assert!(found.certain);
         assert_eq!(executed(found), [set("/a", 1), set("/b", 2)]);
     }
@@ -304,7 +310,7 @@ mod tests {
     #[test]
     fn entries_before_a_malformed_one_have_run() {
         let call = malformed(Request::multicall([set("/a", 1)]));
-        let found = of(&Master::default(), &call);
+        let found = accepted_by_model(&Master::default(), &call);
         assert_eq!(found.calls.len(), 1);
         assert!(!found.certain);
     }
@@ -317,7 +323,7 @@ mod tests {
         let fails = (0..count)
             .map(|index| malformed(Request::multicall([set("/q", index), set("/", index)])));
         let call = Request::multicall(sets.chain(fails));
-        let found = of(&Master::default(), &call);
+        let found = accepted_by_model(&Master::default(), &call);
         assert!(!found.certain);
         assert_eq!(executed(found).len(), 40_000);
     }
@@ -344,7 +350,7 @@ mod tests {
         };
         assert_eq!(answer[0], 0.into());
         assert_ne!(master, after);
-        assert_eq!(of(&master, &call).calls.len(), 1);
+        assert_eq!(accepted_by_model(&master, &call).calls.len(), 1);
     }
 
     #[test]
@@ -358,7 +364,7 @@ mod tests {
         for key in ["/p", "/n/x"] {
             let params = [Value::from("/n"), "http://n/".into(), key.into()];
             let call = Request::new(Method::SubscribeParam, params);
-            let found = of(&master, &call);
+            let found = accepted_by_model(&master, &call);
             assert_eq!((found.calls.len(), found.certain), (1, true), "{key}");
         }
     }

@@ -11,18 +11,18 @@ const SENTENCES_MAX: usize = 20;
 /// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if the two
 /// are equal. The sentences contain keys, nodes and addresses, but never a parameter's value.
 pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
-    let mut words = Words(Vec::new());
+    let mut words = Sentences(Vec::new());
     let (a, b) = (mirror.registry(), master.registry());
     words.map("the node", &a.nodes, &b.nodes, |words, caller_id, a, b| {
         if a.api != b.api {
-            words.say(|| {
+            words.add(|| {
                 format!(
                     "the node `{caller_id}` is at {} in the mirror and at {} in the master",
                     a.api, b.api
                 )
             });
         } else if a != b {
-            words.say(|| format!("the node `{caller_id}` has other registrations in the master"));
+            words.add(|| format!("the node `{caller_id}` has other registrations in the master"));
         }
     });
     for (what, a, b) in [
@@ -36,20 +36,20 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     ] {
         words.map(&format!("{what} of"), a, b, |words, key, a, b| {
             for node in a.iter().filter(|node| !b.contains(node)) {
-                words.say(|| format!("`{node}` is among the {what} of `{key}` only in the mirror"));
+                words.add(|| format!("`{node}` is among the {what} of `{key}` only in the mirror"));
             }
             for node in b.iter().filter(|node| !a.contains(node)) {
-                words.say(|| format!("`{node}` is among the {what} of `{key}` only in the master"));
+                words.add(|| format!("`{node}` is among the {what} of `{key}` only in the master"));
             }
             if a != b {
-                words.say(|| format!("the {what} of `{key}` differ, or are in another order"));
+                words.add(|| format!("the {what} of `{key}` differ, or are in another order"));
             }
         });
         words.order(what, a, b);
     }
     words.map("the service", &a.services, &b.services, |words, service, a, b| {
         if a != b {
-            words.say(|| format!(
+            words.add(|| format!(
                 "the service `{service}` is from `{}` at {} in the mirror and from `{}` at {} in the master",
                 a.node, a.api, b.node, b.api
             ));
@@ -57,12 +57,12 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     });
     words.order("services", &a.services, &b.services);
     if a.had_services != b.had_services {
-        words.say(|| "only one of the two has ever had a service".to_owned());
+        words.add(|| "only one of the two has ever had a service".to_owned());
     }
     let (a, b) = (mirror.topic_types(), master.topic_types());
     words.map("the type of", a, b, |words, topic, a, b| {
         if a != b {
-            words.say(|| {
+            words.add(|| {
                 format!("the type of `{topic}` is {a} in the mirror and {b} in the master")
             });
         }
@@ -72,10 +72,10 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     words.0
 }
 
-struct Words(Vec<String>);
+struct Sentences(Vec<String>);
 
-impl Words {
-    fn say(&mut self, sentence: impl FnOnce() -> String) {
+impl Sentences {
+    fn add(&mut self, sentence: impl FnOnce() -> String) {
         if self.0.len() < SENTENCES_MAX {
             self.0.push(sentence());
         }
@@ -91,17 +91,17 @@ impl Words {
         for (key, value) in a {
             match b.get(key) {
                 Some(other) => both(self, key, value, other),
-                None => self.say(|| format!("{what} `{key}` is only in the mirror")),
+                None => self.add(|| format!("{what} `{key}` is only in the mirror")),
             }
         }
         for key in b.keys().filter(|key| !a.contains_key(*key)) {
-            self.say(|| format!("{what} `{key}` is only in the master"));
+            self.add(|| format!("{what} `{key}` is only in the master"));
         }
     }
 
     fn order<T>(&mut self, what: &str, a: &IndexMap<String, T>, b: &IndexMap<String, T>) {
         if a.len() == b.len() && a.keys().all(|key| b.contains_key(key)) && !a.keys().eq(b.keys()) {
-            self.say(|| format!("the {what} are in another order"));
+            self.add(|| format!("the {what} are in another order"));
         }
     }
 
@@ -116,18 +116,18 @@ impl Words {
                 }
                 (value, Some(other)) if value == other => {}
                 (_, Some(_)) => {
-                    self.say(|| format!("the parameter `{path}/{key}` has another value"))
+                    self.add(|| format!("the parameter `{path}/{key}` has another value"))
                 }
                 (_, None) => {
-                    self.say(|| format!("the parameter `{path}/{key}` is only in the mirror"))
+                    self.add(|| format!("the parameter `{path}/{key}` is only in the mirror"))
                 }
             }
         }
         for key in b.keys().filter(|key| !a.contains_key(*key)) {
-            self.say(|| format!("the parameter `{path}/{key}` is only in the master"));
+            self.add(|| format!("the parameter `{path}/{key}` is only in the master"));
         }
         if a.len() == b.len() && a.keys().all(|key| b.contains_key(key)) && !a.keys().eq(b.keys()) {
-            self.say(|| format!("the parameters below `{path}/` are in another order"));
+            self.add(|| format!("the parameters below `{path}/` are in another order"));
         }
     }
 }

@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use indexmap::IndexMap;
 use thiserror::Error;
 
-use super::{Bears, Token, order};
+use super::{Token, TokenState, order};
 use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Reply, Struct, Value};
@@ -35,7 +35,7 @@ pub enum NotAMaster {
 #[derive(Clone, Debug)]
 pub struct Inspection {
     pid: i32,
-    bears: Bears,
+    bears: TokenState,
     publishers: IndexMap<String, Vec<String>>,
     subscribers: IndexMap<String, Vec<String>>,
     /// Providers by service.
@@ -50,7 +50,7 @@ impl Inspection {
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
-            bears: Bears::Nothing,
+            bears: TokenState::Nothing,
             publishers: IndexMap::new(),
             subscribers: IndexMap::new(),
             services: IndexMap::new(),
@@ -123,7 +123,7 @@ impl Inspection {
             Some(_) => Ok(None),
             None => Err(form(Method::LookupNode)),
         };
-        let bears = token.found(api(number)?.is_some(), api(session)?);
+        let bears = token.state_in_master(api(number)?.is_some(), api(session)?);
         let state = success(state, Method::GetSystemState)?.as_array();
         let Some([publishers, subscribers, services]) = state else {
             return Err(form(Method::GetSystemState));
@@ -160,7 +160,7 @@ impl Inspection {
     }
 
     /// The token that the master has.
-    pub fn bears(&self) -> Bears {
+    pub fn bears(&self) -> TokenState {
         self.bears
     }
 
@@ -264,10 +264,10 @@ impl Inspection {
             let node = found.nodes.get(caller_id);
             node.is_some_and(|node| previous.api_of(caller_id) == Some(node.api.as_str()))
         };
-        found.publishers = only(self.publishers, |node| found.nodes.contains_key(node));
-        found.subscribers = only(self.subscribers, |node| found.nodes.contains_key(node));
+        found.publishers = retain_nodes(self.publishers, |node| found.nodes.contains_key(node));
+        found.subscribers = retain_nodes(self.subscribers, |node| found.nodes.contains_key(node));
         let subscriptions = previous.registry().param_subscribers.clone();
-        found.param_subscribers = only(subscriptions, same);
+        found.param_subscribers = retain_nodes(subscriptions, same);
         for topic in found.publishers.keys() {
             if !found.topic_types.contains_key(topic) {
                 found.topic_types.insert(topic.clone(), "*".to_owned());
@@ -318,7 +318,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
 }
 
 /// The registrations of the nodes that `of` accepts, without lists that would be empty.
-fn only(
+fn retain_nodes(
     registrations: IndexMap<String, Vec<String>>,
     of: impl Fn(&str) -> bool,
 ) -> IndexMap<String, Vec<String>> {

@@ -232,7 +232,7 @@ impl Plan {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
         }
-        for call in token.leave() {
+        for call in token.set_calls() {
             let (call, predicted) = aside(call);
             write(call, predicted);
         }

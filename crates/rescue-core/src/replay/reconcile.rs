@@ -127,7 +127,7 @@ mod tests {
         call("registerPublisher", &[node, topic, "x/Y", &api])
     }
 
-    fn after(calls: &[Request]) -> Master {
+    fn master_after(calls: &[Request]) -> Master {
         let mut master = Master::default();
         for call in calls {
             master.apply(call);
@@ -140,22 +140,22 @@ mod tests {
         let base = [set("/old", 1), set("/both", 1), publish("/n", "/t")];
         let gone = call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
         let pending = [set("/both", 2), gone.clone()];
-        let mirror = after(&[&base[..], &pending].concat());
+        let mirror = master_after(&[&base[..], &pending].concat());
         let past_us = [set("/old", 3), set("/both", 3), publish("/new", "/t")];
-        let held = after(&[&base[..], &past_us].concat());
+        let held = master_after(&[&base[..], &past_us].concat());
         let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
         let expected = [&base[..], &past_us, &pending].concat();
-        assert_eq!(target, after(&expected));
+        assert_eq!(target, master_after(&expected));
         // The result is the same if the master has run some of the pending writes.
-        let held = after(&[&base[..], &past_us, &pending[..1]].concat());
+        let held = master_after(&[&base[..], &past_us, &pending[..1]].concat());
         let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
-        assert_eq!(target, after(&expected));
+        assert_eq!(target, master_after(&expected));
     }
 
     #[test]
     fn the_mirror_wins_wherever_it_has_an_entry_and_takes_over_the_rest() {
         let base = [set("/a", 1), publish("/n", "/t")];
-        let mirror = after(&base);
+        let mirror = master_after(&base);
         let moved = call("registerPublisher", &["/n", "/t", "x/Y", "http://n:2/"]);
         let offer = call(
             "registerService",
@@ -169,9 +169,9 @@ mod tests {
             offer.clone(),
             listen.clone(),
         ];
-        let target = reconcile(&mirror, &after(&held), &[], Authority::Mirror);
+        let target = reconcile(&mirror, &master_after(&held), &[], Authority::Mirror);
         let expected = [&base[..], &[set("/b", 2), listen, offer]].concat();
-        assert_eq!(target, after(&expected));
+        assert_eq!(target, master_after(&expected));
         let target = reconcile(&mirror, &Master::default(), &[], Authority::Mirror);
         assert_eq!(target, mirror);
     }
@@ -183,8 +183,8 @@ mod tests {
             &["/n", "/s", "rosrpc://n:2", "http://n:1/"],
         );
         let gone = call("unregisterService", &["/n", "/s", "rosrpc://n:2"]);
-        let held = after(std::slice::from_ref(&offer));
-        let mirror = after(&[offer, gone.clone()]);
+        let held = master_after(std::slice::from_ref(&offer));
+        let mirror = master_after(&[offer, gone.clone()]);
         let target = reconcile(&mirror, &held, &[gone], Authority::Mirror);
         assert_eq!(target, mirror);
     }
@@ -193,9 +193,9 @@ mod tests {
     fn a_parameter_subscription_that_a_pending_write_removes_may_still_be_there() {
         let watch = |api: &str| call("subscribeParam", &["/n", api, "/k"]);
         let gone = |api: &str| call("unsubscribeParam", &["/n", api, "/k"]);
-        let mirror = after(&[watch("http://n:1/"), gone("http://n:1/")]);
+        let mirror = master_after(&[watch("http://n:1/"), gone("http://n:1/")]);
         let held = may_hold(&mirror, &[gone("http://n:1/")]);
-        assert_eq!(held, after(&[watch("http://n:1/")]));
+        assert_eq!(held, master_after(&[watch("http://n:1/")]));
         let target = reconcile(
             &mirror,
             &held,
@@ -203,7 +203,7 @@ mod tests {
             Authority::PendingWrites,
         );
         assert_eq!(target, mirror);
-        let moved = after(&[watch("http://n:2/")]);
+        let moved = master_after(&[watch("http://n:2/")]);
         assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
     }
 
@@ -217,7 +217,7 @@ mod tests {
         );
         let listen = call("registerSubscriber", &["/n", "t", "x/Y", "http://n:1/"]);
         let state = [set("/k", 1), publish("/n", "/t"), watch, offer, listen];
-        let master = after(&state);
+        let master = master_after(&state);
         for call in &state {
             assert!(!master.would_change(call), "{call:?}");
             assert!(Master::default().would_change(call), "{call:?}");

@@ -264,14 +264,14 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
         for (service, entry) in &target.registry().services {
             let losers = losers.remove(service.as_str()).unwrap_or_default();
-            if self.leave_service(service, &losers) {
+            if self.skip_if_provided(service, &losers) {
                 continue;
             }
             let owner = self.api(&entry.node);
             let name = names::name_for(service, &entry.node);
             match (owner, name) {
                 (Some(api), Some(name)) => {
-                    self.lose(service, &losers);
+                    self.register_for_losers(service, &losers);
                     let params = [entry.node.as_str(), &name, &entry.api, api];
                     self.push(Method::RegisterService, params);
                 }
@@ -279,16 +279,16 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
                     if owner.is_some() {
                         self.skip_unnameable(service, &entry.node);
                     }
-                    self.lose_to_nobody(service, &losers);
+                    self.register_for_losers_without_provider(service, &losers);
                 }
             }
         }
         for (caller_id, node) in &target.registry().nodes {
             for service in target.taken_over(caller_id, node) {
                 if let Some(losers) = losers.remove(service.as_str())
-                    && !self.leave_service(service, &losers)
+                    && !self.skip_if_provided(service, &losers)
                 {
-                    self.lose_to_nobody(service, &losers);
+                    self.register_for_losers_without_provider(service, &losers);
                 }
             }
         }
@@ -311,7 +311,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 
     /// Whether a service has a provider in the new master. If so, the service and its previous providers are left out.
-    fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
+    fn skip_if_provided(&mut self, service: &str, losers: &[&str]) -> bool {
         let Some(found) = self.found.registry().services.get(service) else {
             return false;
         };
@@ -339,7 +339,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 
     /// Registers `service` for `losers`, the nodes from which other nodes have taken it over.
-    fn lose(&mut self, service: &str, losers: &[&str]) {
+    fn register_for_losers(&mut self, service: &str, losers: &[&str]) {
         for caller_id in losers {
             let Some(api) = self.api(caller_id) else {
                 continue;
@@ -358,7 +358,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     /// Registers `service`, which has no provider now, for `losers`, the nodes that have lost it. Then a helper, a
     /// caller id that no node has, takes the service over and unregisters it.
-    fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
+    fn register_for_losers_without_provider(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
             for caller_id in losers {
@@ -366,7 +366,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             }
             return;
         };
-        self.lose(service, losers);
+        self.register_for_losers(service, losers);
         if self.count > before {
             self.take_and_give_up(&helper, &name);
         }

@@ -6,7 +6,7 @@
 
 use std::time::Duration;
 
-use super::{Bears, Treatment};
+use super::{TokenState, Treatment};
 use crate::master::{CALLER_ID, Master, Method, Request};
 use crate::xmlrpc::{Reply, Value};
 
@@ -25,7 +25,7 @@ pub fn has_run_id() -> Request {
 }
 
 /// Whether `reply` to [`has_run_id`] says yes.
-pub fn says_run_id(reply: &Reply) -> bool {
+pub fn is_run_id_set(reply: &Reply) -> bool {
     let answer = match reply {
         Reply::Value(answer) => answer.as_array(),
         Reply::Fault { .. } => None,
@@ -54,11 +54,11 @@ pub fn withheld_run_id(
 /// roscore ends its rosout when its master has ended, so a dead one must not be restored.
 pub fn rosout_to_ask<'a>(
     may_be_roscores: bool,
-    bears: Bears,
+    bears: TokenState,
     state: &'a Master,
     found: &Master,
 ) -> Option<&'a str> {
-    let is_new = bears == Bears::Nothing;
+    let is_new = bears == TokenState::Nothing;
     let asks = may_be_roscores && is_new && found.api_of(ROSOUT).is_none();
     state.api_of(ROSOUT).filter(|_| asks)
 }
@@ -86,7 +86,7 @@ mod tests {
         master.apply(&remove);
         for (state, says) in [(&master, false), (&old, true)] {
             let reply = state.clone().apply(&has_run_id()).reply;
-            assert_eq!(says_run_id(&reply), says);
+            assert_eq!(is_run_id_set(&reply), says);
         }
         master.apply(&set);
         assert_eq!(master.params(), old.params());
@@ -99,10 +99,16 @@ mod tests {
         let call = [ROSOUT, "/rosout_agg", "rosgraph_msgs/Log", api];
         with.apply(&Request::new(Method::RegisterPublisher, call));
         let none = Master::default();
-        assert_eq!(rosout_to_ask(true, Bears::Nothing, &with, &none), Some(api));
-        assert_eq!(rosout_to_ask(false, Bears::Nothing, &with, &none), None);
-        assert_eq!(rosout_to_ask(true, Bears::Present, &with, &none), None);
-        assert_eq!(rosout_to_ask(true, Bears::Nothing, &with, &with), None);
-        assert_eq!(rosout_to_ask(true, Bears::Nothing, &none, &none), None);
+        assert_eq!(
+            rosout_to_ask(true, TokenState::Nothing, &with, &none),
+            Some(api)
+        );
+        assert_eq!(
+            rosout_to_ask(false, TokenState::Nothing, &with, &none),
+            None
+        );
+        assert_eq!(rosout_to_ask(true, TokenState::Present, &with, &none), None);
+        assert_eq!(rosout_to_ask(true, TokenState::Nothing, &with, &with), None);
+        assert_eq!(rosout_to_ask(true, TokenState::Nothing, &none, &none), None);
     }
 }

@@ -32,7 +32,7 @@ pub struct Token {
 
 /// The token that a master has, compared with the latest [`Token`] that rosrescue knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Bears {
+pub enum TokenState {
     /// The latest token that rosrescue knows, so this master has got the whole state.
     Present,
     /// An earlier token of this session.
@@ -63,7 +63,7 @@ impl Token {
     }
 
     /// The calls that set the token in a master. The one with the master's number in its caller id comes last.
-    pub fn leave(&self) -> [Request; 2] {
+    pub fn set_calls(&self) -> [Request; 2] {
         let session_api = format!("{NO_API}/{}", self.number);
         [(&self.session, session_api.as_str()), (&self.name, NO_API)]
             .map(|(name, api)| subscription(Method::SubscribeParam, name, api))
@@ -86,15 +86,15 @@ impl Token {
 
     /// The token that a master has. `number` says whether [`Self::lookup`] found the number, and `session` is the
     /// address that [`Self::lookup_session`] returned. An address without a number is not that of a later token.
-    pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
+    pub(super) fn state_in_master(&self, number: bool, session: Option<&str>) -> TokenState {
         let later = session
             .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())
             .filter(|later| *later > self.number);
         match (later, number, session) {
-            (Some(later), _, _) => Bears::Later(later),
-            (None, true, _) => Bears::Present,
-            (None, false, Some(_)) => Bears::Earlier,
-            (None, false, None) => Bears::Nothing,
+            (Some(later), _, _) => TokenState::Later(later),
+            (None, true, _) => TokenState::Present,
+            (None, false, Some(_)) => TokenState::Earlier,
+            (None, false, None) => TokenState::Nothing,
         }
     }
 
@@ -144,7 +144,7 @@ mod tests {
         let mut master = Master::default();
         let before: Vec<_> = reads().iter().map(|call| master.apply(call)).collect();
         assert!(!Token::is_found(&master.apply(&token.lookup()).reply));
-        for call in token.leave() {
+        for call in token.set_calls() {
             master.apply(&call);
         }
         let after: Vec<_> = reads().iter().map(|call| master.apply(call)).collect();
@@ -166,7 +166,7 @@ mod tests {
     #[test]
     fn no_parameter_change_sends_a_callback_to_a_token() {
         let mut master = Master::default();
-        for call in Token::new("a", 1).leave() {
+        for call in Token::new("a", 1).set_calls() {
             master.apply(&call);
         }
         let tree = Value::Struct([("rosrescue".to_owned(), Value::Int(1))].into());

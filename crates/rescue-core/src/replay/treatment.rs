@@ -1,6 +1,6 @@
 //! Decides what to do with an examined master, as in the table in `docs/architecture.md` (Recovery, 4).
 
-use super::{Authority, Bears};
+use super::{Authority, TokenState};
 
 /// What is known about a master before it is examined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,27 +39,29 @@ pub enum Treatment {
 /// Decides what to do with a master that has the token `bears`. Not called for a master that can continue unchanged,
 /// because it has the latest token, calls have already passed to it, and it has missed no write.
 pub fn treatment(
-    bears: Bears,
+    bears: TokenState,
     known: KnownMaster,
     mirror_is_empty: bool,
     master_is_empty: bool,
 ) -> Treatment {
     match (bears, known) {
-        (Bears::Nothing, _) if !mirror_is_empty => Treatment::Inject,
-        (Bears::Nothing, _) if master_is_empty => Treatment::Begin,
-        (Bears::Nothing, _) => Treatment::TakeOver,
+        (TokenState::Nothing, _) if !mirror_is_empty => Treatment::Inject,
+        (TokenState::Nothing, _) if master_is_empty => Treatment::Begin,
+        (TokenState::Nothing, _) => Treatment::TakeOver,
         // A new session has no state that could replace the master's.
-        (Bears::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::TakeOver,
+        (TokenState::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::TakeOver,
         // A later incarnation has been served, so the mirror is newer than everything in this master.
-        (Bears::Earlier, _) => Treatment::Replace,
+        (TokenState::Earlier, _) => Treatment::Replace,
         // The checkpoint is older than this master, or another rosrescue has a copy of the checkpoint.
-        (Bears::Later(_), KnownMaster::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
-        (Bears::Later(_), _) => Treatment::Replace,
-        // This master has run all writes of the checkpoint that are not pending, and perhaps more.
-        (Bears::Present, KnownMaster::Nothing | KnownMaster::ServedIfPresent) => {
+        (TokenState::Later(_), KnownMaster::Nothing) => {
             Treatment::Reconcile(Authority::PendingWrites)
         }
-        (Bears::Present, _) => Treatment::Reconcile(Authority::Mirror),
+        (TokenState::Later(_), _) => Treatment::Replace,
+        // This master has run all writes of the checkpoint that are not pending, and perhaps more.
+        (TokenState::Present, KnownMaster::Nothing | KnownMaster::ServedIfPresent) => {
+            Treatment::Reconcile(Authority::PendingWrites)
+        }
+        (TokenState::Present, _) => Treatment::Reconcile(Authority::Mirror),
     }
 }
 
@@ -73,57 +75,81 @@ mod tests {
         let (served, injected) = (KnownMaster::ServedIfPresent, KnownMaster::InjectedIfPresent);
         for (bears, known, mirror_is_empty, master_is_empty, expected) in [
             (
-                Bears::Present,
+                TokenState::Present,
                 served,
                 false,
                 false,
                 Reconcile(Authority::PendingWrites),
             ),
             (
-                Bears::Present,
+                TokenState::Present,
                 injected,
                 false,
                 false,
                 Reconcile(Authority::Mirror),
             ),
             (
-                Bears::Present,
+                TokenState::Present,
                 KnownMaster::Nothing,
                 false,
                 false,
                 Reconcile(Authority::PendingWrites),
             ),
             (
-                Bears::Later(7),
+                TokenState::Later(7),
                 KnownMaster::Nothing,
                 false,
                 false,
                 Reconcile(Authority::PendingWrites),
             ),
-            (Bears::Later(7), served, false, false, Replace),
+            (TokenState::Later(7), served, false, false, Replace),
             (
-                Bears::Present,
+                TokenState::Present,
                 served,
                 true,
                 true,
                 Reconcile(Authority::PendingWrites),
             ),
-            (Bears::Earlier, served, false, false, Replace),
-            (Bears::Earlier, KnownMaster::Nothing, false, false, Replace),
-            (Bears::Earlier, KnownMaster::Nothing, true, false, TakeOver),
-            (Bears::Nothing, KnownMaster::Nothing, true, false, TakeOver),
-            (Bears::Nothing, KnownMaster::Nothing, true, true, Begin),
-            (Bears::Nothing, KnownMaster::Nothing, false, false, Inject),
-            (Bears::Nothing, served, false, true, Inject),
+            (TokenState::Earlier, served, false, false, Replace),
             (
-                Bears::Nothing,
+                TokenState::Earlier,
+                KnownMaster::Nothing,
+                false,
+                false,
+                Replace,
+            ),
+            (
+                TokenState::Earlier,
+                KnownMaster::Nothing,
+                true,
+                false,
+                TakeOver,
+            ),
+            (
+                TokenState::Nothing,
+                KnownMaster::Nothing,
+                true,
+                false,
+                TakeOver,
+            ),
+            (TokenState::Nothing, KnownMaster::Nothing, true, true, Begin),
+            (
+                TokenState::Nothing,
+                KnownMaster::Nothing,
+                false,
+                false,
+                Inject,
+            ),
+            (TokenState::Nothing, served, false, true, Inject),
+            (
+                TokenState::Nothing,
                 KnownMaster::New { pid: 1 },
                 false,
                 true,
                 Inject,
             ),
             (
-                Bears::Nothing,
+                TokenState::Nothing,
                 KnownMaster::New { pid: 1 },
                 true,
                 true,

@@ -11,7 +11,7 @@ use super::{
     },
     Findings, list, named,
 };
-use crate::{cluster::survey, commands::counted, ros_env, status::summary::some};
+use crate::{cluster::survey, commands::counted, ros_env, status::summary::shortened};
 
 /// A name lookup that takes longer than this, in milliseconds, is a finding: it delays every call to the node.
 const SLOW: u128 = 1000;
@@ -381,7 +381,7 @@ impl Findings {
             };
             let list = match names.as_slice() {
                 [_] => String::new(),
-                all => format!(": {}", some(all)),
+                all => format!(": {}", shortened(all)),
             };
             let pids: Vec<_> = processes.iter().map(|it| it.pid.to_string()).collect();
             let again = format!(
@@ -418,7 +418,7 @@ impl Findings {
             all => Some(format!(
                 "{} clients talk directly to the master at {uri}: {}",
                 all.len(),
-                some(all)
+                shortened(all)
             )),
         };
         if let Some(talks) = talks {
@@ -468,7 +468,7 @@ impl Findings {
                 Outcome::Answered => true,
                 Outcome::Blocked { is_on } => is_on,
             });
-            let (list, number) = (some(&list), list.len());
+            let (list, number) = (shortened(&list), list.len());
             if is_on {
                 self.bad(
                     NETWORK,

@@ -43,7 +43,7 @@ fn reader() -> LogReader {
     LogReader::new(crate::hide::DEFAULT.parse().unwrap())
 }
 
-fn text(entry: &Entry) -> String {
+fn text(entry: &LogEntry) -> String {
     let change = entry.change.as_ref().unwrap();
     let shown = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
     format!(
@@ -91,7 +91,7 @@ fn the_log_has_old_and_new_values_and_nothing_that_changed_nothing() {
             // A file that is read again adds nothing.
             reader.read(&file).unwrap();
         }
-        let entries: Vec<_> = reader.take().iter().map(text).collect();
+        let entries: Vec<_> = reader.take_entries().iter().map(text).collect();
         assert_eq!(entries, expected, "{each} records in a file");
     }
 }
@@ -112,13 +112,13 @@ fn a_change_without_a_record_and_the_events_of_a_session_are_listed() {
         format::encode_checkpoint(&checkpoint, 1).unwrap().bytes
     };
     reader.read(&file(1, &|_| ())).unwrap();
-    assert_eq!(reader.take(), []);
+    assert_eq!(reader.take_entries(), []);
     reader.read(&file(2, &|_| ())).unwrap();
-    let entries: Vec<_> = reader.take().iter().map(text).collect();
+    let entries: Vec<_> = reader.take_entries().iter().map(text).collect();
     assert_eq!(entries, ["5 77 - - Parameter /a: 1 -> 2"]);
     let events = |change: &dyn Fn(&mut Session), reader: &mut LogReader| {
         reader.read(&file(2, change)).unwrap();
-        let entries = reader.take().into_iter();
+        let entries = reader.take_entries().into_iter();
         entries.map(|it| it.event.unwrap()).collect::<Vec<_>>()
     };
     let rescued = events(&|session| session.incarnation = 2, &mut reader);
@@ -185,7 +185,7 @@ fn a_clock_that_jumps_reorders_and_loses_nothing() {
         }
         let mut reader = reader();
         files.iter().for_each(|file| reader.read(file).unwrap());
-        let entries = reader.take();
+        let entries = reader.take_entries();
         assert!(entries.iter().map(|entry| entry.seq).is_sorted());
         assert_eq!(entries.len(), 60, "seed {seed}");
     }

@@ -149,8 +149,8 @@ fn the_patience_grows_with_false_alarms() {
             .feed(Input::CaughtUp, &[Action::OpenGate]);
     }
     let mut patience = script.machine.patience().clone();
-    assert_eq!(patience.at(script.now), PROBING.patience * 8);
-    assert_eq!(patience.at(script.now + CALM * 7), PROBING.patience);
+    assert_eq!(patience.limit_at(script.now), PROBING.patience * 8);
+    assert_eq!(patience.limit_at(script.now + CALM * 7), PROBING.patience);
 }
 
 #[test]

@@ -1,5 +1,5 @@
 use super::*;
-use crate::replay::{Bears, Inspection, NotAMaster, Token, difference};
+use crate::replay::{Inspection, NotAMaster, Token, TokenState, difference};
 
 /// Reads the state of `master` as rosrescue does over the network.
 fn look(master: &mut Master, previous: &Master) -> Master {
@@ -84,10 +84,14 @@ fn an_empty_master_shows_no_state_and_no_token() {
     let first = look(&mut master);
     assert_eq!(
         (first.pid(), first.bears(), first.is_empty()),
-        (42, Bears::Nothing, true)
+        (42, TokenState::Nothing, true)
     );
     assert_eq!(first.second_call(&Master::default()), None);
-    for (call, bears) in token.leave().iter().zip([Bears::Earlier, Bears::Present]) {
+    for (call, bears) in token
+        .set_calls()
+        .iter()
+        .zip([TokenState::Earlier, TokenState::Present])
+    {
         master.apply(call);
         let next = look(&mut master);
         assert_eq!((next.bears(), next.is_empty()), (bears, true));
@@ -95,13 +99,13 @@ fn an_empty_master_shows_no_state_and_no_token() {
     master.apply(&set("/a", 1));
     assert!(!look(&mut master).is_empty());
     // A later number is found even if the master also has an earlier one.
-    let [session, _] = Token::new("m", 12).leave();
+    let [session, _] = Token::new("m", 12).set_calls();
     master.apply(&session);
-    assert_eq!(look(&mut master).bears(), Bears::Later(12));
-    let [session, _] = Token::new("m", 0).leave();
+    assert_eq!(look(&mut master).bears(), TokenState::Later(12));
+    let [session, _] = Token::new("m", 0).set_calls();
     master.apply(&session);
     master.apply(&token.remove());
-    assert_eq!(look(&mut master).bears(), Bears::Earlier);
+    assert_eq!(look(&mut master).bears(), TokenState::Earlier);
 }
 
 #[test]

@@ -23,7 +23,7 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     assert_eq!(plan.verify(&outcome.reply), Ok(()));
     assert_eq!(plan.answer(), &encode_reply(&outcome.reply));
     assert!(Token::is_found(&master.apply(&token().lookup()).reply));
-    let [session, _] = token().leave();
+    let [session, _] = token().set_calls();
     master.apply(&token().remove());
     master.apply(&Request::new(
         Method::UnsubscribeParam,
@@ -222,7 +222,7 @@ fn a_state_is_replaced_without_any_callback() {
 fn tokens_are_not_restored() {
     let mut master = after([publish("/p", "/t", "a/B")]);
     let bare = master.clone();
-    master.apply(&Token::new("old", 1).leave()[0]);
+    master.apply(&Token::new("old", 1).set_calls()[0]);
     let plan = Plan::new(&master, &Master::default(), &token());
     assert_eq!(run(&plan, &Master::default()).0, bare);
     assert_eq!(plan.skipped(), []);
@@ -546,7 +546,7 @@ fn nothing_is_lost_that_another_program_does_at_any_moment_of_an_injection() {
             let reply = run_beside(&plan, &mut master, moment, &theirs);
             let deviation = plan.verify(&reply).expect_err("a difference");
             assert_eq!(deviation.failed, Vec::<String>::new());
-            for call in token().leave() {
+            for call in token().set_calls() {
                 let params = call.params().to_vec();
                 master.apply(&Request::new(Method::UnsubscribeParam, params));
             }
