@@ -25,7 +25,7 @@ pub use self::{
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{
         CommonArgs, CoreArgs, LogFormat, LoggingArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice,
-        SyncPolicy,
+        SyncPolicy, Writes,
     },
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},

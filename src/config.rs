@@ -13,7 +13,7 @@ use rescue_core::{
 use thiserror::Error;
 
 use crate::{
-    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice, SyncPolicy},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, ReapNodes, RestoreChoice, SyncPolicy, Writes},
     ros_env::{self, Lookup, MasterUri, UriError},
 };
 
@@ -107,6 +107,8 @@ pub struct Config {
     pub resync_interval: Option<Duration>,
     /// Whether the mirror or the master answers reads while there is a master.
     pub reads: Reads,
+    /// Whether the mirror or the master answers writes while there is a master.
+    pub writes: Writes,
     /// Maximum number of connections to the master for reads.
     pub master_connections: usize,
     /// Maximum number of connections from clients.
@@ -286,6 +288,7 @@ impl Config {
             advertised,
             master,
             reads,
+            writes: args.writes.unwrap_or(Writes::Master),
             restore: match args.restore {
                 RestoreChoice::Auto => RestorePolicy::Auto,
                 RestoreChoice::Always => RestorePolicy::Always,

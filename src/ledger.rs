@@ -10,6 +10,7 @@ mod answers;
 pub(crate) mod checkpointer;
 pub(crate) mod delivery;
 mod durability;
+pub(crate) mod first;
 pub(crate) mod history;
 mod inner;
 pub(crate) mod journal;
@@ -44,7 +45,7 @@ use tokio::sync::{Notify, watch};
 use self::activity::Activity;
 pub(crate) use self::durability::Mark;
 use self::{
-    inner::Inner,
+    inner::{Inner, Notifier},
     late::{CatchUp, LateState, Missed, once},
     shared::{Agreement, LeaderLease, Shared},
 };
@@ -236,7 +237,7 @@ impl Ledger {
             recorded.is_ahead |= is_recorded && !answered.executed;
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
-            let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
+            let outcome = inner.apply(now, answered.call, Notifier::Master, &self.outbox_changed);
             origin.note_in(&mut inner.mirror, answered.call);
             if !answered.agrees(&outcome, index < last_write) {
                 if !is_inexact {
@@ -311,7 +312,7 @@ impl Ledger {
     /// Records and applies a call made by rosrescue before there is a master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
-        inner.apply(Instant::now(), call, None, &self.outbox_changed);
+        inner.apply(Instant::now(), call, Notifier::Master, &self.outbox_changed);
         let (at, origin) = (clock::wall_millis(), Origin::Rosrescue);
         let label = Label { at, origin };
         inner.append(vec![RecordContent::labelled(call.clone(), label)]);
@@ -376,6 +377,8 @@ impl Ledger {
         let mut inner = self.lock();
         if inner.injecting
             || inner.is_elsewhere()
+            // The master has not run these when it was read.
+            || !inner.pending.calls().is_empty()
             || (inner.session.incarnation, inner.version) != (incarnation, version)
         {
             return Err(Superseded);
@@ -550,8 +553,9 @@ impl Ledger {
     /// Notes that the present master holds the mirror's state, so no write is pending.
     pub fn delivered(&self) {
         let mut inner = self.lock();
-        if !inner.pending.calls().is_empty() {
+        if !inner.pending.calls().is_empty() || inner.acknowledged > 0 {
             inner.pending.clear();
+            inner.acknowledged = 0;
             inner.session.delivered = inner.seq();
             inner.session_unwritten = true;
         }
@@ -606,12 +610,14 @@ impl Ledger {
         whole
     }
 
-    /// Notes that the mirror has answered the calls that the present master is late with, and no later calls. `tells`
-    /// are the topics, parameters and node names about which these calls may make the master notify nodes.
-    pub(crate) fn fall_behind(&self, now: Instant, tells: Vec<Subject>) {
+    /// Notes that the mirror has answered the calls that the present master is late with. `tells`
+    /// are the topics, parameters and node names about which these calls may make the master notify nodes. `is_exact` says
+    /// whether the mirror has answered no later calls: otherwise the master must be examined when it answers.
+    pub(crate) fn fall_behind(&self, now: Instant, tells: Vec<Subject>, is_exact: bool) {
         let mut inner = self.lock();
         inner.order.master_is_late(now);
         inner.behind = Some(LateState {
+            is_exact,
             state: inner.mirror.clone(),
             ran: inner.pending.calls().len(),
             tells,
@@ -634,14 +640,7 @@ impl Ledger {
         };
         behind.answered = true;
         order.late_answered(now);
-        for subject in &behind.tells {
-            let nodes = match subject {
-                Subject::Topic(topic) => mirror.subscribers_of(topic).len(),
-                Subject::Param(_) => 1,
-                Subject::Name(_) => continue,
-            };
-            order.told_by_master(now, subject, nodes);
-        }
+        told_by_master(now, order, mirror, &behind.tells);
         drop(inner);
         self.outbox_changed.notify_one();
     }
@@ -654,7 +653,8 @@ impl Ledger {
     /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
     pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
         let mut inner = self.lock();
-        let behind = inner.behind.take().filter(|behind| behind.answered)?;
+        let behind = inner.behind.take();
+        let behind = behind.filter(|behind| behind.answered && behind.is_exact)?;
         if inner.doubted || inner.abandoned || inner.mirror.is_inexact() {
             return None;
         }
@@ -712,6 +712,18 @@ impl Ledger {
             mirror, activity, ..
         } = &mut *inner;
         work(mirror, activity)
+    }
+}
+
+/// Notes that the master begins to notify nodes about `tells`.
+fn told_by_master(now: Instant, order: &mut Order, mirror: &Master, tells: &[Subject]) {
+    for subject in tells {
+        let nodes = match subject {
+            Subject::Topic(topic) => mirror.subscribers_of(topic).len(),
+            Subject::Param(_) => 1,
+            Subject::Name(_) => continue,
+        };
+        order.told_by_master(now, subject, nodes);
     }
 }
 

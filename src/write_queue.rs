@@ -33,7 +33,7 @@ use self::{
     dispatcher::Dispatcher,
 };
 pub(crate) use self::{dispatcher::PATIENCE, drain::Drain, evict::MoveJudge};
-use crate::{gate, ledger::Ledger, status::stats::Stats, upstream::Upstream};
+use crate::{cli::Writes, gate, ledger::Ledger, status::stats::Stats, upstream::Upstream};
 
 /// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
 const CHANNEL: usize = 64;
@@ -140,15 +140,15 @@ struct Signals {
 }
 
 /// Creates a write queue and its worker. `resync_interval` is the pause between two comparisons of master and mirror;
-/// `None` for never. `judge` judges calls that could make the master shut down an innocent node. `patience` is how
-/// long writes wait for the master.
+/// `None` for never. `judge` judges calls that could make the master shut down an innocent node. `writes` says who
+/// answers writes, and `patience` how long they wait for the master.
 pub(crate) fn write_queue(
-    ledger: Arc<Ledger>,
-    upstream: Arc<Upstream>,
+    link: Link,
     gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
     judge: Arc<dyn MoveJudge>,
+    writes: Writes,
     patience: Patience,
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
@@ -160,8 +160,7 @@ pub(crate) fn write_queue(
         slow: Notify::new(),
     });
     let (tell_sent, sent) = watch::channel(None);
-    let dispatcher = Dispatcher::new(ledger.clone(), judge, stats, patience);
-    let link = Link { ledger, upstream };
+    let dispatcher = Dispatcher::new(link.ledger.clone(), judge, stats, writes, patience);
     let drain = Drain::new(
         dispatcher,
         rx,
@@ -181,9 +180,9 @@ pub(crate) fn write_queue(
 
 /// What a round trip to the master needs.
 #[derive(Clone)]
-struct Link {
-    ledger: Arc<Ledger>,
-    upstream: Arc<Upstream>,
+pub(crate) struct Link {
+    pub(crate) ledger: Arc<Ledger>,
+    pub(crate) upstream: Arc<Upstream>,
 }
 
 #[cfg(test)]

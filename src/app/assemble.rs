@@ -35,7 +35,7 @@ use crate::{
     status::{Board, Earlier, Mode, stats::Stats},
     upstream::{Upstream, pool::Pool},
     wait,
-    write_queue::{self, Drain},
+    write_queue::{self, Drain, Link},
 };
 
 /// How long a start waits for the reports of earlier rescues. Calls wait during this time.
@@ -105,12 +105,15 @@ pub(super) async fn assemble(
     ));
     let local = Arc::new(LocalNodes::new(config.reap, stats));
     let (write_queue, drain) = write_queue::write_queue(
-        ledger.clone(),
-        upstream.clone(),
+        Link {
+            ledger: ledger.clone(),
+            upstream: upstream.clone(),
+        },
         gate.clone(),
         stats,
         config.resync_interval,
         local.clone(),
+        config.writes,
         Patience::new(config.probing.patience),
     );
     let served = Served::default();

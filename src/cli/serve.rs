@@ -215,6 +215,10 @@ pub struct CommonArgs {
     /// Choose the master if programs call it directly [default: mirror for core, master for proxy]
     #[arg(long, env = "ROSRESCUE_READS", value_enum, hide = true)]
     pub reads: Option<Reads>,
+    /// Who answers writes while there is a master: the mirror, as soon as the disk has them, or the master within
+    /// 100 ms [default: master]
+    #[arg(long, env = "ROSRESCUE_WRITES", value_enum, hide = true)]
+    pub writes: Option<Writes>,
     /// Number of connections to the master for reads
     #[arg(
         long,
@@ -324,6 +328,15 @@ pub enum ReapNodes {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Reads {
     /// The mirror
+    Mirror,
+    /// The master while it is available
+    Master,
+}
+
+/// The side that answers writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Writes {
+    /// The mirror, where it knows the master's answer
     Mirror,
     /// The master while it is available
     Master,

@@ -13,7 +13,7 @@ use ros1_master::{
     xmlrpc::{Reply, Value},
 };
 
-use super::{Ledger, Mark, delivery::Delivery};
+use super::{Ledger, Mark, delivery::Delivery, inner::Notifier};
 use crate::clock;
 
 /// An unregistration that changes nothing in the mirror is added to the pending writes only while there are fewer than
@@ -22,7 +22,7 @@ pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
 /// Maximum memory for the answers to all reads of one multicall, in bytes. Without a limit, a few short reads of a
 /// large state could need any amount. Larger multicalls wait for the master.
-const ANSWER_MOST: usize = 64 << 20;
+pub(super) const ANSWER_MOST: usize = 64 << 20;
 
 /// Maximum memory for the answers to all reads of one multicall while there is a master, in bytes. Larger multicalls go
 /// to the master.
@@ -80,7 +80,12 @@ impl Ledger {
             return None;
         }
         let number = inner.order.begin(now, heard);
-        let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
+        let reply = inner.apply(
+            now,
+            write,
+            Notifier::Rosrescue { changes: false },
+            &self.outbox_changed,
+        );
         // The master refuses calls with its own messages.
         let refused = match &reply {
             Reply::Value(value) => is_refusal(value),
@@ -166,7 +171,12 @@ impl Ledger {
         let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
         let before = call.ends_early().then(|| inner.mirror.clone());
-        let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
+        let reply = inner.apply(
+            now,
+            call,
+            Notifier::Rosrescue { changes },
+            &self.outbox_changed,
+        );
         origin.note_in(&mut inner.mirror, call);
         let mut writes: Vec<&Request> = match reply {
             // The answer cannot be encoded, so it does not show which writes were accepted. All count as accepted,

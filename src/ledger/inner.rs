@@ -41,6 +41,9 @@ pub(super) struct Inner {
     /// The write on its way to the master that the journal already holds, and the mirror does not.
     pub(super) ahead: Option<Arc<Request>>,
     pub(super) pending: PendingWrites,
+    /// The record of the last pending write that the master is known to have run. The journal gets to know it when there
+    /// is time.
+    pub(super) acknowledged: u64,
     pub(super) activity: Activity,
     pub(super) order: Order,
     pub(super) diverged: Divergences,
@@ -61,6 +64,17 @@ pub(super) struct Inner {
     pub(super) session_unwritten: bool,
 }
 
+/// Who notifies nodes of a call's effects.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Notifier {
+    /// The master, which has run the call.
+    Master,
+    /// The master, when it runs the call.
+    MasterLater,
+    /// rosrescue, in place of a master. `changes` says whether the call changes the mirror.
+    Rosrescue { changes: bool },
+}
+
 impl Inner {
     /// See [`Ledger::new`](super::Ledger::new).
     pub(super) fn new(mirror: Master, session: Session, pending: Vec<Request>) -> Self {
@@ -74,6 +88,7 @@ impl Inner {
             whole: Whole::default(),
             ahead: None,
             pending: PendingWrites::default(),
+            acknowledged: 0,
             activity: Activity::default(),
             order: Order::default(),
             diverged: Divergences::default(),
@@ -90,15 +105,18 @@ impl Inner {
         inner
     }
 
-    /// Applies `call` to the mirror. `standing_in` is `None` if a master notifies the nodes. Otherwise rosrescue must
-    /// notify them, and the value says whether `call` changes the mirror.
+    /// Applies `call` to the mirror. `notifier` says who notifies the nodes.
     pub(super) fn apply(
         &mut self,
         now: Instant,
         call: &Request,
-        standing_in: Option<bool>,
+        notifier: Notifier,
         outbox_changed: &Notify,
     ) -> Reply {
+        let standing_in = match notifier {
+            Notifier::Rosrescue { changes } => Some(changes),
+            Notifier::Master | Notifier::MasterLater => None,
+        };
         let mut noticed = Noticed::new(standing_in.is_some());
         noticed.left_to_master = self.order.is_left_to_master();
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
@@ -118,6 +136,7 @@ impl Inner {
                     outbox_changed.notify_one();
                 }
             }
+            None if notifier == Notifier::MasterLater => {}
             None => {
                 for (subject, nodes) in noticed.subjects() {
                     self.order.told_by_master(now, &subject, nodes);
@@ -160,7 +179,8 @@ impl Inner {
     }
 
     pub(super) fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
-        if self.pending.extend(writes).is_err() {
+        let last = self.seq();
+        if self.pending.extend(writes, last).is_err() {
             // If the present master answers again, it gets the mirror's whole state.
             self.raise_incarnation();
             self.write_session();
@@ -170,6 +190,7 @@ impl Inner {
     pub(super) fn raise_incarnation(&mut self) {
         self.behind = None;
         self.pending.clear();
+        self.acknowledged = 0;
         self.session.incarnation += 1;
         self.session.delivered = self.seq();
         self.session_unwritten = true;

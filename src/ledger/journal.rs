@@ -176,6 +176,11 @@ impl Journal {
         self.shared.seen().clone()
     }
 
+    /// Whether records are written.
+    pub(super) fn protects(&self) -> bool {
+        self.gives && self.shared.seen().unprotected.is_none()
+    }
+
     /// Takes the name under which a foreign file at the checkpoint's path was kept.
     pub(super) fn take_kept(&self) -> Option<PathBuf> {
         self.shared.seen().kept.take()

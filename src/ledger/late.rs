@@ -18,6 +18,8 @@ pub(super) struct LateState {
     /// The topics, parameters and node names about which the outstanding calls may make the master notify nodes.
     pub(super) tells: Vec<Subject>,
     pub(super) answered: bool,
+    /// Whether [`Self::state`] is what the master will have. Not if the mirror had answered later calls first.
+    pub(super) is_exact: bool,
 }
 
 /// How to bring a late master up to date.

@@ -1,5 +1,7 @@
 //! Writes that the mirror has answered and that the present master may not have run.
 
+use std::collections::BTreeSet;
+
 use ros1_master::{master::Request, xmlrpc::Value};
 
 /// Maximum number of pending writes.
@@ -16,13 +18,17 @@ pub(super) struct TooMany;
 #[derive(Debug, Default)]
 pub(super) struct PendingWrites {
     calls: Vec<Request>,
+    /// The number of each write's record in the journal.
+    seqs: Vec<u64>,
+    /// The records of writes that the master has run before an earlier one.
+    run: BTreeSet<u64>,
     bytes: usize,
     /// Number of pending writes that come from a checkpoint.
     restored: usize,
 }
 
 impl PendingWrites {
-    /// Adds `calls`.
+    /// Adds `calls`, whose records in the journal end with number `last`.
     ///
     /// # Errors
     ///
@@ -30,11 +36,16 @@ impl PendingWrites {
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,
+        last: u64,
     ) -> Result<(), TooMany> {
+        let before = self.calls.len();
         for call in calls {
-            self.bytes += call.params().iter().map(Value::size).sum::<usize>();
+            self.bytes += size(&call);
             self.calls.push(call);
         }
+        let added = self.calls.len() - before;
+        let first = (last + 1).saturating_sub(added as u64);
+        self.seqs.extend((first..).take(added));
         if self.calls.len() > COUNT_MAX || self.bytes > BYTES_MAX {
             self.clear();
             return Err(TooMany);
@@ -49,10 +60,32 @@ impl PendingWrites {
 
     /// Drops the pending writes that come from a checkpoint.
     pub(super) fn forget_restored(&mut self) {
-        let calls = self.calls.split_off(self.restored);
-        self.clear();
-        // This cannot fail, because there are fewer writes than before.
-        let _ = self.extend(calls);
+        self.drop_first(self.restored);
+    }
+
+    /// Notes that the master has run the write with record `seq`, and drops it once all earlier ones have been run. The
+    /// master may run writes in another order if they are about different things. Returns the record of the last write
+    /// that was dropped.
+    pub(super) fn acknowledge(&mut self, seq: u64) -> Option<u64> {
+        self.run.insert(seq);
+        let is_run = |seq: &&u64| self.run.contains(seq);
+        let count = self.seqs.iter().take_while(is_run).count();
+        let last = self.seqs.get(count.checked_sub(1)?).copied();
+        self.drop_first(count);
+        self.run.retain(|seq| Some(*seq) > last);
+        last
+    }
+
+    fn drop_first(&mut self, count: usize) {
+        self.seqs.drain(..count);
+        let gone = self.calls.drain(..count);
+        self.bytes -= gone.map(|call| size(&call)).sum::<usize>();
+        self.restored = self.restored.saturating_sub(count);
+    }
+
+    /// Whether `call` can be added, and there are fewer than `most` pending writes.
+    pub(super) fn has_room_for(&self, call: &Request, most: usize) -> bool {
+        self.calls.len() < most && self.bytes + size(call) <= BYTES_MAX
     }
 
     /// Whether this process has added `call`. Calls from a checkpoint do not count.
@@ -70,6 +103,11 @@ impl PendingWrites {
     }
 }
 
+/// The size of a call's parameters in bytes, approximately.
+fn size(call: &Request) -> usize {
+    call.params().iter().map(Value::size).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,10 +117,10 @@ mod tests {
     fn a_write_that_a_checkpoint_has_too_outlives_it() {
         let write = || Request::new(Method::SetParam, ["/n", "/k", "v"]);
         let mut pending = PendingWrites::default();
-        pending.extend([write()]).unwrap();
+        pending.extend([write()], 0).unwrap();
         pending.are_restored();
         assert!(!pending.contains(&write()));
-        pending.extend([write()]).unwrap();
+        pending.extend([write()], 0).unwrap();
         assert!(pending.contains(&write()));
         pending.forget_restored();
         assert_eq!(pending.calls(), [write()]);
@@ -93,13 +131,19 @@ mod tests {
         let write = |text: String| Request::new(Method::SetParam, ["/n", "/k", text.as_str()]);
         let mut pending = PendingWrites::default();
         for _ in 0..COUNT_MAX {
-            pending.extend([write(String::new())]).unwrap();
+            pending.extend([write(String::new())], 0).unwrap();
         }
-        assert!(pending.extend([write(String::new())]).is_err());
+        assert!(pending.extend([write(String::new())], 0).is_err());
         assert_eq!(pending.calls(), []);
-        pending.extend([write("x".repeat(BYTES_MAX / 2))]).unwrap();
-        assert!(pending.extend([write("x".repeat(BYTES_MAX / 2))]).is_err());
-        pending.extend([write(String::new())]).unwrap();
+        pending
+            .extend([write("x".repeat(BYTES_MAX / 2))], 0)
+            .unwrap();
+        assert!(
+            pending
+                .extend([write("x".repeat(BYTES_MAX / 2))], 0)
+                .is_err()
+        );
+        pending.extend([write(String::new())], 0).unwrap();
         assert_eq!(pending.calls().len(), 1);
     }
 }

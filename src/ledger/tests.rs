@@ -267,7 +267,7 @@ fn what_is_left_to_a_late_master_is_owed_until_the_next_one_serves() {
     ledger.with_order(|order, _| order.sent(concern.tells(), Vec::new()));
     // The master is late with the call, so the mirror answers it. Then the master answers, and dies.
     ledger.stand_in(now, &publish);
-    ledger.fall_behind(now, concern.tells().to_vec());
+    ledger.fall_behind(now, concern.tells().to_vec(), true);
     ledger.late_answered(now);
     ledger.abandon_batch();
     let queued = ledger.queue_owed(now, now, Telling::Now);

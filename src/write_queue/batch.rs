@@ -65,6 +65,16 @@ pub(crate) struct Item {
     pub patience: Option<Instant>,
     /// Set for a call that unregisters dead nodes before another one.
     pub(super) evicted: Option<Evicted>,
+    /// The mirror's answer, if the caller has got it before the master has run the call.
+    pub(super) first: Option<First>,
+}
+
+/// The mirror's answer to a call that the master must still run.
+#[derive(Debug)]
+pub(super) struct First {
+    pub(super) reply: Reply,
+    /// The number of the call's record in the journal.
+    pub(super) seq: u64,
 }
 
 /// Dead nodes that a call unregisters.
@@ -127,6 +137,7 @@ impl Item {
             merge: None,
             patience: None,
             evicted: None,
+            first: None,
         };
         (item, answered)
     }
@@ -169,7 +180,13 @@ impl Item {
     /// Whether the answer is no longer awaited: the call is answered, or its client has disconnected.
     pub(super) fn is_dropped(&self) -> bool {
         let caller = self.caller.as_ref();
-        self.evicted.is_none() && caller.is_none_or(|caller| caller.0.is_closed())
+        let is_kept = self.evicted.is_some() || self.is_answered_first();
+        !is_kept && caller.is_none_or(|caller| caller.0.is_closed())
+    }
+
+    /// Whether the caller has got the mirror's answer, and the master must still run the call.
+    pub(super) fn is_answered_first(&self) -> bool {
+        self.first.is_some()
     }
 
     /// Logs the nodes that the call has unregistered, if it is an eviction and `answer` answers it.
@@ -265,7 +282,9 @@ pub(crate) fn pack(
             break;
         };
         bytes += item.weight();
-        item.delivery = order.begin(now, item.concern.heard()).map(&delivery);
+        if !item.is_answered_first() {
+            item.delivery = order.begin(now, item.concern.heard()).map(&delivery);
+        }
         batch.items.push(item);
         if is_alone {
             break;

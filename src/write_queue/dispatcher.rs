@@ -12,7 +12,7 @@ use bytes::Bytes;
 
 use super::{
     MoveJudge,
-    batch::{self, Batch, CallAnswer, Caller, Item},
+    batch::{self, Batch, CallAnswer, Caller, First, Item},
     evict, merge,
     outdated::is_outdated,
     resync::ResyncSchedule,
@@ -25,8 +25,13 @@ use ros1_master::{
 };
 
 use crate::{
+    cli::Writes,
     gate::State,
-    ledger::{Ledger, Mark, delivery::Delivery},
+    ledger::{
+        Ledger, Mark,
+        delivery::Delivery,
+        first::{Acknowledged, AnsweredFirst},
+    },
     limit::rarely,
     status::stats::Stats,
     upstream::{Head, RawReply},
@@ -37,6 +42,9 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// How long a batch may continue after calls no longer pass to the master, before the mirror answers it. A killed
 /// master closes its connections within milliseconds. A master that only closed an idle connection still answers.
 const GRACE: Duration = Duration::from_millis(5);
+/// How long the journal may not know which writes the master has run. A rosrescue that starts meanwhile gives them to
+/// the master once more, although a program may have changed the master directly since.
+const ACKNOWLEDGE_AFTER: Duration = Duration::from_millis(10);
 /// Time after which the mirror answers in place of a master that has not answered. A rosmaster answers within a
 /// millisecond, or within some ten milliseconds if another call keeps its Python interpreter busy.
 pub(crate) const PATIENCE: Duration = Duration::from_millis(100);
@@ -186,6 +194,8 @@ pub(super) struct Dispatcher {
     ledger: Arc<Ledger>,
     judge: Arc<dyn MoveJudge>,
     stats: &'static Stats,
+    /// Who answers writes first.
+    writes: Writes,
     /// Calls that have not been sent, in the order of their arrival.
     queue: VecDeque<Item>,
     exchange: Exchange,
@@ -199,6 +209,10 @@ pub(super) struct Dispatcher {
     held_until: Option<Instant>,
     /// When the master counts as late with the request in flight.
     late_at: Option<Instant>,
+    /// Whether the last input has shown that a master will not run all calls that the mirror has answered first.
+    has_left_out: bool,
+    /// When the journal gets to know which writes the master has run.
+    acknowledge_at: Option<Instant>,
     actions: Vec<Action>,
 }
 
@@ -207,12 +221,14 @@ impl Dispatcher {
         ledger: Arc<Ledger>,
         judge: Arc<dyn MoveJudge>,
         stats: &'static Stats,
+        writes: Writes,
         patience: Patience,
     ) -> Self {
         Self {
             ledger,
             judge,
             stats,
+            writes,
             queue: VecDeque::new(),
             exchange: Exchange::Idle { not_before: None },
             opaque: Opaque::default(),
@@ -221,6 +237,8 @@ impl Dispatcher {
             patience,
             held_until: None,
             late_at: None,
+            has_left_out: false,
+            acknowledge_at: None,
             actions: Vec::new(),
         }
     }
@@ -237,6 +255,16 @@ impl Dispatcher {
             }
             Input::Patience(patience) => self.patience = patience,
             Input::Wake => {}
+        }
+        if view.gate
+            != (State::Open {
+                incarnation: self.incarnation,
+            })
+        {
+            self.leave_out_answered();
+        }
+        if self.acknowledge_at.take_if(|at| *at <= view.now).is_some() {
+            self.ledger.record_acknowledged();
         }
         // Drops calls that are answered or whose client has gone.
         self.queue.retain(|item| !item.is_dropped());
@@ -276,7 +304,12 @@ impl Dispatcher {
             Exchange::Lost | Exchange::LateEnded => None,
         };
         let impatient = self.waiting().filter_map(|item| item.patience).min();
-        let others = [self.held_until, self.late_at, self.inspections.wake_at()];
+        let others = [
+            self.held_until,
+            self.late_at,
+            self.acknowledge_at,
+            self.inspections.wake_at(),
+        ];
         let others = others.into_iter().flatten();
         exchange.into_iter().chain(impatient).chain(others).min()
     }
@@ -308,9 +341,121 @@ impl Dispatcher {
                 && item.patience.is_some()
                 && self.answer_if_unchanged(view.now, &mut item);
             if !is_answered {
+                if self.may_answer_first(view, &item) {
+                    self.answer_first(view.now, &mut item);
+                }
                 self.queue.push_back(item);
             }
         }
+    }
+
+    /// Whether the mirror may answer this call before the master has run it. The master must run calls in the order in
+    /// which the mirror has applied them, so no other call may wait for the master's answer.
+    fn may_answer_first(&self, view: &View, item: &Item) -> bool {
+        let waits = |item: &Item| !item.is_answered_first();
+        let is_behind = match &self.exchange {
+            Exchange::Idle { .. } => false,
+            Exchange::InFlight(InFlight {
+                work: Work::Calls(items),
+                ..
+            }) => items.iter().any(waits),
+            _ => true,
+        };
+        self.writes == Writes::Mirror
+            && view.leads
+            && view.gate
+                == (State::Open {
+                    incarnation: self.incarnation,
+                })
+            && !is_behind
+            && !self.queue.iter().any(waits)
+            && self.opaque.answers.is_empty()
+            && item.raw.as_ref().is_some_and(|(head, _)| head.is_for_rpc())
+            && item.merge.is_none()
+            && item.answerable().is_some_and(|call| {
+                let judge = &self.judge;
+                self.ledger
+                    .with_mirror(|mirror| judge.first_apart(mirror, &[call]).is_none())
+            })
+    }
+
+    fn answer_first(&mut self, now: Instant, item: &mut Item) {
+        let Some(call) = item.answerable() else {
+            return;
+        };
+        let registers = registers(call);
+        let first = self
+            .ledger
+            .answer_first(now, call, item.concern(), item.origin);
+        let Some(AnsweredFirst {
+            reply,
+            mark,
+            delivery,
+            seq,
+        }) = first
+        else {
+            return;
+        };
+        let Some(caller) = item.take_caller() else {
+            return;
+        };
+        if registers {
+            self.judge.registered();
+        }
+        item.patience = None;
+        item.first = Some(First {
+            reply: reply.clone(),
+            seq,
+        });
+        let answers = Answers {
+            mark: self.ledger.to_await(mark),
+            version: None,
+            made: vec![(caller, CallAnswer::Made(reply), delivery)],
+        };
+        self.actions.push(Action::Answer(answers));
+    }
+
+    /// Leaves out the calls that the mirror has answered first: the state that a master gets has them.
+    fn leave_out_answered(&mut self) {
+        let (ledger, before) = (&self.ledger, self.queue.len());
+        self.queue.retain(|item| {
+            if let Some(First { seq, .. }) = &item.first {
+                ledger.is_left_out(*seq, item.concern());
+            }
+            !item.is_answered_first()
+        });
+        self.has_left_out = self.queue.len() < before;
+    }
+
+    /// Notes what the master has answered to the calls that the mirror has answered first. Without `replies`, that is not
+    /// known. False if another master is about to get the state.
+    fn acknowledge(
+        &mut self,
+        now: Instant,
+        incarnation: u64,
+        items: &[Item],
+        replies: &[Reply],
+    ) -> bool {
+        let acknowledged = items.iter().enumerate().filter_map(|(index, item)| {
+            let First {
+                reply: predicted,
+                seq,
+            } = item.first.as_ref()?;
+            Some(Acknowledged {
+                seq: *seq,
+                concern: item.concern(),
+                predicted,
+                reply: replies.get(index),
+            })
+        });
+        let acknowledged: Vec<_> = acknowledged.collect();
+        if acknowledged.is_empty() {
+            return true;
+        }
+        self.acknowledge_at.get_or_insert(now + ACKNOWLEDGE_AFTER);
+        self.ledger
+            .acknowledge(now, incarnation, &acknowledged)
+            .is_ok()
     }
 
     /// Answers the calls whose patience has ended, if they change nothing. A call that the master has answered already
@@ -403,6 +548,7 @@ impl Dispatcher {
             self.ledger.withdraw();
             self.actions.push(Action::Disconnect);
             self.take_back_in_flight();
+            self.leave_out_answered();
         }
         if self.opaque.incarnation != incarnation {
             let opaque = std::mem::take(&mut self.opaque).answers;
@@ -423,7 +569,9 @@ impl Dispatcher {
         {
             own.reply(CallAnswer::Close);
         }
-        let inspects = self.inspections.begin(now);
+        // The mirror has applied calls that the master has not got.
+        let is_ahead = self.queue.iter().any(Item::is_answered_first);
+        let inspects = !is_ahead && self.inspections.begin(now);
         let items = match inspects {
             true => Vec::new(),
             false => self.next_batch(now),
@@ -442,6 +590,7 @@ impl Dispatcher {
             order.sent(tells, answers.map(Delivery::number).collect());
         });
         if let [item] = items.as_slice()
+            && !item.is_answered_first()
             && let Some(call) = item.call.as_ref().filter(|_| item.raw.is_some())
         {
             self.ledger.record_ahead(call, item.origin);
@@ -618,7 +767,7 @@ impl Dispatcher {
             return items;
         };
         let mut length = 1;
-        if first.raw.is_some() && !first.way_made {
+        if first.raw.is_some() && !first.way_made && !first.is_answered_first() {
             if let Some(call) = first.call.as_deref()
                 && let Some(eviction) = self.judge.judge(&ledger, call)
             {
@@ -664,24 +813,24 @@ impl Dispatcher {
             ([_], None) => Vec::new(),
             (_, Some(reply)) => match batch::unpack(&reply, items.len()) {
                 Some(replies) => replies,
-                None => return self.undeliverable(items),
+                None => return self.undeliverable(now, incarnation, items),
             },
-            (_, None) => return self.undeliverable(items),
+            (_, None) => return self.undeliverable(now, incarnation, items),
         };
+        if !self.acknowledge(now, incarnation, &items, &replies) {
+            return self.superseded(items);
+        }
         let answered: Vec<_> = items
             .iter()
             .zip(&replies)
+            .filter(|(item, _)| !item.is_answered_first())
             .filter_map(|(item, reply)| {
                 Some((item.call.as_deref()?, reply, &item.source, item.origin))
             })
             .collect();
         let registered = answered.iter().any(|(call, ..)| registers(call));
         let Ok(recorded) = self.ledger.record(now, incarnation, &answered) else {
-            // The gate is about to open for another master.
-            self.ledger.withdraw();
-            self.take_back(items);
-            self.exchange = Exchange::Lost;
-            return;
+            return self.superseded(items);
         };
         if registered {
             self.judge.registered();
@@ -695,6 +844,7 @@ impl Dispatcher {
             self.opaque.mark = self.opaque.mark.max(recorded.mark);
             let answers = items
                 .into_iter()
+                .filter(|item| !item.is_answered_first())
                 .map(|item| (item, CallAnswer::Raw(raw.clone())));
             self.opaque.answers.extend(answers);
             return;
@@ -713,8 +863,16 @@ impl Dispatcher {
         self.answer(recorded.mark, version, answers);
     }
 
+    /// Takes back a batch whose answers do not count, because the gate is about to open for another master.
+    fn superseded(&mut self, items: Vec<Item>) {
+        self.ledger.withdraw();
+        self.take_back(items);
+        self.exchange = Exchange::Lost;
+    }
+
     /// Handles a batch whose reply is one answer instead of a result for each call.
-    fn undeliverable(&mut self, items: Vec<Item>) {
+    fn undeliverable(&mut self, now: Instant, incarnation: u64, items: Vec<Item>) {
+        self.acknowledge(now, incarnation, &items, &[]);
         rarely!(
             warn,
             calls = items.len(),
@@ -765,14 +923,14 @@ impl Dispatcher {
                     Work::Inspection => {
                         // A read of the master's state was under way, and must be repeated.
                         self.inspections.request();
-                        self.ledger.fall_behind(now, Vec::new());
+                        self.ledger.fall_behind(now, Vec::new(), true);
                     }
                     Work::Calls(items) => self.answer_late_batch(now, items),
                 }
             }
             // The master has answered the batch just now.
             Exchange::Idle { .. } | Exchange::Lost => {
-                self.ledger.fall_behind(now, Vec::new());
+                self.ledger.fall_behind(now, Vec::new(), !self.has_left_out);
                 self.late_ended(now, true);
             }
             Exchange::LateEnded => {}
@@ -786,11 +944,15 @@ impl Dispatcher {
         for mut item in items {
             item.delivery = None;
             tells.extend_from_slice(item.concern().tells());
+            if let Some(First { seq, .. }) = &item.first {
+                self.ledger.is_left_out(*seq, item.concern());
+                continue;
+            }
             if let Some(item) = answers.add(&self.ledger, now, item) {
                 self.queue.push_front(item);
             }
         }
-        self.ledger.fall_behind(now, tells);
+        self.ledger.fall_behind(now, tells, !self.has_left_out);
         self.give(answers);
     }
 

@@ -37,7 +37,7 @@ use self::{
     outbox::{Outbox, Payload},
     under_way::UnderWay,
 };
-use crate::{master::Master, xmlrpc::Call};
+use crate::{health::port_of, master::Master, xmlrpc::Call};
 
 /// How long a notification of rosrescue waits after an answer about the same [`Subject`] was written. A notification of
 /// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.
@@ -69,6 +69,9 @@ pub struct Order {
     outbox: Outbox,
     /// The calls that the master has not answered yet. The master may be notifying nodes because of them.
     in_flight: InFlight,
+    /// What the master will notify nodes of when it runs the writes that the mirror has answered first, by the number of
+    /// the write.
+    unacknowledged: BySubject<u64>,
     /// The topics, parameters and names about which the master has recently notified nodes.
     told: Told,
     /// Whether the master was late and has neither got calls again nor gone since. Then it may still be sending
@@ -145,9 +148,49 @@ impl Order {
     /// answer could be older than a notification that the master sends to the reader.
     pub fn read_must_wait(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
-        let waits = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
+        let waits = heard.any(|heard| self.master_will_tell(&heard.subject));
         self.awaited |= waits;
         waits
+    }
+
+    /// Whether the answer to a write may not be given before the master has run it: the answer is about something of
+    /// which the master may be notifying the caller, who has subscribed to it before.
+    pub fn answer_must_wait(&self, mirror: &Master, heard: &[Heard]) -> bool {
+        let is_told = |heard: &Heard| match &heard.subject {
+            Subject::Topic(topic) => {
+                let subscribers = mirror.subscribers_of(topic);
+                subscribers.iter().any(|api| port_of(api) == heard.port)
+            }
+            Subject::Param(_) => true,
+            Subject::Name(_) => false,
+        };
+        let mut heard = heard.iter();
+        heard.any(|heard| is_told(heard) && self.master_will_tell(&heard.subject))
+    }
+
+    /// Whether the master may notify nodes of `subject` because of calls that it has not answered.
+    fn master_will_tell(&self, subject: &Subject) -> bool {
+        self.in_flight.tells.has(subject) || self.unacknowledged.has(subject)
+    }
+
+    /// Notes that the mirror has answered a write first, and that the master may notify nodes about `tells` when it runs
+    /// it. `write` is any number that identifies it.
+    pub fn answered_first<'a>(&mut self, write: u64, tells: impl IntoIterator<Item = &'a Subject>) {
+        let tells = tells.into_iter();
+        let tells = tells.filter(|it| !matches!(it, Subject::Name(_)));
+        tells.for_each(|subject| self.unacknowledged.add(subject, write));
+    }
+
+    /// Notes that the master has run the write of [`Self::answered_first`], or never will. Returns whether a call or a
+    /// notification waits for that.
+    pub fn acknowledged<'a>(
+        &mut self,
+        write: u64,
+        tells: impl IntoIterator<Item = &'a Subject>,
+    ) -> bool {
+        let tells = tells.into_iter();
+        tells.for_each(|subject| self.unacknowledged.remove(subject, write));
+        std::mem::take(&mut self.awaited)
     }
 
     /// Notes that the master gets calls because of which it may notify nodes about `tells`. `answers` are the numbers
@@ -212,7 +255,7 @@ impl Order {
     /// Whether the master, and not rosrescue, may notify nodes of what the mirror answers now: it is late, or is still
     /// being examined since it was, or it has not answered its calls. It may die before it sends these notifications.
     pub fn is_left_to_master(&self) -> bool {
-        self.is_late || !self.in_flight.tells.is_empty()
+        self.is_late || !self.in_flight.tells.is_empty() || !self.unacknowledged.is_empty()
     }
 
     /// Whether the master is late, or is still being examined since it was.
@@ -246,7 +289,7 @@ impl Order {
             self.repeats.add(until, port.to_owned(), subject);
             return;
         }
-        let is_news = !self.in_flight.tells.has(&subject);
+        let is_news = !self.master_will_tell(&subject);
         let content = is_news.then_some(Payload::Call(call));
         self.outbox
             .add(port, subject, content.unwrap_or(Payload::State));
@@ -289,7 +332,7 @@ impl Order {
             };
             let subject = subject.clone();
             let told = self.told.until(now, &subject);
-            let is_being_told = self.in_flight.tells.has(&subject);
+            let is_being_told = self.master_will_tell(&subject);
             let Some(notification) = self.outbox.pop(port) else {
                 continue;
             };

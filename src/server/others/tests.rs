@@ -17,12 +17,12 @@ use super::{
     *,
 };
 use crate::{
-    cli::{Reads, SyncPolicy},
+    cli::{Reads, SyncPolicy, Writes},
     gate,
     ledger::Ledger,
     ros_env::MasterUri,
     upstream::{Upstream, pool::Pool},
-    write_queue::write_queue,
+    write_queue::{Link, write_queue},
 };
 
 const OWN: &str = "http://127.0.0.1:11311/";
@@ -76,12 +76,15 @@ impl Computer {
         let nobody = MasterUri::parse("http://127.0.0.1:1/").unwrap();
         let upstream = Arc::new(Upstream::new(nobody, second, 3));
         let (write_queue, _) = write_queue(
-            ledger.clone(),
-            upstream.clone(),
+            Link {
+                ledger: ledger.clone(),
+                upstream: upstream.clone(),
+            },
             gate.clone(),
             stats,
             None,
             Arc::new(()),
+            Writes::Master,
             rescue_core::lifecycle::Patience::new(second),
         );
         let (standing, standing_rx) = watch::channel(standing);

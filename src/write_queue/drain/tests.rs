@@ -17,7 +17,7 @@ use tokio::sync::oneshot;
 
 use super::*;
 use crate::{
-    cli::SyncPolicy,
+    cli::{SyncPolicy, Writes},
     gate::{State, gate},
     ledger::Ledger,
     upstream::{Head, sentinel::Sentinel, test_master, verify::Verification},
@@ -68,12 +68,15 @@ impl Served {
         let patience = Patience::new(Duration::from_secs(60));
         let judge = Arc::new(());
         let (queue, drain) = write_queue(
-            ledger.clone(),
-            upstream,
+            Link {
+                ledger: ledger.clone(),
+                upstream,
+            },
             gate_rx,
             stats,
             None,
             judge,
+            Writes::Master,
             patience,
         );
         tokio::spawn(drain.run());

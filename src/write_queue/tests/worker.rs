@@ -51,6 +51,7 @@ impl Parts {
     pub(super) fn begin(
         disk: Option<&Disk>,
         supervision: Supervision,
+        writes: Writes,
         stats: &'static Stats,
     ) -> Self {
         let opened = disk.map(|disk| Store::open(&disk.folder.path().join("chkpt.yaml")).unwrap());
@@ -87,7 +88,7 @@ impl Parts {
             stats,
         };
         Self {
-            dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, patience),
+            dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, writes, patience),
             ledger,
             gate,
             recovery: Recovery::new(examiner, is_restored),
@@ -165,7 +166,7 @@ impl World {
     fn replace(&mut self, reads: bool) -> bool {
         let disk = self.disk.as_ref().filter(|_| reads);
         let (supervision, numbers) = (self.recovery.supervision, self.recovery.numbers());
-        let parts = Parts::begin(disk, supervision, self.stats);
+        let parts = Parts::begin(disk, supervision, self.writes, self.stats);
         self.ledger = parts.ledger;
         (self.dispatcher, self.gate) = (parts.dispatcher, parts.gate);
         self.recovery = parts.recovery;

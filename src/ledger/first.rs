@@ -1,0 +1,164 @@
+//! Writes that the mirror answers before the master has run them.
+
+use std::{sync::Arc, time::Instant};
+
+use rescue_core::{
+    checkpoint::format::{Label, Origin, RecordContent},
+    order::Concern,
+};
+use ros1_master::{
+    master::{Request, Write},
+    xmlrpc::{Reply, Value},
+};
+
+use super::{
+    Ledger, Mark, Superseded, answers::ANSWER_MOST, delivery::Delivery, inner::Notifier,
+    shared::Shared, told_by_master,
+};
+use crate::clock;
+
+/// Maximum number of writes that the master has not run yet. Further ones wait for it.
+const UNACKNOWLEDGED_MAX: usize = 1000;
+
+/// A write that the mirror has answered first.
+#[derive(Debug)]
+pub(crate) struct AnsweredFirst {
+    pub(crate) reply: Reply,
+    /// Identifies the write's record, for which the answer must wait.
+    pub(crate) mark: Mark,
+    pub(crate) delivery: Option<Delivery>,
+    /// The number of the write's record in the journal.
+    pub(crate) seq: u64,
+}
+
+/// What the master has answered to a write that the mirror has answered first.
+pub(crate) struct Acknowledged<'a> {
+    pub(crate) seq: u64,
+    pub(crate) concern: &'a Concern,
+    pub(crate) predicted: &'a Reply,
+    /// `None` if it is not known.
+    pub(crate) reply: Option<&'a Reply>,
+}
+
+impl Ledger {
+    /// Answers a write before the master has run it, and records it as pending. The master notifies nodes when it runs
+    /// it. `None` if the master must run it first:
+    ///
+    /// * the mirror or the journal is in doubt, or nothing would keep the write if this process ended;
+    /// * the master may refuse the write, or would shut a node down;
+    /// * the answer is about something of which the master may be notifying the caller right now;
+    /// * too many writes wait for the master.
+    pub(crate) fn answer_first(
+        self: &Arc<Self>,
+        now: Instant,
+        call: &Request,
+        concern: &Concern,
+        origin: Origin,
+    ) -> Option<AnsweredFirst> {
+        let mut inner = self.lock();
+        let write = Write::of(call)?;
+        let heard = concern.heard();
+        let is_certain = !inner.injecting
+            && !inner.doubted
+            && !inner.unconfirmed
+            && !inner.abandoned
+            && matches!(inner.shared, Shared::Nobody)
+            && inner.journal.as_ref().is_some_and(|it| it.protects())
+            && inner.pending.has_room_for(call, UNACKNOWLEDGED_MAX)
+            && !inner.mirror.is_inexact()
+            && inner.mirror.accepts(&write)
+            && inner.mirror.displaced_by(call).is_none()
+            && inner.mirror.fits(call, ANSWER_MOST)
+            && !inner.order.answer_must_wait(&inner.mirror, &heard);
+        if !is_certain {
+            return None;
+        }
+        // The answer is begun before the call is applied, because the call may notify its own caller.
+        let number = inner.order.begin(now, heard);
+        let reply = inner.apply(now, call, Notifier::MasterLater, &self.outbox_changed);
+        origin.note_in(&mut inner.mirror, call);
+        let at = clock::wall_millis();
+        self.stats.writes_recorded.count();
+        inner.append(vec![RecordContent::Call {
+            call: call.clone(),
+            pending: true,
+            label: Label { at, origin },
+        }]);
+        inner.add_pending([call.clone()]);
+        let (mark, seq) = (inner.mark(), inner.seq());
+        inner.order.answered_first(seq, concern.tells());
+        drop(inner);
+        self.recorded();
+        Some(AnsweredFirst {
+            reply,
+            mark,
+            delivery: number.map(|number| Delivery::new(self, number)),
+            seq,
+        })
+    }
+
+    /// Notes that the master whose token has the number `incarnation` has run these writes.
+    pub(crate) fn acknowledge(
+        &self,
+        now: Instant,
+        incarnation: u64,
+        writes: &[Acknowledged<'_>],
+    ) -> Result<(), Superseded> {
+        let inner = &mut *self.lock();
+        if inner.session.incarnation != incarnation || inner.injecting {
+            return Err(Superseded);
+        }
+        let mut awaited = false;
+        for write in writes {
+            let tells = write.concern.tells();
+            awaited |= inner.order.acknowledged(write.seq, tells);
+            told_by_master(now, &mut inner.order, &inner.mirror, tells);
+            if let Some(last) = inner.pending.acknowledge(write.seq) {
+                inner.acknowledged = last;
+            }
+            let reply = write.reply;
+            if !reply.is_some_and(|reply| is_same_result(write.predicted, reply)) {
+                self.stats.divergences.count();
+                inner.doubted = true;
+            }
+        }
+        if inner.order.has_new_repeat() {
+            self.outbox_changed.notify_one();
+        }
+        if awaited {
+            self.order_changed.send_replace(());
+        }
+        Ok(())
+    }
+
+    /// Notes that this master will not run the write as a call, because the state that a master gets has it.
+    pub(crate) fn is_left_out(&self, seq: u64, concern: &Concern) {
+        self.release(|order| order.acknowledged(seq, concern.tells()));
+    }
+
+    /// Tells the journal which pending writes the master has run, if it does not know it yet.
+    pub(crate) fn record_acknowledged(&self) {
+        let mut inner = self.lock();
+        if inner.acknowledged <= inner.session.delivered {
+            return;
+        }
+        inner.session.delivered = inner.acknowledged;
+        inner.session_unwritten = true;
+        inner.write_session();
+        drop(inner);
+        self.write();
+        self.work.notify_one();
+    }
+}
+
+/// Whether two answers have the same code and value. The text between them may differ in a changed rosmaster.
+fn is_same_result(one: &Reply, other: &Reply) -> bool {
+    let parts = |reply: &Reply| match reply {
+        Reply::Value(Value::Array(answer)) => match answer.as_slice() {
+            [code, _, value] => Some((code.clone(), value.clone())),
+            _ => None,
+        },
+        _ => None,
+    };
+    parts(one).is_some() && parts(one) == parts(other)
+}
