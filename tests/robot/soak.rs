@@ -514,6 +514,16 @@ fn trouble(disk: &FailingDisk, mut dice: Dice, flags: &Flags) -> BTreeMap<String
 
 #[test]
 fn the_state_always_equals_the_acknowledged_calls_whatever_dies() {
+    soak(&[]);
+}
+
+#[test]
+fn the_state_always_equals_the_acknowledged_calls_if_the_mirror_answers_them_first() {
+    soak(&["--writes", "mirror"]);
+}
+
+/// Plays a while with a `core` that has these `arguments` in addition.
+fn soak(arguments: &[&str]) {
     let seconds = number("ROSRESCUE_SOAK_SECONDS", 30);
     let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
     println!("seed {seed}, {seconds} s");
@@ -521,6 +531,7 @@ fn the_state_always_equals_the_acknowledged_calls_whatever_dies() {
     let disk = FailingDisk::new(&scratch);
     let port = free_port();
     let setup = Setup::core(&scratch, port).arg("--no-rosout").guarded();
+    let setup = setup.args(arguments);
     let rescue = disk.under(setup).start();
     let writer = |index| Writer::new(index, rescue.client());
     let writers: Vec<_> = (0..WRITERS).map(writer).collect();

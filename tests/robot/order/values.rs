@@ -22,6 +22,22 @@ fn no_value_goes_back_while_the_master_lives() {
 }
 
 #[test]
+fn no_value_goes_back_while_the_mirror_answers_first() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout", "--writes", "mirror"]);
+    no_value_goes_back(&robot.client(), || {});
+}
+
+#[test]
+fn no_value_goes_back_while_the_mirror_answers_first_and_the_master_dies_again_and_again() {
+    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--writes", "mirror"]);
+    no_value_goes_back(&robot.client(), || {
+        for _ in 0..3 {
+            robot.crash_master();
+        }
+    });
+}
+
+#[test]
 fn no_value_goes_back_while_standing_in() {
     let mut robot = Robot::start(Mode::Proxy);
     robot.take_master_away();
