@@ -2,13 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use indexmap::IndexMap;
 use rescue_core::checkpoint::format::{
     Checkpoint, Decoded, FormatError, Label, Origin, Record, RecordContent, Session, SnapshotError,
     Stamp, decode, encode_checkpoint, encode_record,
 };
 use ros1_master::{
-    master::{Method, Request, Snapshot, SnapshotNode},
+    master::{Method, OrderedMap, Request, Snapshot, SnapshotNode},
     xmlrpc::{Struct, Value},
 };
 
@@ -21,14 +20,14 @@ fn checkpoint(seq: u64) -> Checkpoint {
             ..Session::default()
         },
         snapshot: Snapshot {
-            nodes: IndexMap::from([(
+            nodes: OrderedMap::from([(
                 "/talker".to_owned(),
                 SnapshotNode {
                     api: "http://robot:40001/".to_owned(),
                     ..SnapshotNode::default()
                 },
             )]),
-            publishers: IndexMap::from([("/chatter".to_owned(), vec!["/talker".to_owned()])]),
+            publishers: OrderedMap::from([("/chatter".to_owned(), vec!["/talker".to_owned()])]),
             params: Struct::from([("rate".to_owned(), Value::Double(10.0))]),
             ..Snapshot::default()
         },

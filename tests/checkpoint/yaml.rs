@@ -5,14 +5,13 @@ mod catalogue;
 mod python;
 
 use self::catalogue::{catalogue, values};
-use indexmap::IndexMap;
 use proptest::prelude::*;
 use rescue_core::checkpoint::format::{
     Checkpoint, DEPTH_MAX, EncodeError, Label, Origin, Record, RecordContent, Session, decode,
     encode_checkpoint, encode_record,
 };
 use ros1_master::{
-    master::{Displaced, Method, Request, ServiceEntry, Snapshot, SnapshotNode},
+    master::{Displaced, Method, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode},
     xmlrpc::{Struct, Value},
 };
 
@@ -66,7 +65,7 @@ fn with_params(params: Struct) -> Checkpoint {
             at: 1_764_115_200_000,
         },
         snapshot: Snapshot {
-            nodes: IndexMap::from([
+            nodes: OrderedMap::from([
                 (
                     "/b".to_owned(),
                     SnapshotNode {
@@ -83,10 +82,10 @@ fn with_params(params: Struct) -> Checkpoint {
                     },
                 ),
             ]),
-            topic_types: IndexMap::from([("/t".to_owned(), "*".to_owned())]),
-            publishers: IndexMap::from([("/t".to_owned(), ids(&["/b", "/a: "]))]),
-            subscribers: IndexMap::new(),
-            services: IndexMap::from([(
+            topic_types: OrderedMap::from([("/t".to_owned(), "*".to_owned())]),
+            publishers: OrderedMap::from([("/t".to_owned(), ids(&["/b", "/a: "]))]),
+            subscribers: OrderedMap::default(),
+            services: OrderedMap::from([(
                 "/s".to_owned(),
                 ServiceEntry {
                     node: "/b".to_owned(),
@@ -94,7 +93,7 @@ fn with_params(params: Struct) -> Checkpoint {
                 },
             )]),
             had_services: true,
-            param_subscribers: IndexMap::from([("/p/".to_owned(), ids(&["~"]))]),
+            param_subscribers: OrderedMap::from([("/p/".to_owned(), ids(&["~"]))]),
             params,
         },
         pending: Vec::new(),

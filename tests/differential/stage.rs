@@ -236,7 +236,7 @@ impl<'n> Stage<'n> {
         let nodes: BTreeSet<String> = callers.chain(known).collect();
         calls.extend(nodes.iter().map(|node| one(node, "lookupNode", "~")));
         calls.extend(nodes.iter().map(|node| one("/a//x", "lookupNode", node)));
-        let services = model.snapshot().services.into_keys();
+        let services = model.registry().services.keys().cloned();
         let services: BTreeSet<String> = services
             .chain(NAMES.iter().map(|name| (*name).to_owned()))
             .collect();

@@ -1,8 +1,6 @@
 //! Describes how the states of the mirror and a master differ.
 
-use indexmap::IndexMap;
-
-use crate::master::Master;
+use crate::master::{Master, OrderedMap};
 use crate::xmlrpc::{Struct, Value};
 
 /// Maximum number of sentences.
@@ -84,8 +82,8 @@ impl Sentences {
     fn map<T>(
         &mut self,
         what: &str,
-        a: &IndexMap<String, T>,
-        b: &IndexMap<String, T>,
+        a: &OrderedMap<T>,
+        b: &OrderedMap<T>,
         mut both: impl FnMut(&mut Self, &str, &T, &T),
     ) {
         for (key, value) in a {
@@ -99,7 +97,7 @@ impl Sentences {
         }
     }
 
-    fn order<T>(&mut self, what: &str, a: &IndexMap<String, T>, b: &IndexMap<String, T>) {
+    fn order<T>(&mut self, what: &str, a: &OrderedMap<T>, b: &OrderedMap<T>) {
         if a.len() == b.len() && a.keys().all(|key| b.contains_key(key)) && !a.keys().eq(b.keys()) {
             self.add(|| format!("the {what} are in another order"));
         }

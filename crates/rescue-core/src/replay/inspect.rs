@@ -7,7 +7,9 @@ use thiserror::Error;
 
 use super::{Token, TokenState, order};
 use crate::master::names::{self, CALLER_ID};
-use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
+use crate::master::{
+    Master, Method, OrderedMap, Registrations, Request, ServiceEntry, Snapshot, SnapshotNode,
+};
 use crate::xmlrpc::{Reply, Struct, Value};
 
 /// Why the answer to an inspection cannot be used.
@@ -63,10 +65,10 @@ impl Inspection {
     /// as on Python 2.
     pub fn arrange_like(&mut self, mirror: &Master) {
         let registry = mirror.registry();
-        order::arrange(&mut self.publishers, &registry.publishers);
-        order::arrange(&mut self.subscribers, &registry.subscribers);
-        order::arrange(&mut self.services, &registry.services);
-        order::arrange(&mut self.topic_types, mirror.topic_types());
+        order::arrange(&mut self.publishers, registry.publishers.keys());
+        order::arrange(&mut self.subscribers, registry.subscribers.keys());
+        order::arrange(&mut self.services, registry.services.keys());
+        order::arrange(&mut self.topic_types, mirror.topic_types().keys());
         if let Some(params) = &mut self.params {
             order::arrange_params(params, mirror.params());
         }
@@ -232,7 +234,7 @@ impl Inspection {
                 .params
                 .clone()
                 .unwrap_or_else(|| previous.params().clone()),
-            topic_types: self.topic_types.clone(),
+            topic_types: self.topic_types.clone().into_iter().collect(),
             had_services: previous.registry().had_services,
             ..Snapshot::default()
         };
@@ -290,7 +292,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
     ];
     let registered = shared
         .into_iter()
-        .flat_map(IndexMap::values)
+        .flat_map(OrderedMap::values)
         .flatten()
         .cloned();
     let providers = found.services.values().map(|entry| entry.node.clone());
@@ -319,9 +321,9 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
 
 /// The registrations of the nodes that `of` accepts, without lists that would be empty.
 fn retain_nodes(
-    registrations: IndexMap<String, Vec<String>>,
+    registrations: impl IntoIterator<Item = (String, Vec<String>)>,
     of: impl Fn(&str) -> bool,
-) -> IndexMap<String, Vec<String>> {
+) -> Registrations {
     let lists = registrations.into_iter().filter_map(|(key, mut nodes)| {
         nodes.retain(|node| of(node));
         (!nodes.is_empty()).then_some((key, nodes))

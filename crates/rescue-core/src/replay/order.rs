@@ -1,13 +1,19 @@
 //! Compares masters with unordered dictionaries, as on Python 2. Their answers show an order that no call has
 //! determined, and that another master with the same state may not have.
 
+use std::collections::HashMap;
+
 use indexmap::IndexMap;
 
 use crate::xmlrpc::{Reply, Struct, Value};
 
 /// Puts `found` into the order of `known`. Whatever only `found` has comes last, in its own order.
-pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<String, B>) {
-    let place = |key: &str| known.get_index_of(key).unwrap_or(usize::MAX);
+pub(super) fn arrange<'k, A>(
+    found: &mut IndexMap<String, A>,
+    known: impl Iterator<Item = &'k String>,
+) {
+    let known: HashMap<&str, usize> = known.map(String::as_str).zip(0..).collect();
+    let place = |key: &str| known.get(key).copied().unwrap_or(usize::MAX);
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
@@ -16,7 +22,7 @@ pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;
     }
-    arrange(found, known);
+    arrange(found, known.keys());
     for (key, value) in found.iter_mut() {
         if let Some(known) = known.get(key) {
             arrange_value(value, known);

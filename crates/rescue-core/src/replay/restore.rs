@@ -2,6 +2,8 @@
 
 use std::collections::HashMap;
 
+use indexmap::IndexMap;
+
 use super::Token;
 use super::plan::Skipped;
 use super::token::{HELPER, NO_API};
@@ -19,7 +21,9 @@ pub(super) struct Restore<'a, W> {
     pub(super) skipped: Vec<Skipped>,
     target: &'a Master,
     found: &'a Master,
-    /// Number of topic types of `target`, the state to restore, that the new master has so far.
+    /// The topic types of `target`, the state to restore, in order.
+    types: IndexMap<&'a str, &'a str>,
+    /// Number of `types` that the new master has so far.
     types_in: usize,
     /// Whether the new master's list of topic types is a prefix of the list in `target`, the state to restore. If not,
     /// the order of the types cannot be restored.
@@ -43,7 +47,9 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Brings a model of `found` to `target`.
     pub(super) fn run(target: &'a Master, found: &'a Master, manner: Manner, write: W) -> Self {
         let known = found.topic_types().keys();
-        let first = target.topic_types().keys().take(known.len());
+        let first = target.topic_types().keys().take(found.topic_types().len());
+        let types = target.topic_types().iter();
+        let types = types.map(|(topic, topic_type)| (topic.as_str(), topic_type.as_str()));
         let mut restore = Self {
             ordered: known.eq(first),
             write,
@@ -52,6 +58,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             skipped: Vec::new(),
             target,
             found,
+            types: types.collect(),
             types_in: 0,
             manner,
         };
@@ -63,7 +70,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         restore.star_types();
         restore.changed_types();
         restore.subscribers();
-        restore.types_before(target.topic_types().len());
+        restore.types_before(restore.types.len());
         restore.param_subscribers();
         restore
     }
@@ -405,7 +412,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
             && !self.model.topic_types().contains_key(topic)
-            && let Some(index) = self.target.topic_types().get_index_of(topic)
+            && let Some(index) = self.types.get_index_of(topic)
         {
             self.types_before(index);
         }
@@ -438,12 +445,12 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     /// Adds the first `end` types of the target.
     fn types_before(&mut self, end: usize) {
-        let target = self.target;
-        let types = target.topic_types().iter().take(end).skip(self.types_in);
-        for (topic, topic_type) in types {
+        while self.types_in < end
+            && let Some((&topic, &topic_type)) = self.types.get_index(self.types_in)
+        {
+            self.types_in += 1;
             self.bring_type(topic, topic_type);
         }
-        self.types_in = self.types_in.max(end);
     }
 
     /// A caller id that no node has, with the name by which it can register `key`.

@@ -2,12 +2,12 @@
 
 use std::net::IpAddr;
 
-use indexmap::{IndexMap, IndexSet};
+use indexmap::IndexSet;
 
-use super::snapshot::ServiceEntry;
+use super::{ordered_map::OrderedMap, snapshot::ServiceEntry};
 
 /// Caller ids by topic or parameter key, in the order in which they registered.
-pub type Registrations = IndexMap<String, Vec<String>>;
+pub type Registrations = OrderedMap<Vec<String>>;
 
 /// The kinds of registration that several nodes can share under one key.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -44,12 +44,22 @@ impl PartialEq for Node {
     }
 }
 
+impl Eq for Node {}
+
 impl Node {
     pub(crate) fn is_empty(&self) -> bool {
         self.publications.is_empty()
             && self.subscriptions.is_empty()
             && self.param_subscriptions.is_empty()
             && self.services.is_empty()
+    }
+
+    fn has(&self, kind: SharedRegistration, key: &str) -> bool {
+        match kind {
+            SharedRegistration::Publishers => self.publications.contains(key),
+            SharedRegistration::Subscribers => self.subscriptions.contains(key),
+            SharedRegistration::ParamSubscribers => self.param_subscriptions.contains(key),
+        }
     }
 
     pub(crate) fn keys(&mut self, kind: SharedRegistration) -> &mut IndexSet<String> {
@@ -61,11 +71,11 @@ impl Node {
     }
 }
 
-/// rosmaster's `RegistrationManager`.
+/// rosmaster's `RegistrationManager`. A clone shares its memory; see [`OrderedMap`].
 #[derive(Clone, Default)]
 pub struct Registry {
     /// References to nodes by caller id. No reply shows their order.
-    pub nodes: IndexMap<String, Node>,
+    pub nodes: OrderedMap<Node>,
     /// The publishers of each topic.
     pub publishers: Registrations,
     /// The subscribers of each topic.
@@ -73,7 +83,7 @@ pub struct Registry {
     /// The subscribers of each parameter key.
     pub param_subscribers: Registrations,
     /// The provider of each service.
-    pub services: IndexMap<String, ServiceEntry>,
+    pub services: OrderedMap<ServiceEntry>,
     /// Whether any service was ever registered. This shows only in a message of `unregisterService`.
     pub had_services: bool,
 }
@@ -113,10 +123,14 @@ impl Registry {
         caller_id: &str,
         caller_api: &str,
     ) -> Option<String> {
-        let (node, bumped) = self.node(caller_id, caller_api);
-        if node.keys(kind).insert(key.to_owned()) {
-            let callers = self.shared_mut(kind).entry(key.to_owned()).or_default();
-            callers.push(caller_id.to_owned());
+        let bumped = self.add_node(caller_id, caller_api);
+        let node = self.nodes.get_mut(caller_id);
+        if node.is_some_and(|node| node.keys(kind).insert(key.to_owned())) {
+            let registrations = self.shared_mut(kind);
+            match registrations.get_mut(key) {
+                Some(callers) => callers.push(caller_id.to_owned()),
+                None => registrations.insert(key.to_owned(), vec![caller_id.to_owned()]),
+            }
         }
         bumped
     }
@@ -130,8 +144,10 @@ impl Registry {
         caller_api: &str,
         service_api: &str,
     ) -> Option<String> {
-        let (node, bumped) = self.node(caller_id, caller_api);
-        node.services.insert(service.to_owned());
+        let bumped = self.add_node(caller_id, caller_api);
+        if let Some(node) = self.nodes.get_mut(caller_id) {
+            node.services.insert(service.to_owned());
+        }
         let entry = ServiceEntry {
             node: caller_id.to_owned(),
             api: service_api.to_owned(),
@@ -141,22 +157,25 @@ impl Registry {
         bumped
     }
 
-    /// The reference to a node, created if needed. If the name is registered at another address, that is an old node:
-    /// removes its registrations and also returns its address.
-    fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
-        let mut bumped = None;
-        if let Some(node) = self.nodes.get_mut(caller_id)
-            && node.api != caller_api
-        {
-            let node = std::mem::take(node);
-            self.drop_registrations(caller_id, &node);
-            bumped = Some(node.api);
+    /// Creates the reference to a node if needed. If the name is registered at another address, that is an old node:
+    /// removes its registrations and returns its address.
+    fn add_node(&mut self, caller_id: &str, caller_api: &str) -> Option<String> {
+        let fresh = || Node {
+            api: caller_api.to_owned(),
+            ..Node::default()
+        };
+        match self.nodes.get(caller_id) {
+            Some(node) if node.api == caller_api => None,
+            Some(_) => {
+                let old = std::mem::replace(self.nodes.get_mut(caller_id)?, fresh());
+                self.drop_registrations(caller_id, &old);
+                Some(old.api)
+            }
+            None => {
+                self.nodes.insert(caller_id.to_owned(), fresh());
+                None
+            }
         }
-        let node = self.nodes.entry(caller_id.to_owned()).or_default();
-        if node.api.is_empty() {
-            caller_api.clone_into(&mut node.api);
-        }
-        (node, bumped)
     }
 
     fn drop_registrations(&mut self, caller_id: &str, node: &Node) {
@@ -175,7 +194,7 @@ impl Registry {
                 .get(service)
                 .is_some_and(|entry| entry.node == caller_id)
             {
-                self.services.shift_remove(service);
+                self.services.remove(service);
             }
         }
     }
@@ -188,10 +207,12 @@ impl Registry {
         caller_id: &str,
         caller_api: &str,
     ) -> (String, bool) {
-        let Some(node) = self.nodes.get_mut(caller_id) else {
+        let Some(node) = self.nodes.get(caller_id) else {
             return (not_registered(caller_id), false);
         };
-        if node.api != caller_api || !node.keys(kind).swap_remove(key) {
+        let is_known = node.api == caller_api && node.has(kind, key);
+        let node = self.nodes.get_mut(caller_id).filter(|_| is_known);
+        if !node.is_some_and(|node| node.keys(kind).swap_remove(key)) {
             let text = format!("[{caller_id}] is not a known provider of [{key}]");
             return (text, false);
         }
@@ -207,9 +228,9 @@ impl Registry {
         caller_id: &str,
         service_api: &str,
     ) -> (String, bool) {
-        let Some(node) = self.nodes.get_mut(caller_id) else {
+        if !self.nodes.contains_key(caller_id) {
             return (not_registered(caller_id), false);
-        };
+        }
         if !self.had_services {
             let text = format!("[{caller_id}] is not a provider of [{service}]");
             return (text, false);
@@ -221,15 +242,17 @@ impl Registry {
             );
             return (text, false);
         }
-        node.services.swap_remove(service);
-        self.services.shift_remove(service);
+        if let Some(node) = self.nodes.get_mut(caller_id) {
+            node.services.swap_remove(service);
+        }
+        self.services.remove(service);
         self.forget_if_empty(caller_id);
         (unregistered(caller_id, service), true)
     }
 
     fn forget_if_empty(&mut self, caller_id: &str) {
         if self.nodes.get(caller_id).is_some_and(Node::is_empty) {
-            self.nodes.swap_remove(caller_id);
+            self.nodes.remove(caller_id);
         }
     }
 }
@@ -240,7 +263,7 @@ fn drop_caller(registrations: &mut Registrations, key: &str, caller_id: &str) {
             callers.remove(index);
         }
         if callers.is_empty() {
-            registrations.shift_remove(key);
+            registrations.remove(key);
         }
     }
 }

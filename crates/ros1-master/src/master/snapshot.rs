@@ -2,8 +2,7 @@
 
 use std::net::IpAddr;
 
-use indexmap::IndexMap;
-
+use super::OrderedMap;
 use crate::xmlrpc::Struct;
 
 /// The whole state of a master. Every map and list keeps the master's order, because replies show it.
@@ -11,20 +10,20 @@ use crate::xmlrpc::Struct;
 pub struct Snapshot {
     /// References to nodes by caller id, including nodes that have nothing but services that other nodes have taken
     /// over.
-    pub nodes: IndexMap<String, SnapshotNode>,
+    pub nodes: OrderedMap<SnapshotNode>,
     /// Types by topic. A type remains when the topic has no nodes left.
-    pub topic_types: IndexMap<String, String>,
+    pub topic_types: OrderedMap<String>,
     /// Caller ids of the publishers of each topic.
-    pub publishers: IndexMap<String, Vec<String>>,
+    pub publishers: OrderedMap<Vec<String>>,
     /// Caller ids of the subscribers of each topic.
-    pub subscribers: IndexMap<String, Vec<String>>,
+    pub subscribers: OrderedMap<Vec<String>>,
     /// Providers by service.
-    pub services: IndexMap<String, ServiceEntry>,
+    pub services: OrderedMap<ServiceEntry>,
     /// Whether any service was ever registered. If there are none now, this shows only in a message of
     /// `unregisterService`.
     pub had_services: bool,
     /// Caller ids of the subscribers of each parameter key. As in the master, keys end in `/`.
-    pub param_subscribers: IndexMap<String, Vec<String>>,
+    pub param_subscribers: OrderedMap<Vec<String>>,
     pub params: Struct,
 }
 

@@ -2,7 +2,6 @@
 
 use std::{fmt, net::IpAddr};
 
-use indexmap::IndexMap;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -12,10 +11,13 @@ use super::registry::{Node, Registry, SharedRegistration};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
 use super::write::Write;
-use super::{Method, Request, names};
+use super::{Method, OrderedMap, Request, names};
 use crate::xmlrpc::{Python, Reply, Struct, Value};
 
 /// A complete master without IO: holds the state of a rosmaster and answers calls by [`Master::apply`].
+///
+/// A clone shares its memory with the original, so it costs less than a microsecond. The next change of either costs some
+/// ten microseconds with 10,000 nodes.
 ///
 /// Two masters are equal if all reads give the same answers in the same order, and if their references to
 /// nodes and their parameter subscriptions are the same. Their identity (process id and address) is not
@@ -23,7 +25,7 @@ use crate::xmlrpc::{Python, Reply, Struct, Value};
 #[derive(Clone, Default)]
 pub struct Master {
     pub(crate) registry: Registry,
-    pub(crate) topic_types: IndexMap<String, String>,
+    pub(crate) topic_types: OrderedMap<String>,
     pub(crate) params: Params,
     /// Whether a value is stored differently than in rosmaster, so that answers may differ. No ROS client sends a value
     /// that causes this.
@@ -120,7 +122,7 @@ impl Master {
     }
 
     /// The type of each topic, in the order in which the master first saw the topics.
-    pub fn topic_types(&self) -> &IndexMap<String, String> {
+    pub fn topic_types(&self) -> &OrderedMap<String> {
         &self.topic_types
     }
 
@@ -208,8 +210,9 @@ impl Master {
     /// Notes that `call`, which has been applied, came from the computer `from`; `None` for this one.
     pub fn note_origin(&mut self, call: &Request, from: Option<IpAddr>) {
         for (caller_id, api) in Write::all(call).filter_map(|write| write.registrant()) {
-            let node = self.registry.nodes.get_mut(caller_id);
-            if let Some(node) = node.filter(|node| node.api == api) {
+            let node = self.registry.nodes.get(caller_id);
+            let changes = node.is_some_and(|node| node.api == api && node.from != from);
+            if let Some(node) = self.registry.nodes.get_mut(caller_id).filter(|_| changes) {
                 node.from = from;
             }
         }
@@ -218,10 +221,12 @@ impl Master {
     /// Notes for each node that `known` has at the same address where that one has registered from. For a state that was
     /// read from a master.
     pub fn keep_origins(&mut self, known: &Self) {
-        for (caller_id, node) in &mut self.registry.nodes {
-            let known = known.registry.nodes.get(caller_id);
-            if let Some(known) = known.filter(|known| known.api == node.api) {
-                node.from = node.from.or(known.from);
+        for (caller_id, known) in &known.registry.nodes {
+            let Some(from) = known.from else { continue };
+            let node = self.registry.nodes.get(caller_id);
+            let lacks = node.is_some_and(|node| node.api == known.api && node.from.is_none());
+            if let Some(node) = self.registry.nodes.get_mut(caller_id).filter(|_| lacks) {
+                node.from = Some(from);
             }
         }
     }
@@ -388,7 +393,7 @@ impl Master {
     ///
     /// If no sequence of calls leads to this state.
     pub fn from_snapshot(snapshot: Snapshot) -> Result<Self, InvalidSnapshot> {
-        let mut nodes: IndexMap<String, Node> = IndexMap::with_capacity(snapshot.nodes.len());
+        let mut nodes: OrderedMap<Node> = OrderedMap::default();
         for (caller_id, node) in snapshot.nodes {
             if node.api.is_empty() {
                 return Err(InvalidSnapshot::NoApi { caller_id });
@@ -442,9 +447,9 @@ impl Master {
             let caller_id = caller_id.clone();
             return Err(InvalidSnapshot::EmptyNode { caller_id });
         }
-        let mut topics = snapshot.publishers.keys();
-        if let Some(topic) = topics.find(|topic| !snapshot.topic_types.contains_key(*topic)) {
-            let topic = topic.clone();
+        let lacks_type = |topic: &&String| !snapshot.topic_types.contains_key(topic);
+        let topic = snapshot.publishers.keys().find(lacks_type).cloned();
+        if let Some(topic) = topic {
             return Err(InvalidSnapshot::NoType { topic });
         }
         Ok(Self {
@@ -494,13 +499,13 @@ impl Registry {
 impl PartialEq for Master {
     fn eq(&self, other: &Self) -> bool {
         let (a, b) = (&self.registry, &other.registry);
-        a.nodes == b.nodes
-            && a.publishers.iter().eq(&b.publishers)
-            && a.subscribers.iter().eq(&b.subscribers)
-            && a.services.iter().eq(&b.services)
+        a.nodes.has_same(&b.nodes)
+            && a.publishers == b.publishers
+            && a.subscribers == b.subscribers
+            && a.services == b.services
             && a.had_services == b.had_services
-            && a.param_subscribers.iter().eq(&b.param_subscribers)
-            && self.topic_types.iter().eq(&other.topic_types)
+            && a.param_subscribers == b.param_subscribers
+            && self.topic_types == other.topic_types
             && self.params.tree() == other.params.tree()
     }
 }

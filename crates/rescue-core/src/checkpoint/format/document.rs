@@ -2,11 +2,9 @@
 
 use std::net::IpAddr;
 
-use indexmap::IndexMap;
-
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
 use super::{Checkpoint, EncodeError, Label, Origin, RecordContent, Session, frame, yaml};
-use crate::master::{Displaced, Request, ServiceEntry, Snapshot, SnapshotNode};
+use crate::master::{Displaced, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// Writes the document up to and including the line `journal:`.
@@ -99,7 +97,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
 fn section<T>(
     out: &mut Vec<u8>,
     title: &str,
-    entries: &IndexMap<String, T>,
+    entries: &OrderedMap<T>,
     mut write: impl FnMut(&mut Vec<u8>, &T),
 ) {
     section_of_lines(out, title, entries, |out, entry| {
@@ -114,7 +112,7 @@ fn section<T>(
 fn section_of_lines<T>(
     out: &mut Vec<u8>,
     title: &str,
-    entries: &IndexMap<String, T>,
+    entries: &OrderedMap<T>,
     mut write: impl FnMut(&mut Vec<u8>, &T),
 ) {
     out.extend_from_slice(title.as_bytes());
@@ -446,11 +444,11 @@ fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
         .ok_or_else(|| format!("`{key}` is not a mapping"))
 }
 
-fn entries<T>(
+fn entries<T: Clone>(
     document: &mut Struct,
     key: &str,
     read: impl Fn(Value) -> Option<T>,
-) -> Result<IndexMap<String, T>, String> {
+) -> Result<OrderedMap<T>, String> {
     members(document, key)?
         .into_iter()
         .map(|(name, value)| {

@@ -40,10 +40,11 @@ fn an_inspection_reads_everything_that_a_master_shows() {
     let mut master = busy();
     let found = look(&mut master.clone(), &Master::default());
     let mut blind = master.snapshot();
-    blind.param_subscribers.clear();
-    blind.nodes.shift_remove("/w");
-    blind.nodes.shift_remove("/gone");
-    blind.nodes["/p"].taken_over_services.clear();
+    blind.param_subscribers = Default::default();
+    blind.nodes.remove("/w");
+    blind.nodes.remove("/gone");
+    let node = blind.nodes.get_mut("/p").unwrap();
+    node.taken_over_services.clear();
     assert_eq!(found.snapshot().publishers, blind.publishers);
     assert_eq!(
         difference(&Master::from_snapshot(blind).unwrap(), &found),
