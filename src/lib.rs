@@ -37,8 +37,7 @@ pub mod cluster;
 pub mod commands;
 pub mod config;
 #[cfg(test)]
-#[path = "../crates/rescue-core/src/dice.rs"]
-pub(crate) mod dice;
+use test_support::dice;
 pub(crate) mod gate;
 pub mod guardian;
 pub(crate) mod ledger;

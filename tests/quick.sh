@@ -7,4 +7,4 @@ cd "$(dirname "$0")/.."
 
 cargo fmt --all --check
 cargo clippy --locked --workspace --all-targets -- -D warnings
-cargo test --locked --workspace --lib --test codec --test checkpoint --test tidy
+cargo test --locked --workspace --lib --test codec --test checkpoint --test model --test tidy

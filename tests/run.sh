@@ -69,9 +69,9 @@ failures() {
     ' "$log"
 }
 
-fast="codec checkpoint tidy"
+fast="codec checkpoint model tidy"
 slow=
-for program in tests/*/main.rs crates/*/tests/*.rs; do
+for program in tests/*/main.rs crates/*/tests/*.rs crates/*/tests/*/main.rs; do
     program=$(basename "${program%/main.rs}" .rs)
     case " $fast " in *" $program "*) ;; *) slow="$slow $program" ;; esac
 done

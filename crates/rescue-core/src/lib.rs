@@ -20,8 +20,6 @@
 
 pub mod checkpoint;
 pub mod cluster;
-#[cfg(test)]
-mod dice;
 pub mod health;
 pub mod hide;
 pub mod lifecycle;

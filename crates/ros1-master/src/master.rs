@@ -24,8 +24,6 @@ pub mod returnable;
 mod snapshot;
 mod state;
 mod tell;
-#[cfg(test)]
-mod tests;
 mod updates;
 mod would_change;
 mod write;

@@ -11,10 +11,8 @@ use super::{
     Death, Eviction, Evidence, LocalName, Moving, Owner, Process, Reach, Reap, Registrants,
     mutant::WrongRule, port_of,
 };
-use crate::{
-    dice::Dice,
-    master::{Master, Method, Request},
-};
+use crate::master::{Master, Method, Request};
+use test_support::dice::Dice;
 
 /// Few names, ports and process ids, so that all are reused often.
 const NAMES: u64 = 6;

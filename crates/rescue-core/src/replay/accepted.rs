@@ -195,7 +195,8 @@ pub(super) fn is_write_error(text: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{replay::tests::calls::malformed, xmlrpc::Struct};
+    use crate::xmlrpc::Struct;
+    use test_support::calls::malformed;
 
     #[test]
     fn two_refusals_agree_and_a_refusal_does_not_agree_with_a_success() {

@@ -21,10 +21,10 @@ use crate::{
         sharing::Source,
         standing::{Pass, Place, Standing},
     },
-    dice::Dice,
     master::Notice,
     xmlrpc::{Reply, Value},
 };
+use test_support::dice::Dice;
 
 mod calls;
 mod faults;

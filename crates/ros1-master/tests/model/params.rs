@@ -1,7 +1,7 @@
 //! Tests of the parameter server's special cases.
 
 use super::*;
-use crate::xmlrpc::Python;
+use ros1_master::xmlrpc::Python;
 
 #[test]
 fn a_value_in_the_way_becomes_a_namespace_and_empty_namespaces_stay() {

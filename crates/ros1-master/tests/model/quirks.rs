@@ -215,7 +215,7 @@ fn unknown_methods_are_answered_with_a_fault() {
 
 #[test]
 fn a_snapshot_restores_the_whole_state_and_impossible_states_are_refused() {
-    use crate::master::InvalidSnapshot;
+    use ros1_master::master::InvalidSnapshot;
     let master = after([
         provide("/a", "/s"),
         provide("/b", "/s"),

@@ -1,7 +1,7 @@
 //! Tests that no call costs more than it would cost a master.
 
 use super::*;
-use crate::master::NoticeSink;
+use ros1_master::master::NoticeSink;
 
 /// Records the receivers of a value, and the value's address in memory.
 #[derive(Default)]

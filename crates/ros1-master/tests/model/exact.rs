@@ -1,7 +1,7 @@
 //! Tests which reads the model answers byte for byte as rosmaster does, and which it leaves to the master.
 
 use super::*;
-use crate::xmlrpc::{MAX_DEPTH, Python};
+use ros1_master::xmlrpc::{MAX_DEPTH, Python};
 
 fn master() -> Master {
     after([publish("/n", "/t", "a/B"), set("/a/b", 1)])
