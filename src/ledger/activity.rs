@@ -9,7 +9,7 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 use rescue_core::order::Subject;
 use ros1_master::{
-    master::{self, Displaced, Effect, Master, NoticeSink, Request, Write},
+    master::{self, Displaced, Master, NoticeSink, Request, Write, WriteTarget},
     xmlrpc::{Call, Value},
 };
 
@@ -265,14 +265,17 @@ impl Activity {
 
     /// Notes the topic registrations that `call` removes, before it is applied to `mirror`.
     pub(super) fn note_lost(&mut self, mirror: &Master, call: &Request) {
-        for write in Write::all(call) {
-            let (node, publishes, topic) = match write.effect {
-                Effect::UnregisterPublisher { topic, .. } => (write.caller, true, topic),
-                Effect::UnregisterSubscriber { topic, .. } => (write.caller, false, topic),
-                _ => continue,
+        for write in Write::all(call).filter(Write::unregisters) {
+            let publishes = match write.target() {
+                WriteTarget::Publisher => true,
+                WriteTarget::Subscriber => false,
+                WriteTarget::Service | WriteTarget::ParamSubscriber | WriteTarget::Parameter => {
+                    continue;
+                }
             };
+            let (node, topic) = (write.caller, write.name());
             if let Some(api) = mirror.api_of(node)
-                && mirror.has_topic(node, publishes, &topic)
+                && mirror.has_topic(node, publishes, topic)
                 && node.len() + api.len() + topic.len() <= LOST_MOST
             {
                 if self.lost.len() == NOTICES {
@@ -282,7 +285,7 @@ impl Activity {
                     node: node.to_owned(),
                     api: api.to_owned(),
                     publishes,
-                    topic: topic.into_owned(),
+                    topic: topic.to_owned(),
                 });
             }
         }

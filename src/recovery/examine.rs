@@ -15,7 +15,7 @@ use rescue_core::{
     },
 };
 use ros1_master::{
-    master::{Counts, Effect, Master, Request, Write},
+    master::{Counts, Master, Request, Write, WriteTarget},
     xmlrpc::{Python, Reply},
 };
 use thiserror::Error;
@@ -392,13 +392,8 @@ impl Examiner {
                 });
                 // A master does not tell which nodes subscribe to parameters.
                 let hidden = |call: &Request| {
-                    let hidden = |write: Write<'_>| {
-                        matches!(
-                            write.effect,
-                            Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. }
-                        )
-                    };
-                    Write::of(call).is_some_and(hidden)
+                    let write = Write::of(call);
+                    write.is_some_and(|write| write.target() == WriteTarget::ParamSubscriber)
                 };
                 if state != found || pending.iter().any(hidden) {
                     (state, Change::Replace(before))

@@ -44,4 +44,4 @@ pub use tell::{
     Displaced, MASTER, PARAM_UPDATE, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update,
     publisher_update, question, shutdown,
 };
-pub use write::{Effect, Write};
+pub use write::{Effect, Write, WriteTarget};

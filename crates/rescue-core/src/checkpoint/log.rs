@@ -12,7 +12,7 @@ use crate::{
         session::{Rebuilt, rebuild},
     },
     hide::Hide,
-    master::{Effect, Master, Request, Write, names},
+    master::{Master, Request, Write, WriteTarget, names},
 };
 
 /// The state at an earlier time.
@@ -294,21 +294,14 @@ fn changes(state: &mut Master, call: &Request, hide: &Hide) -> Vec<Difference> {
         api: state.api_of(caller).map(str::to_owned),
         value: registration_of(state, &write),
     };
-    let (what, param) = match &write.effect {
-        Effect::SetParam { key, .. } | Effect::DeleteParam { key } => {
-            (What::Parameter, state.param(key))
-        }
-        Effect::RegisterPublisher { .. } | Effect::UnregisterPublisher { .. } => {
-            (What::Publisher, None)
-        }
-        Effect::RegisterSubscriber { .. } | Effect::UnregisterSubscriber { .. } => {
-            (What::Subscriber, None)
-        }
-        Effect::RegisterService { .. } | Effect::UnregisterService { .. } => (What::Service, None),
-        Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. } => {
-            (What::ParamSubscriber, None)
-        }
+    let what = match write.target() {
+        WriteTarget::Publisher => What::Publisher,
+        WriteTarget::Subscriber => What::Subscriber,
+        WriteTarget::Service => What::Service,
+        WriteTarget::ParamSubscriber => What::ParamSubscriber,
+        WriteTarget::Parameter => What::Parameter,
     };
+    let param = write.parameter().and_then(|key| state.param(key));
     let before = facts(state);
     state.apply_telling(call, &mut ());
     let after = facts(state);
@@ -349,21 +342,21 @@ fn registration_of(state: &Master, write: &Write<'_>) -> Option<String> {
         let there = state.has_topic(caller, publishes, name);
         there.then(|| state.type_of(name).unwrap_or_default().to_owned())
     };
-    match write.effect {
-        Effect::RegisterPublisher { .. } | Effect::UnregisterPublisher { .. } => topic(true),
-        Effect::RegisterSubscriber { .. } | Effect::UnregisterSubscriber { .. } => topic(false),
-        Effect::RegisterService { .. } | Effect::UnregisterService { .. } => {
+    match write.target() {
+        WriteTarget::Publisher => topic(true),
+        WriteTarget::Subscriber => topic(false),
+        WriteTarget::Service => {
             let node = state.provider_of(name)?;
             let mut services = state.services_of(node);
             let (_, api) = services.find(|(service, _)| *service == name)?;
             Some(format!("{node} at {api}"))
         }
-        Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. } => {
+        WriteTarget::ParamSubscriber => {
             let key = names::param_key(name);
             let mut keys = state.param_subscriptions(caller);
             keys.any(|it| it == key).then(String::new)
         }
-        Effect::SetParam { .. } | Effect::DeleteParam { .. } => None,
+        WriteTarget::Parameter => None,
     }
 }
 

@@ -138,10 +138,7 @@ pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     let parts: Vec<&str> = names::parts(&path).collect();
     let present = value_at(now.params(), &parts).cloned();
     if matches!(why, Conflict::Parameter(_)) && !parts.is_empty() {
-        let wanted = match Write::of(call).map(|write| write.effect) {
-            Some(Effect::SetParam { value, .. }) => Some(value),
-            _ => None,
-        };
+        let wanted = Write::of(call).and_then(|write| write.value());
         if wanted == present.as_ref() {
             return Verdict::Holds;
         }

@@ -70,6 +70,17 @@ pub enum Effect<'a> {
     },
 }
 
+/// What a write registers, unregisters, sets or deletes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum WriteTarget {
+    Publisher,
+    Subscriber,
+    Service,
+    /// A subscription to a parameter.
+    ParamSubscriber,
+    Parameter,
+}
+
 impl<'a> Write<'a> {
     /// The write that `call` makes. `None` for a multicall, for a call that changes nothing, and for a call that every
     /// master refuses because of its arguments.
@@ -124,23 +135,63 @@ impl<'a> Write<'a> {
         }
     }
 
+    /// The address that is registered or unregistered: for a service its own, else that of the node.
+    pub fn address(&self) -> Option<&'a str> {
+        match self.effect {
+            Effect::RegisterPublisher { api, .. }
+            | Effect::RegisterSubscriber { api, .. }
+            | Effect::UnregisterPublisher { api, .. }
+            | Effect::UnregisterSubscriber { api, .. }
+            | Effect::SubscribeParam { api, .. }
+            | Effect::UnsubscribeParam { api, .. } => Some(api),
+            Effect::RegisterService { service_api, .. }
+            | Effect::UnregisterService { service_api, .. } => Some(service_api),
+            Effect::SetParam { .. } | Effect::DeleteParam { .. } => None,
+        }
+    }
+
+    pub fn target(&self) -> WriteTarget {
+        match self.effect {
+            Effect::RegisterPublisher { .. } | Effect::UnregisterPublisher { .. } => {
+                WriteTarget::Publisher
+            }
+            Effect::RegisterSubscriber { .. } | Effect::UnregisterSubscriber { .. } => {
+                WriteTarget::Subscriber
+            }
+            Effect::RegisterService { .. } | Effect::UnregisterService { .. } => {
+                WriteTarget::Service
+            }
+            Effect::SubscribeParam { .. } | Effect::UnsubscribeParam { .. } => {
+                WriteTarget::ParamSubscriber
+            }
+            Effect::SetParam { .. } | Effect::DeleteParam { .. } => WriteTarget::Parameter,
+        }
+    }
+
     /// The resolved name of the parameter that this write sets or deletes.
     pub fn parameter(&self) -> Option<&str> {
-        match &self.effect {
-            Effect::SetParam { key, .. } | Effect::DeleteParam { key } => Some(key),
-            _ => None,
+        (self.target() == WriteTarget::Parameter).then(|| self.name())
+    }
+
+    /// The value to which this write sets a parameter.
+    pub fn value(&self) -> Option<&'a Value> {
+        match self.effect {
+            Effect::SetParam { value, .. } => Some(value),
+            Effect::RegisterPublisher { .. }
+            | Effect::RegisterSubscriber { .. }
+            | Effect::RegisterService { .. }
+            | Effect::UnregisterPublisher { .. }
+            | Effect::UnregisterSubscriber { .. }
+            | Effect::UnregisterService { .. }
+            | Effect::SubscribeParam { .. }
+            | Effect::UnsubscribeParam { .. }
+            | Effect::DeleteParam { .. } => None,
         }
     }
 
     /// Whether this write unregisters something.
     pub fn unregisters(&self) -> bool {
-        matches!(
-            self.effect,
-            Effect::UnregisterPublisher { .. }
-                | Effect::UnregisterSubscriber { .. }
-                | Effect::UnregisterService { .. }
-                | Effect::UnsubscribeParam { .. }
-        )
+        self.target() != WriteTarget::Parameter && self.registrant().is_none()
     }
 }
 

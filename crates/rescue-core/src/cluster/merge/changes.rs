@@ -258,10 +258,7 @@ impl Own {
         self.calls().any(|call| {
             let below = param_of(call).and_then(|of| path.strip_prefix(of.as_str()));
             let Some(below) = below else { return false };
-            let set = match Write::of(call).map(|write| write.effect) {
-                Some(Effect::SetParam { value, .. }) => Some(value),
-                _ => None,
-            };
+            let set = Write::of(call).and_then(|write| write.value());
             let parts: Vec<&str> = names::parts(below).collect();
             let value = match (set, parts.as_slice()) {
                 (set, []) => set,

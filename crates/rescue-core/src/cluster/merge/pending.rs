@@ -5,14 +5,14 @@ use std::collections::{BTreeMap, HashMap};
 use super::changes::param_of;
 use crate::{
     cluster::mutant::Mutant,
-    master::{Effect, Method, Request, Write},
+    master::{Method, Request, Write, WriteTarget},
     xmlrpc::Value,
 };
 
 /// What a call registers or unregisters: for example, the node `caller` as a publisher of the topic `name`.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct RegistrationSlot {
-    what: &'static str,
+    target: WriteTarget,
     name: String,
     caller: String,
 }
@@ -126,23 +126,13 @@ impl WritesToSend {
 /// The slot that `call` registers or unregisters, with the address, and whether it registers.
 fn slot(call: &Request) -> Option<(RegistrationSlot, String, bool)> {
     let write = Write::of(call)?;
-    let (what, api, registers) = match write.effect {
-        Effect::RegisterPublisher { api, .. } => ("publisher", api, true),
-        Effect::UnregisterPublisher { api, .. } => ("publisher", api, false),
-        Effect::RegisterSubscriber { api, .. } => ("subscriber", api, true),
-        Effect::UnregisterSubscriber { api, .. } => ("subscriber", api, false),
-        Effect::RegisterService { service_api, .. } => ("service", service_api, true),
-        Effect::UnregisterService { service_api, .. } => ("service", service_api, false),
-        Effect::SubscribeParam { api, .. } => ("parameter", api, true),
-        Effect::UnsubscribeParam { api, .. } => ("parameter", api, false),
-        Effect::SetParam { .. } | Effect::DeleteParam { .. } => return None,
-    };
+    let api = write.address()?;
     let slot = RegistrationSlot {
-        what,
+        target: write.target(),
         name: write.name().to_owned(),
         caller: write.caller.to_owned(),
     };
-    Some((slot, api.to_owned(), registers))
+    Some((slot, api.to_owned(), !write.unregisters()))
 }
 
 /// The approximate size of a call in bytes.
