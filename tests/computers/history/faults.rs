@@ -305,7 +305,8 @@ fn restore_older(fleet: &mut Fleet, clients: &Clients, chance: &mut Chance, time
     for computer in &mut fleet.computers {
         computer.start_etcd();
     }
-    fleet.await_etcd();
+    // A computer that starts before a new journal has begun shows the copy first.
+    fleet.await_whole();
 }
 
 /// Sets etcd up again, as docs/several-computers.md says under "Backup".
