@@ -23,7 +23,7 @@ use rescue_core::{
     cluster::{
         journal::{self, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
-        member::{Action, Entry, Heard, Input, Member, PROBES, Read},
+        member::{Action, Entry, Input, Member, MemberEntryChange, PROBES, Read},
         merge::wire::{self, Ask},
         standing::{Place, Standing},
     },
@@ -147,8 +147,8 @@ impl ClusterDriver {
         if !matches!(input, Input::Wake | Input::Watched { .. }) {
             tracing::trace!(?input, "cluster");
         }
-        for heard in input.heard() {
-            self.facts.note_member_entry(heard);
+        for change in input.member_entries() {
+            self.facts.note_member_entry(change);
         }
         let actions = self.member.on(now, input);
         let lease = self.member.machine().lease(now);
@@ -310,9 +310,9 @@ impl ClusterDriver {
                     Input::Probed { number, leads }
                 });
             }
-            Action::Say => {
+            Action::PublishMemberEntry => {
                 let key = self.replica.keys.member(&self.member.settings().name);
-                let value = serde_json::to_vec(&self.member.says()).unwrap_or_default();
+                let value = serde_json::to_vec(&self.member.member_entry()).unwrap_or_default();
                 let put = Put { key, value };
                 self.beside
                     .spawn(publish_member_entry(self.replica.client.clone(), put));
@@ -436,7 +436,7 @@ impl ClusterDriver {
             return Input::WatchEnded;
         };
         let keys = self.replica.keys.clone();
-        let (mut entries, mut heard, mut deleted) = (Vec::new(), Vec::new(), None);
+        let (mut entries, mut members, mut deleted) = (Vec::new(), Vec::new(), None);
         for change in changes {
             if change.kv.is_none() {
                 deleted = deleted.max(keys.record_of(&change.key));
@@ -448,7 +448,7 @@ impl ClusterDriver {
             if let Err(error) = etcd::absorb(&change, &mut self.watched, &keys) {
                 self.trouble.set(&error.into());
             }
-            heard.extend(member_entry(
+            members.extend(member_entry(
                 &keys,
                 &change.key,
                 change.revision,
@@ -464,7 +464,7 @@ impl ClusterDriver {
             view,
             entries,
             deleted,
-            heard,
+            members,
         }
     }
 
@@ -486,8 +486,8 @@ impl ClusterDriver {
 /// Converts what was read from etcd for the [`Member`]. `None` if the state in etcd is invalid.
 fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
     let members = loaded.members.iter();
-    let heard = members.filter_map(|kv| member_entry(keys, &kv.key, kv.revision, Some(kv)));
-    let heard = heard.collect();
+    let members = members.filter_map(|kv| member_entry(keys, &kv.key, kv.revision, Some(kv)));
+    let members = members.collect();
     let state = match loaded.checkpoint {
         None => None,
         Some(checkpoint) => match Master::from_snapshot(checkpoint.snapshot) {
@@ -507,17 +507,22 @@ fn read(keys: &Keys, loaded: LoadedState) -> Option<Read> {
         state,
         records: loaded.records,
         progress: loaded.progress,
-        heard,
+        members,
     })
 }
 
 /// The member entry at `key`, if `key` belongs to a member.
-fn member_entry(keys: &Keys, key: &str, revision: u64, kv: Option<&Kv>) -> Option<Heard> {
+fn member_entry(
+    keys: &Keys,
+    key: &str,
+    revision: u64,
+    kv: Option<&Kv>,
+) -> Option<MemberEntryChange> {
     let name = key.strip_prefix(&keys.member(""))?.to_owned();
-    let said = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
-    Some(Heard {
+    let entry = kv.and_then(|kv| serde_json::from_slice(&kv.value).ok());
+    Some(MemberEntryChange {
         name,
-        said,
+        entry,
         revision,
     })
 }
@@ -582,11 +587,11 @@ async fn merge(
 
 /// Writes this computer's entry among the members to etcd.
 async fn publish_member_entry(client: Etcd, put: Put) {
-    let said = async {
+    let published = async {
         let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;
         client.put_with_lease(&put, lease, LIMIT).await
     };
-    if let Err(error) = said.await {
+    if let Err(error) = published.await {
         tracing::debug!(%error, "could not write this computer's member entry");
     }
 }

@@ -7,7 +7,7 @@ use std::{
 
 use rescue_core::cluster::{
     machine::{Role, Settings, View},
-    member::Heard,
+    member::MemberEntryChange,
 };
 
 use super::ClusterDriver;
@@ -76,21 +76,21 @@ impl ComputerFacts {
     }
 
     /// Updates the facts from what a computer has written about itself.
-    pub(super) fn note_member_entry(&mut self, heard: &Heard) {
-        let uri = heard.said.as_ref().map(|said| &*said.uri);
-        self.addresses.set_address(&heard.name, uri);
-        let Some(said) = &heard.said else { return };
+    pub(super) fn note_member_entry(&mut self, change: &MemberEntryChange) {
+        let uri = change.entry.as_ref().map(|entry| &*entry.uri);
+        self.addresses.set_address(&change.name, uri);
+        let Some(entry) = &change.entry else { return };
         let mut roles = Role::ALL.into_iter();
-        let role = roles.find(|role| role.as_str() == said.role);
+        let role = roles.find(|role| role.as_str() == entry.role);
         let member = MemberFacts {
-            name: heard.name.clone(),
-            uri: said.uri.clone(),
-            version: said.version.clone(),
+            name: change.name.clone(),
+            uri: entry.uri.clone(),
+            version: entry.version.clone(),
             role: role.unwrap_or(Role::Joining),
-            seq: said.seq,
+            seq: entry.seq,
             heard: Some(Instant::now()),
         };
-        self.members.insert(heard.name.clone(), member);
+        self.members.insert(change.name.clone(), member);
     }
 
     /// Checks whether the computer `name` can take over, or any other computer if `name` is empty. Returns the reason
@@ -167,7 +167,7 @@ impl ClusterDriver {
             self.facts.role = (self.member.role(), Instant::now());
         }
         let facts = &self.facts;
-        let own = self.member.says();
+        let own = self.member.member_entry();
         let own = MemberFacts {
             name: self.member.settings().name.clone(),
             uri: own.uri,

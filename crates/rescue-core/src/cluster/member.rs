@@ -53,7 +53,7 @@ use self::{
 pub use self::{
     chores::PUBLISH_EVERY,
     probes::PROBES,
-    types::{Action, Cause, Entry, Heard, Holds, Input, News, Own, Read, Said},
+    types::{Action, Cause, Entry, Holds, Input, MemberEntry, MemberEntryChange, News, Own, Read},
 };
 
 /// Pause before a failed read of etcd is retried.
@@ -179,7 +179,7 @@ impl Member {
 
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
-        self.note_member_entries(now, input.heard());
+        self.note_member_entries(now, input.member_entries());
         match input {
             Input::Begin => {
                 self.queue.start_by = Some(now + START_BY);
@@ -306,9 +306,9 @@ impl Member {
     }
 
     /// This computer's entry among the members.
-    pub fn says(&self) -> Said {
+    pub fn member_entry(&self) -> MemberEntry {
         let settings = self.settings();
-        Said {
+        MemberEntry {
             uri: settings.uri.clone(),
             version: settings.version.clone(),
             role: self.machine.role().as_str().to_owned(),

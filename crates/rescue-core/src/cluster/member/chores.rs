@@ -64,7 +64,7 @@ impl Member {
         if self.chores.publish_at.is_none_or(|at| at <= now) {
             self.chores.publish_at = Some(now + PUBLISH_EVERY);
             if may_say {
-                self.act(Action::Say);
+                self.act(Action::PublishMemberEntry);
             }
         }
         if let Some(seq) = self.chores.kept_until {

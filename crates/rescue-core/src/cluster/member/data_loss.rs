@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Action, Heard, Holds, Member, News};
+use super::{Action, Holds, Member, MemberEntryChange, News};
 use crate::cluster::{
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
@@ -193,7 +193,7 @@ impl Member {
         let since = now;
         self.data_loss.present = Some(Loss { since, holds, left });
         self.data_loss.is_second = false;
-        self.act(Action::Say);
+        self.act(Action::PublishMemberEntry);
     }
 
     /// Notes whether the journal with this `origin` could be read from its beginning.
@@ -201,18 +201,18 @@ impl Member {
         let unreadable = if is_readable { 0 } else { origin };
         if std::mem::replace(&mut self.data_loss.unreadable, unreadable) != unreadable {
             self.machine.set_unreadable(unreadable);
-            self.act(Action::Say);
+            self.act(Action::PublishMemberEntry);
         }
     }
 
     /// Notes how much another computer holds of a journal that etcd has lost, and whether it cannot read the present
     /// one.
-    pub(super) fn note_holdings(&mut self, now: Instant, heard: &Heard) {
-        let said = heard.said.as_ref();
-        let holds = said.and_then(|said| said.holds);
+    pub(super) fn note_holdings(&mut self, now: Instant, change: &MemberEntryChange) {
+        let entry = change.entry.as_ref();
+        let holds = entry.and_then(|entry| entry.holds);
         let before = match holds {
-            Some(holds) => self.data_loss.others.insert(heard.name.clone(), holds),
-            None => self.data_loss.others.remove(&heard.name),
+            Some(holds) => self.data_loss.others.insert(change.name.clone(), holds),
+            None => self.data_loss.others.remove(&change.name),
         };
         // Another computer may have lost a later journal, which this one has not seen.
         self.data_loss.is_second &= holds == before;
@@ -221,7 +221,7 @@ impl Member {
             term: view.term(),
             seq: view.seq(),
         };
-        let unreadable = said.map_or(0, |said| said.unreadable);
+        let unreadable = entry.map_or(0, |entry| entry.unreadable);
         if leads && unreadable != 0 && unreadable == view.origin {
             self.reading.check_all(now);
         }

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::{AGAIN, Action, Entry, Heard, Member, Read};
+use super::{AGAIN, Action, Entry, Member, MemberEntryChange, Read};
 use crate::{
     checkpoint::format::Record,
     cluster::{
@@ -392,16 +392,16 @@ impl Member {
     }
 
     /// Handles what computers have written into their entries among the members.
-    pub(super) fn note_member_entries(&mut self, now: Instant, heard: &[Heard]) {
+    pub(super) fn note_member_entries(&mut self, now: Instant, changes: &[MemberEntryChange]) {
         let mut outdated = false;
-        for heard in heard {
+        for change in changes {
             let own = self.machine.settings();
-            if heard.name == own.name {
-                self.namesake.sign = heard.sign_of_namesake(own);
+            if change.name == own.name {
+                self.namesake.sign = change.sign_of_namesake(own);
                 continue;
             }
-            self.note_holdings(now, heard);
-            outdated |= self.chores.notifying.note_entry(heard);
+            self.note_holdings(now, change);
+            outdated |= self.chores.notifying.note_entry(change);
         }
         if outdated && self.published.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
             self.act(Action::TellAll);

@@ -2,15 +2,15 @@
 
 use std::collections::HashMap;
 
-use super::Heard;
+use super::MemberEntryChange;
 
-/// What the entries among the members say about notifications.
+/// The markers in member entries that tell who has stopped notifying nodes.
 #[derive(Debug, Default)]
 pub(super) struct Notifying {
     /// How often this process has stopped notifying nodes.
     stopped: u64,
-    /// What the entries of the others said last.
-    heard: HashMap<String, String>,
+    /// The markers in the last entries of the others.
+    markers: HashMap<String, String>,
 }
 
 impl Notifying {
@@ -19,7 +19,7 @@ impl Notifying {
         self.stopped += 1;
     }
 
-    /// What this computer's entry says: see [`Said::notifies`](super::Said::notifies). `keeps` says whether the leader
+    /// The marker in this computer's entry: see [`MemberEntry::notifies`](super::MemberEntry::notifies). `keeps` says whether the leader
     /// lacks partition writes of this computer.
     pub(super) fn marker(&self, process: &str, keeps: bool) -> String {
         match keeps {
@@ -30,12 +30,12 @@ impl Notifying {
 
     /// Notes the entry of another computer. Returns whether that computer has stopped notifying nodes since its last
     /// entry.
-    pub(super) fn note_entry(&mut self, heard: &Heard) -> bool {
-        let says = heard.said.as_ref().map(|said| &said.notifies);
-        let Some(says) = says.filter(|says| !says.is_empty()) else {
+    pub(super) fn note_entry(&mut self, change: &MemberEntryChange) -> bool {
+        let marker = change.entry.as_ref().map(|entry| &entry.notifies);
+        let Some(marker) = marker.filter(|marker| !marker.is_empty()) else {
             return false;
         };
-        let before = self.heard.insert(heard.name.clone(), says.clone());
-        before.is_some_and(|before| before != *says)
+        let before = self.markers.insert(change.name.clone(), marker.clone());
+        before.is_some_and(|before| before != *marker)
     }
 }

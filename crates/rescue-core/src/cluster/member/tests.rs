@@ -132,7 +132,7 @@ impl Merges {
             state: None,
             records,
             progress: self.journal,
-            heard: Vec::new(),
+            members: Vec::new(),
         })));
     }
 }
@@ -168,12 +168,12 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
         records: vec![record(seq)],
         bytes: 1,
     });
-    let (view, entries, heard) = (led(first + 49), entries.collect(), Vec::new());
+    let (view, entries, members) = (led(first + 49), entries.collect(), Vec::new());
     let watched = Input::Watched {
         view,
         entries,
         deleted: None,
-        heard,
+        members,
     };
     let last = i32::try_from(first + 49).unwrap();
     assert_eq!(merges.shown_after(watched), [last.into()]);
@@ -245,7 +245,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
         state: None,
         records: records(1),
         progress,
-        heard: Vec::new(),
+        members: Vec::new(),
     }));
     assert_eq!(followed(loaded), None);
     let late = Input::Watched {
@@ -255,7 +255,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
             bytes: 1,
         }],
         deleted: None,
-        heard: Vec::new(),
+        members: Vec::new(),
     };
     assert_eq!(followed(late), Some(2.into()));
 }

@@ -32,7 +32,7 @@ pub struct Own {
 
 /// A computer's entry among the members, as JSON at `ROBOT/members/NAME`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Said {
+pub struct MemberEntry {
     pub uri: String,
     pub version: String,
     pub role: String,
@@ -59,23 +59,23 @@ pub struct Holds {
 
 /// What a computer has written about itself: its entry among the members.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Heard {
+pub struct MemberEntryChange {
     pub name: String,
     /// `None` if the entry was deleted.
-    pub said: Option<Said>,
+    pub entry: Option<MemberEntry>,
     /// The revision of the entry's last change.
     pub revision: u64,
 }
 
-impl Heard {
+impl MemberEntryChange {
     /// Returns evidence of another computer with this one's name, if this entry, which has the name in `own`, belongs
     /// to another computer.
     pub(super) fn sign_of_namesake(&self, own: &Settings) -> Option<Sign> {
-        let said = self.said.as_ref()?;
-        let is_own = own.is_of_this_computer(&self.name, &said.uri, &said.boot);
+        let entry = self.entry.as_ref()?;
+        let is_own = own.is_of_this_computer(&self.name, &entry.uri, &entry.boot);
         (!is_own).then(|| Sign {
             key: Key::Member,
-            uri: said.uri.clone(),
+            uri: entry.uri.clone(),
             revision: self.revision,
         })
     }
@@ -107,14 +107,14 @@ impl Entry {
 pub struct Read {
     /// The keys `origin`, `leader` and `alive` at the same revision.
     pub view: View,
-    /// Whether the journal could be read from its beginning. If not, only `view` and `heard` count.
+    /// Whether the journal could be read from its beginning. If not, only `view` and `members` count.
     pub is_readable: bool,
     /// The state before the records, and the nodes that lost their names to other nodes shortly before. `None` if the
     /// records follow the known journal.
     pub state: Option<(Master, Vec<Displaced>)>,
     pub records: Vec<Record>,
     pub progress: Progress,
-    pub heard: Vec<Heard>,
+    pub members: Vec<MemberEntryChange>,
 }
 
 impl Read {
@@ -126,7 +126,7 @@ impl Read {
             state: None,
             records: Vec::new(),
             progress: Progress::default(),
-            heard: Vec::new(),
+            members: Vec::new(),
         }
     }
 }
@@ -148,7 +148,7 @@ pub enum Input {
         entries: Vec<Entry>,
         /// The highest number of a record that a deleted key held; see [`Keys::record_of`](crate::cluster::journal::Keys::record_of).
         deleted: Option<u64>,
-        heard: Vec<Heard>,
+        members: Vec<MemberEntryChange>,
     },
     /// The watch on etcd has ended.
     WatchEnded,
@@ -187,10 +187,10 @@ pub enum Input {
 
 impl Input {
     /// The member entries in this input.
-    pub fn heard(&self) -> &[Heard] {
+    pub fn member_entries(&self) -> &[MemberEntryChange] {
         match self {
-            Self::Watched { heard, .. } => heard,
-            Self::Loaded(Some(read)) => &read.heard,
+            Self::Watched { members, .. } => members,
+            Self::Loaded(Some(read)) => &read.members,
             _ => &[],
         }
     }
@@ -333,7 +333,7 @@ pub enum Action {
         term: u64,
     },
     /// Write this computer's entry among the members to etcd.
-    Say,
+    PublishMemberEntry,
     WriteSnapshot {
         term: u64,
         progress: Progress,

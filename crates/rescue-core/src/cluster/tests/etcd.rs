@@ -9,7 +9,7 @@ use crate::{
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
         machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
-        member::{Entry, Heard, Read, Said},
+        member::{Entry, MemberEntry, MemberEntryChange, Read},
     },
     master::{Displaced, Master, Request},
 };
@@ -65,7 +65,7 @@ pub(super) struct Etcd {
     /// The state that the journal leads to.
     pub(super) state: Master,
     values: BTreeMap<String, Vec<u8>>,
-    members: BTreeMap<String, (Said, u64)>,
+    members: BTreeMap<String, (MemberEntry, u64)>,
     /// The computers whose claims have succeeded, in order.
     pub(super) claims: Vec<usize>,
     /// All entries that were added to the journal, and when.
@@ -255,10 +255,10 @@ impl Etcd {
     }
 
     /// Writes a computer's member entry.
-    pub(super) fn say(&mut self, name: &str, said: Said) {
+    pub(super) fn put_member_entry(&mut self, name: &str, entry: MemberEntry) {
         self.view.revision += 1;
         let revision = self.view.revision;
-        self.members.insert(name.to_owned(), (said, revision));
+        self.members.insert(name.to_owned(), (entry, revision));
     }
 
     /// Carries out the transaction if the keys have the revisions that it expects.
@@ -446,7 +446,7 @@ impl Etcd {
             state: None,
             records: Vec::new(),
             progress: known,
-            heard: self.heard(0),
+            members: self.member_entries(0),
         };
         if let Some((seq, state, displaced)) = &self.snapshot
             && *seq > known.seq
@@ -493,14 +493,14 @@ impl Etcd {
     }
 
     /// The member entries that were written after a revision.
-    pub(super) fn heard(&self, after: u64) -> Vec<Heard> {
+    pub(super) fn member_entries(&self, after: u64) -> Vec<MemberEntryChange> {
         let members = self.members.iter();
         let new = members.filter(|(_, (_, revision))| *revision > after);
-        let heard = new.map(|(name, (said, revision))| Heard {
+        let changes = new.map(|(name, (entry, revision))| MemberEntryChange {
             name: name.clone(),
-            said: Some(said.clone()),
+            entry: Some(entry.clone()),
             revision: *revision,
         });
-        heard.collect()
+        changes.collect()
     }
 }

@@ -446,7 +446,7 @@ impl World {
             computer.watching = false;
             return self.input(at, Input::WatchEnded);
         };
-        let heard = self.etcd.heard(revision);
+        let members = self.etcd.member_entries(revision);
         let deleted = self.etcd.deleted(revision, view.revision);
         let leads = computer.member.role() == Role::Leading;
         if leads && deleted.is_some() && !self.etcd.is_readable() {
@@ -457,7 +457,7 @@ impl World {
             view,
             entries,
             deleted,
-            heard,
+            members,
         };
         self.input(at, input);
     }
@@ -688,12 +688,12 @@ impl World {
                     }
                 }
             }
-            Action::Say => {
+            Action::PublishMemberEntry => {
                 let computer = &self.computers[at];
-                let said = computer.member.says();
+                let entry = computer.member.member_entry();
                 if self.network.reaches_etcd(at) {
                     let name = computer.name.clone();
-                    self.etcd.say(&name, said);
+                    self.etcd.put_member_entry(&name, entry);
                     self.show_watches();
                 }
             }
