@@ -25,7 +25,7 @@ use rescue_core::{
         machine::{EtcdAnswer, Op, Settings, View},
         member::{Action, Entry, Input, Member, MemberEntryChange, PROBES, Read},
         merge::wire::{self, Ask},
-        standing::{Place, Standing},
+        standing::{JournalPosition, Standing},
     },
 };
 use ros1_master::{master::Master, xmlrpc};
@@ -75,8 +75,8 @@ pub(super) struct ClusterDriver {
     member: Member,
     replica: Replica,
     standing: watch::Sender<Standing>,
-    /// The place in the journal up to which the mirror is current.
-    place: watch::Sender<Place>,
+    /// The position in the journal up to which the mirror is current.
+    position: watch::Sender<JournalPosition>,
     shown: Arc<Shown>,
     peers: Arc<Peers>,
     /// Writes of this computer that a leader has not answered yet.
@@ -160,9 +160,9 @@ impl ClusterDriver {
                 action => self.carry_out(action).await,
             }
         }
-        let place = self.member.place();
-        self.place
-            .send_if_modified(|before| std::mem::replace(before, place) != place);
+        let position = self.member.position();
+        self.position
+            .send_if_modified(|before| std::mem::replace(before, position) != position);
         self.show();
         None
     }
@@ -228,8 +228,8 @@ impl ClusterDriver {
             }
             Action::Leave { binds } => {
                 if let Some(seq) = ledger.leave().filter(|_| binds) {
-                    let led = *self.place.borrow();
-                    self.shown.raise(Place { seq, ..led });
+                    let led = *self.position.borrow();
+                    self.shown.raise(JournalPosition { seq, ..led });
                 }
             }
             Action::Lead { seq, held, state } => {

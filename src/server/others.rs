@@ -13,7 +13,7 @@ use rescue_core::{
     cluster::{
         journal::RECORD_BYTES_MAX,
         sharing::Source,
-        standing::{Pass, Place, Standing},
+        standing::{JournalPosition, Pass, Standing},
     },
     order::ANSWER_LIMIT,
 };
@@ -75,30 +75,30 @@ pub(crate) struct Others {
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
-    /// The last place in the journal of all computers that the mirror includes.
-    pub(crate) followed: watch::Receiver<Place>,
+    /// The last position in the journal of all computers that the mirror includes.
+    pub(crate) followed: watch::Receiver<JournalPosition>,
     pub(crate) shown: Arc<Shown>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
 }
 
-/// The furthest place in the journal that an answer on this computer has shown. The mirror must not answer before it has
-/// reached that place.
+/// The furthest position in the journal that an answer on this computer has shown. The mirror must not answer before it has
+/// reached that position.
 #[derive(Debug)]
-pub(crate) struct Shown(Mutex<Place>);
+pub(crate) struct Shown(Mutex<JournalPosition>);
 
 impl Shown {
     pub(crate) fn new() -> Self {
-        Self(Mutex::new(Place::at_the_start()))
+        Self(Mutex::new(JournalPosition::at_start()))
     }
 
-    fn get(&self) -> Place {
+    fn get(&self) -> JournalPosition {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn raise(&self, place: Place) {
+    pub(crate) fn raise(&self, position: JournalPosition) {
         let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        *shown = shown.max(place);
+        *shown = shown.max(position);
     }
 }
 
@@ -294,7 +294,8 @@ impl Others {
                             }
                             let agreed = calls.ledger.agreement.last();
                             let last = calls.ledger.last_shared();
-                            let seq = Place::shown_seq(call.kind == Kind::Read, agreed, last);
+                            let seq =
+                                JournalPosition::shown_seq(call.kind == Kind::Read, agreed, last);
                             let seq = HeaderValue::from(seq);
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
@@ -372,14 +373,16 @@ pub(crate) fn own_address(uri: &str) -> IpAddr {
 }
 
 impl Call<'_> {
-    /// Passes the leader's answer on to the caller. Notes the answer's place in the journal: from now on the mirror
-    /// answers here only if it has reached that place.
+    /// Passes the leader's answer on to the caller. Notes the answer's position in the journal: from now on the mirror
+    /// answers here only if it has reached that position.
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
         let seq = seq.unwrap_or(0);
         let epoch = self.others.followed.borrow().epoch;
-        self.others.shown.raise(Place { epoch, term, seq });
+        self.others
+            .shown
+            .raise(JournalPosition { epoch, term, seq });
         let number = raw.headers.get(peer::ANSWER_HEADER);
         let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
         let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);

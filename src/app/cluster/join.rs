@@ -8,7 +8,7 @@ use rescue_core::{
         journal::Keys,
         machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
         member::{Member, Own},
-        standing::{Place, Standing},
+        standing::{JournalPosition, Standing},
     },
     hide::Hide,
 };
@@ -90,7 +90,7 @@ pub(in crate::app) async fn join(
     let known = setup.restored;
     let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
-    let place = watch::Sender::new(Place::default());
+    let position = watch::Sender::new(JournalPosition::default());
     let shown = Arc::new(Shown::new());
     let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(context.probe_timeout));
@@ -103,7 +103,7 @@ pub(in crate::app) async fn join(
         forwarded: forwarded.clone(),
         served: setup.context.served.clone(),
         members: members.clone(),
-        followed: place.subscribe(),
+        followed: position.subscribe(),
         shown: shown.clone(),
         // A call may have to wait for the next leader. That takes the time to live, and longer if etcd must elect its
         // own leader first.
@@ -130,7 +130,7 @@ pub(in crate::app) async fn join(
         },
         setup,
         standing,
-        place,
+        position,
         shown,
         peers,
         forwarded,

@@ -34,15 +34,15 @@ struct Computer {
     gate: gate::Tx,
     standing: watch::Sender<Standing>,
     /// How much of the journal this computer's mirror holds.
-    followed: watch::Sender<Place>,
+    followed: watch::Sender<JournalPosition>,
     handovers: mpsc::Receiver<Handover>,
 }
 
-fn place(term: u64, seq: u64) -> Place {
-    Place {
+fn position(term: u64, seq: u64) -> JournalPosition {
+    JournalPosition {
         term,
         seq,
-        ..Place::default()
+        ..JournalPosition::default()
     }
 }
 
@@ -89,7 +89,7 @@ impl Computer {
         );
         let (standing, standing_rx) = watch::channel(standing);
         let (handovers_tx, handovers) = mpsc::channel(1);
-        let (tell_followed, followed) = watch::channel(Place::at_the_start());
+        let (tell_followed, followed) = watch::channel(JournalPosition::at_start());
         let calls = Calls {
             pool: Arc::new(Pool::new(1, upstream, ledger.clone(), gate.clone())),
             gate,
@@ -437,8 +437,8 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
     let computer = Computer::new(Standing::Nobody { known: true });
     let others = computer.calls.others.clone().unwrap();
-    let shown = |term, seq| others.shown.raise(place(term, seq));
-    let follows = |term, seq| computer.followed.send_replace(place(term, seq));
+    let shown = |term, seq| others.shown.raise(position(term, seq));
+    let follows = |term, seq| computer.followed.send_replace(position(term, seq));
     let later = others.hold / 2;
     let get = get();
     shown(TERM, 7);
@@ -466,7 +466,7 @@ async fn a_read_waits_for_a_silent_leader_only_until_this_computer_is_alone() {
     let (silent, mut calls) = leader_with(vec![None]).await;
     let computer = Computer::new(silent);
     let others = computer.calls.others.as_ref().unwrap();
-    others.shown.raise(place(TERM, 7));
+    others.shown.raise(position(TERM, 7));
     let get = get();
     let alone = async {
         calls.wait_for(|count| *count > 0).await.unwrap();

@@ -25,7 +25,7 @@ use crate::{
         journal::{Keys, Progress},
         machine::{self, Machine, Role, Settings, View, WhenAlone},
         outgoing::Outgoing,
-        standing::{Place, Standing},
+        standing::{JournalPosition, Standing},
     },
     master::{Master, Request},
 };
@@ -117,7 +117,7 @@ pub struct Member {
     data_loss: DataLoss,
     journal: Journal,
     reading: Reading,
-    place: Place,
+    position: JournalPosition,
     /// How much of a journal the ledger's state holds, even if etcd has lost that journal.
     held: Holds,
     outgoing: Outgoing,
@@ -163,7 +163,7 @@ impl Member {
             data_loss: DataLoss::default(),
             journal: Journal::default(),
             reading: Reading::default(),
-            place: Place::default(),
+            position: JournalPosition::default(),
             held,
             outgoing: Outgoing::default(),
             cut_off,
@@ -271,9 +271,9 @@ impl Member {
         &self.published.standing
     }
 
-    /// The place in the journal up to which the mirror is current.
-    pub fn place(&self) -> Place {
-        self.place
+    /// The position in the journal up to which the mirror is current.
+    pub fn position(&self) -> JournalPosition {
+        self.position
     }
 
     /// The number of the last record that was read from the journal.

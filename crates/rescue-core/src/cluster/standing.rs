@@ -49,10 +49,10 @@ impl Standing {
     }
 }
 
-/// A place in the journal of all computers. A place in a later term is further: that term's leader has everything
+/// A position in the journal of all computers. A position in a later term is further: that term's leader has everything
 /// committed before, and nothing more of earlier terms can be added.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Place {
+pub struct JournalPosition {
     /// How often etcd has lost its data since this process started.
     pub epoch: u64,
     /// The leader's term.
@@ -61,10 +61,10 @@ pub struct Place {
     pub seq: u64,
 }
 
-impl Place {
-    /// The place that counts as shown when a process starts. Its mirror may be outdated or empty, so it answers nothing
+impl JournalPosition {
+    /// The position that counts as shown when a process starts. Its mirror may be outdated or empty, so it answers nothing
     /// before etcd's journal has been read.
-    pub fn at_the_start() -> Self {
+    pub fn at_start() -> Self {
         Self {
             seq: u64::from(!Mutant::AnswersUnread.lives()),
             ..Self::default()
@@ -81,7 +81,7 @@ impl Place {
         }
     }
 
-    /// Whether a mirror at this place may answer reads after earlier answers have shown the place `told`. On one
+    /// Whether a mirror at this position may answer reads after earlier answers have shown the position `told`. On one
     /// computer, no read goes back in time.
     pub fn shows(self, told: Self) -> bool {
         self >= told || Mutant::StaleReads.lives()

@@ -14,7 +14,7 @@ use super::{Action, Holds, Member, MemberEntryChange, News};
 use crate::cluster::{
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
-    standing::Place,
+    standing::JournalPosition,
 };
 
 /// How long a computer that holds less of the lost journal waits for the one that holds the most, in times to live.
@@ -183,9 +183,9 @@ impl Member {
                 (self.own.state, self.own.restored) = (journal.state, true);
             }
             // The mirror goes on answering. That of a process which has just started may be older than the new journal.
-            self.place = Place {
+            self.position = JournalPosition {
                 epoch,
-                ..Place::default()
+                ..JournalPosition::default()
             };
         }
         (self.journal.own_wins, self.own.term) = (true, 0);

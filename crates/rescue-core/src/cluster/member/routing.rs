@@ -3,7 +3,7 @@
 use super::{Action, Holds, Member};
 use crate::cluster::{
     machine::Role,
-    standing::{Pass, Place, Standing},
+    standing::{JournalPosition, Pass, Standing},
 };
 
 impl Member {
@@ -41,7 +41,7 @@ impl Member {
 
     /// Notes who leads. If this computer follows, publishes where its calls go.
     pub(super) fn update_standing(&mut self) {
-        self.update_place();
+        self.update_position();
         let own = &self.settings().id;
         let view = self.view();
         let other = view.leader.as_ref().filter(|leader| leader.id != *own);
@@ -73,10 +73,10 @@ impl Member {
         self.publish_standing(standing);
     }
 
-    /// Updates the place up to which the mirror is current.
-    fn update_place(&mut self) {
+    /// Updates the position up to which the mirror is current.
+    fn update_position(&mut self) {
         let seq = self.journal.progress.seq;
-        // If `differs`, the mirror is at no place of the journal: it holds records or kept writes that the journal
+        // If `differs`, the mirror is at no position of the journal: it holds records or kept writes that the journal
         // lacks.
         let lost = self.data_loss.since().is_some();
         let differs = self.own.seq > seq || lost || !self.cut_off.is_empty();
@@ -87,7 +87,7 @@ impl Member {
         // The leader's term counts only once the mirror has the whole journal before that leader's first record.
         let whole = self.reading.loaded && seq >= view.seq();
         let leader = view.leader.as_ref().filter(|_| whole);
-        let term = leader.map_or(self.place.term, |leader| leader.term);
+        let term = leader.map_or(self.position.term, |leader| leader.term);
         let epoch = self.data_loss.times;
         // The mirror of a leader has changes that the journal may lack, also while this computer is cut off.
         let own = view
@@ -98,7 +98,7 @@ impl Member {
             true => seq.max(self.outgoing.last()),
             false => seq,
         };
-        self.place = Place { epoch, term, seq };
+        self.position = JournalPosition { epoch, term, seq };
         self.held = Holds { term, seq };
     }
 }

@@ -39,7 +39,7 @@ pub struct MemberEntry {
     pub seq: u64,
     /// See [`Settings::boot`].
     pub boot: String,
-    /// Set while etcd has lost its data: the place in the lost journal up to which this computer holds the state.
+    /// Set while etcd has lost its data: the position in the lost journal up to which this computer holds the state.
     pub holds: Option<Holds>,
     /// The origin of a journal that this computer could not read from its beginning, or 0. Its leader checks that.
     pub unreadable: u64,
@@ -50,7 +50,7 @@ pub struct MemberEntry {
     pub notifies: String,
 }
 
-/// A place in a journal that etcd has lost: its leader's term and a record number.
+/// A position in a journal that etcd has lost: its leader's term and a record number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Holds {
     pub term: u64,

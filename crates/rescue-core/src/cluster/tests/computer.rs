@@ -11,7 +11,7 @@ use crate::{
         member::{Member, Own},
         merge::wire,
         sharing::{Sharing, Source},
-        standing::{Place, Standing},
+        standing::{JournalPosition, Standing},
     },
     master::{Master, Notice, Request},
 };
@@ -133,12 +133,12 @@ pub(super) struct Computer {
     pub(super) standing: Standing,
     /// Calls of the computer's nodes that wait. Each is sent again only after the time beside it.
     pub(super) waiting: Vec<(usize, u64)>,
-    /// The furthest place in the journal that a leader's answer has shown.
-    pub(super) told: Place,
-    /// The last place that it may have shown, if it led until its role changed last.
-    pub(super) left: Option<Place>,
-    /// The place in the journal up to which the mirror is current.
-    pub(super) followed: Place,
+    /// The furthest position in the journal that a leader's answer has shown.
+    pub(super) told: JournalPosition,
+    /// The last position that it may have shown, if it led until its role changed last.
+    pub(super) left: Option<JournalPosition>,
+    /// The position in the journal up to which the mirror is current.
+    pub(super) followed: JournalPosition,
     /// Whether there is a watch. Its number, time and last revision follow.
     pub(super) watching: bool,
     pub(super) watch: u64,
@@ -201,9 +201,9 @@ impl Computer {
             cut: (0, 0),
             standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
-            told: Place::at_the_start(),
+            told: JournalPosition::at_start(),
             left: None,
-            followed: Place::default(),
+            followed: JournalPosition::default(),
             watching: false,
             watch: 0,
             watch_at: 0,
@@ -220,7 +220,7 @@ impl Computer {
         self.hangs_until = 0;
         self.disk.own.restored = true;
         let own = &self.disk.own;
-        (self.told, self.followed) = (Place::at_the_start(), Place::default());
+        (self.told, self.followed) = (JournalPosition::at_start(), JournalPosition::default());
         self.ledger = Ledger {
             mirror: own.state.clone(),
             leadership: self.ledger.leadership + 1,
@@ -233,16 +233,16 @@ impl Computer {
         self.waiting.clear();
     }
 
-    /// Notes the place in the journal that a leader's answer shows.
-    pub(super) fn tell_of(&mut self, place: Place) {
+    /// Notes the position in the journal that a leader's answer shows.
+    pub(super) fn tell_of(&mut self, position: JournalPosition) {
         let epoch = self.followed.epoch;
-        self.told = self.told.max(Place { epoch, ..place });
+        self.told = self.told.max(JournalPosition { epoch, ..position });
     }
 
     /// Stops recording. Returns the merged portions that are not answered.
     pub(super) fn leave(&mut self, binds: bool) -> Vec<(u64, Asker, wire::MergeAnswer)> {
         let recorded = self.ledger.sharing.is_some().then(|| self.ledger.last());
-        self.left = recorded.filter(|_| binds).map(|seq| Place {
+        self.left = recorded.filter(|_| binds).map(|seq| JournalPosition {
             seq,
             ..self.followed
         });

@@ -19,7 +19,7 @@ use crate::{
         member::{Action, Input, News},
         merge::wire::{self, Ask, WriteOutcome},
         sharing::Source,
-        standing::{Pass, Place, Standing},
+        standing::{JournalPosition, Pass, Standing},
     },
     master::Notice,
     xmlrpc::{Reply, Value},
@@ -54,11 +54,11 @@ enum Event {
     /// A call forwarded by the first computer reaches the second as the leader of a term.
     Forward(usize, usize, u64, usize),
     /// The answer to a call reaches the computer of its node.
-    Done(usize, u64, usize, Place),
+    Done(usize, u64, usize, JournalPosition),
     /// A read forwarded by the first computer reaches the second.
     Ask(usize, u64, usize, u64, usize),
     /// The answer to a read arrives: the value, and whether the journal may lack it.
-    Told(usize, u64, usize, (Option<i32>, Shows), Place),
+    Told(usize, u64, usize, (Option<i32>, Shows), JournalPosition),
     /// The leader has not answered a read in time.
     Late(usize, u64, usize),
     Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
@@ -253,9 +253,9 @@ impl World {
                     self.refused(from, call);
                 }
             }
-            Event::Done(at, life, call, place) => {
+            Event::Done(at, life, call, position) => {
                 if self.lives(at, life) {
-                    self.computers[at].tell_of(place);
+                    self.computers[at].tell_of(position);
                     self.done(at, call);
                 }
             }
@@ -267,16 +267,16 @@ impl World {
                 {
                     let value = self.value(to, self.history.reads[read].key);
                     let ledger = &computer.ledger;
-                    let seq = Place::shown_seq(true, ledger.agreed, ledger.last());
+                    let seq = JournalPosition::shown_seq(true, ledger.agreed, ledger.last());
                     let shows = self.shows(to);
                     let delay = self.delay();
-                    let told = Event::Told(from, life, read, (value, shows), place(term, seq));
+                    let told = Event::Told(from, life, read, (value, shows), position(term, seq));
                     self.after(delay, told);
                 }
             }
-            Event::Told(at, life, read, (value, shows), place) => {
+            Event::Told(at, life, read, (value, shows), position) => {
                 if self.lives(at, life) && self.history.reads[read].done.is_none() {
-                    self.computers[at].tell_of(place);
+                    self.computers[at].tell_of(position);
                     self.read_done(read, value, shows);
                 }
             }
@@ -517,7 +517,7 @@ impl World {
                 self.act(at, action, &mut inputs);
             }
             let computer = &mut self.computers[at];
-            computer.followed = computer.member.place();
+            computer.followed = computer.member.position();
             let follows = computer.member.view().origin == self.etcd.view().origin;
             computer.unaware &= self.etcd.is_old || !follows || computer.member.seq() == 0;
             computer.write_disk();
@@ -845,7 +845,7 @@ impl World {
     }
 }
 
-fn place(term: u64, seq: u64) -> Place {
+fn position(term: u64, seq: u64) -> JournalPosition {
     let epoch = 0;
-    Place { epoch, term, seq }
+    JournalPosition { epoch, term, seq }
 }

@@ -129,14 +129,14 @@ impl World {
             let cut = self.computers[at].cut;
             self.history
                 .answered(at, call, self.now, alone.then_some(cut));
-            let shown = Place::shown_seq(false, agreed, self.computers[at].ledger.last());
-            let place = place(term.unwrap_or(0), shown);
+            let shown = JournalPosition::shown_seq(false, agreed, self.computers[at].ledger.last());
+            let position = position(term.unwrap_or(0), shown);
             let life = self.computers[origin].life;
             if origin == at {
                 self.done(at, call);
             } else if self.network.joins(at, origin) {
                 let delay = self.delay();
-                self.after(delay, Event::Done(origin, life, call, place));
+                self.after(delay, Event::Done(origin, life, call, position));
             } else {
                 self.history.unheard(call);
             }
