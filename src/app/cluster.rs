@@ -222,17 +222,17 @@ impl ClusterDriver {
                 let otherwise = Input::Decided { seq, goes_on };
                 self.spawn(otherwise, decide(seq, state, self.setup.restore, evidence));
             }
-            Action::Stand(standing) => {
+            Action::PublishStanding(standing) => {
                 tracing::debug!(?standing, "this computer's standing has changed");
                 self.standing.send_replace(standing);
             }
-            Action::Leave { binds } => {
+            Action::StopRecording { binds } => {
                 if let Some(seq) = ledger.leave().filter(|_| binds) {
                     let led = *self.position.borrow();
                     self.shown.raise(JournalPosition { seq, ..led });
                 }
             }
-            Action::Lead { seq, held, state } => {
+            Action::StartRecording { seq, held, state } => {
                 if let Some(state) = state {
                     // This fails only if this computer already has the master.
                     let _ = ledger.follow_state(state);
@@ -250,30 +250,30 @@ impl ClusterDriver {
                 let state = ledger.take_as_state();
                 self.inbox.push_front(Input::AsState(state));
             }
-            Action::AskForwarded => {
+            Action::CollectForwarded => {
                 let calls = self.forwarded.writes();
                 self.inbox.push_front(Input::Forwarded(calls));
             }
-            Action::TellDisplaced(nodes) => {
+            Action::ShutDownDisplaced(nodes) => {
                 ledger.with_activity(|_, activity| activity.restore_displaced(nodes));
             }
-            Action::TellAll => notifications::notify_all(&context.nodes),
-            Action::Term(term) => ledger.update_session(|session| session.term = term),
+            Action::NotifyAll => notifications::notify_all(&context.nodes),
+            Action::StoreTerm(term) => ledger.update_session(|session| session.term = term),
             Action::BeginMaster(cause) => {
                 let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);
                 let cause = report::cause(cause);
                 self.duties = Some(context.begin(process, Some(self.setup.rosout), cause));
             }
             Action::EndMaster => self.end_master().await,
-            Action::StandIn => context.gate_tx.set(State::StandingIn),
-            Action::TurnAway => context.gate_tx.set(State::Elsewhere),
-            Action::ServeOwnOnly(own_only) => context.nodes.set_alone(own_only),
-            Action::KeepAll { base, calls } => {
+            Action::AnswerFromMirror => context.gate_tx.set(State::StandingIn),
+            Action::AnswerNothing => context.gate_tx.set(State::Elsewhere),
+            Action::NotifyOwnOnly(own_only) => context.nodes.set_alone(own_only),
+            Action::ReplacePartitionWrites { base, calls } => {
                 self.partition_writes
                     .replace(&context.checkpoint, base, calls)
                     .await;
             }
-            Action::Keep(calls) => {
+            Action::AddPartitionWrites(calls) => {
                 self.partition_writes.add(calls).await;
                 if self.partition_writes.has_outgrown()
                     && let Some((base, calls)) = self.member.kept()
@@ -284,7 +284,9 @@ impl ClusterDriver {
                         .await;
                 }
             }
-            Action::KeepNothing => self.partition_writes.remove(&context.checkpoint).await,
+            Action::DeletePartitionWrites => {
+                self.partition_writes.remove(&context.checkpoint).await
+            }
             Action::Merge { number, ask, to } => {
                 let (peers, queue) = (self.peers.clone(), context.write_queue.clone());
                 let own = others::own_address(&self.member.settings().uri);
@@ -339,7 +341,7 @@ impl ClusterDriver {
                     Input::SnapshotWritten(bytes.map(|bytes| (progress, bytes)))
                 });
             }
-            Action::Forget(revision) => {
+            Action::CompactEtcd(revision) => {
                 let client = self.replica.client.clone();
                 self.beside.spawn(async move {
                     if let Err(error) = client.compact(revision, LIMIT).await {
@@ -362,7 +364,7 @@ impl ClusterDriver {
                     Input::RosoutEnded
                 });
             }
-            Action::Tell(news) => self.log_news(news),
+            Action::Log(news) => self.log_news(news),
             Action::End | Action::EndForNamesake(_) => {}
         }
     }

@@ -13,7 +13,7 @@ use rescue_core::{
     cluster::{
         journal::RECORD_BYTES_MAX,
         sharing::Source,
-        standing::{JournalPosition, Pass, Standing},
+        standing::{AnsweredCalls, JournalPosition, Standing},
     },
     order::ANSWER_LIMIT,
 };
@@ -264,7 +264,8 @@ impl Others {
             let mut by_mirror = false;
             let retry = match now {
                 Standing::Leads {
-                    pass: Pass::Calls, ..
+                    answers: AnsweredCalls::All,
+                    ..
                 }
                 | Standing::Alone => {
                     let Call {
@@ -334,8 +335,8 @@ impl Others {
                     }
                 }
                 // Waits until the next leader has taken over, or the merge is done.
-                Standing::Leads { pass, .. } => {
-                    by_mirror = pass == Pass::Reads;
+                Standing::Leads { answers, .. } => {
+                    by_mirror = answers == AnsweredCalls::Reads;
                     None
                 }
                 Standing::Nobody { known } => {

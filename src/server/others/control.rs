@@ -5,7 +5,7 @@ use rescue_core::{
     checkpoint::format::Origin,
     cluster::{
         merge::wire::Ask,
-        standing::{Pass, Standing},
+        standing::{AnsweredCalls, Standing},
     },
 };
 use ros1_master::{
@@ -103,7 +103,8 @@ impl Others {
     async fn hand_over(&self, call: &Call<'_>, to: String) -> Result<HttpReply, Closed> {
         let mut standing = self.standing.clone();
         let settled = standing.wait_for(|now| {
-            let waits = matches!(now, Standing::Leads { pass, .. } if *pass != Pass::Calls);
+            let waits =
+                matches!(now, Standing::Leads { answers, .. } if *answers != AnsweredCalls::All);
             !waits && !matches!(now, Standing::Nobody { .. })
         });
         let Ok(now) = tokio::time::timeout(self.hold, settled).await else {

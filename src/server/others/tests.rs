@@ -188,7 +188,7 @@ async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
         Standing::Alone,
         Standing::Leads {
             term: 8,
-            pass: Pass::Calls,
+            answers: AnsweredCalls::All,
         },
         Standing::Nobody { known: true },
         leader(None).await,
@@ -291,7 +291,7 @@ async fn who_and_where_the_master_is_each_computer_says_of_itself() {
 async fn a_write_that_no_record_holds_is_refused_before_it_is_run() {
     let computer = Computer::new(Standing::Leads {
         term: TERM,
-        pass: Pass::Calls,
+        answers: AnsweredCalls::All,
     });
     let body = Bytes::from(vec![b' '; RECORD_BYTES_MAX + 1]);
     let from = "127.0.0.1:4000".parse().unwrap();
@@ -313,7 +313,7 @@ async fn a_write_that_no_record_holds_is_refused_before_it_is_run() {
 async fn a_handover_is_asked_for_where_this_computer_leads_and_is_done_or_refused() {
     let mut computer = Computer::new(Standing::Leads {
         term: TERM,
-        pass: Pass::Calls,
+        answers: AnsweredCalls::All,
     });
     for told in [Ok("pc-1".to_owned()), Err("no other computer".to_owned())] {
         let call = handover();

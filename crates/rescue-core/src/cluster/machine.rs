@@ -547,7 +547,7 @@ impl Machine {
             acknowledged,
         } = self.written;
         if recorded > committed {
-            actions.push(Action::Yield {
+            actions.push(Action::HandBack {
                 committed,
                 acknowledged,
             });

@@ -328,7 +328,7 @@ impl Member {
     }
 
     fn report_news(&mut self, news: News) {
-        self.act(Action::Tell(news));
+        self.act(Action::Log(news));
     }
 
     fn queue_input(&mut self, input: machine::Input) {
@@ -351,7 +351,7 @@ impl Member {
                     self.outgoing.acknowledged = seq;
                     self.act(Action::Acknowledge(seq));
                 }
-                machine::Action::Yield {
+                machine::Action::HandBack {
                     committed,
                     acknowledged,
                 } => self.give_back(committed, acknowledged),

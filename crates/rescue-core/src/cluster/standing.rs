@@ -4,19 +4,19 @@ use crate::cluster::mutant::Mutant;
 
 /// The calls that a leader answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pass {
-    Calls,
+pub enum AnsweredCalls {
+    All,
     /// The mirror answers reads. Writes wait for the next leader.
     Reads,
     /// No call is answered: partition writes are not merged yet, so their callers would not see them.
-    Nothing,
+    None,
 }
 
 /// Who has the master, and where this computer's calls go. Only [`Member`](crate::cluster::member::Member) sets it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Standing {
     /// This computer leads in `term`, and has the master.
-    Leads { term: u64, pass: Pass },
+    Leads { term: u64, answers: AnsweredCalls },
     /// This computer is cut off. Its mirror answers its own nodes, and other computers' calls are refused.
     Alone,
     /// The computer at `uri` leads in `term`. All calls are forwarded to it.
@@ -36,7 +36,7 @@ impl Standing {
         matches!(
             self,
             Self::Leads {
-                pass: Pass::Calls,
+                answers: AnsweredCalls::All,
                 ..
             } | Self::Alone
         )
@@ -44,8 +44,8 @@ impl Standing {
 
     /// Whether this computer answers calls that other computers forward to the leader of `term`.
     pub fn answers_others(&self, term: u64) -> bool {
-        let pass = Pass::Calls;
-        *self == Self::Leads { term, pass }
+        let answers = AnsweredCalls::All;
+        *self == Self::Leads { term, answers }
     }
 }
 

@@ -243,7 +243,7 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
         assert_eq!(actions.contains(&Action::Acknowledge(1)), answers);
         // Another computer leads, so this one hands back the writes that it answered.
         let actions = machine.on(lapses, Input::View(led("b", 5, 6)));
-        let hands_back = Action::Yield {
+        let hands_back = Action::HandBack {
             committed: 0,
             acknowledged: u64::from(answers),
         };
@@ -292,7 +292,7 @@ fn a_leader_that_refused_to_serve_alone_does_not_wait_for_records_that_it_gave_u
     let (revision, seq) = (3, 1);
     let answer = EtcdAnswer::Applied { revision, seq };
     let actions = machine.on(late + ms(200), Input::Answer { number, answer });
-    let hands_back = Action::Yield {
+    let hands_back = Action::HandBack {
         committed: 1,
         acknowledged: 1,
     };
@@ -373,7 +373,7 @@ fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
     assert_eq!(actions[0], Action::Become(Role::Alone));
     machine.on(long, Input::Recorded(11));
     let actions = machine.on(long + TTL, Input::Peer(true));
-    let hands_back = Action::Yield {
+    let hands_back = Action::HandBack {
         committed: 10,
         acknowledged: 11,
     };

@@ -266,7 +266,7 @@ pub enum Action {
     /// This computer's calls after `committed` are not in the journal. Those up to `acknowledged` were answered, so
     /// they are merged with the journal and sent to the next leader. The others still wait. The mirror must be
     /// rebuilt from the journal.
-    Yield {
+    HandBack {
         committed: u64,
         acknowledged: u64,
     },

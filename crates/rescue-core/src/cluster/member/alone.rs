@@ -23,7 +23,7 @@ impl Member {
         // The nodes continue from what they wrote in earlier periods of being cut off.
         let base = self.cut_off.on(base);
         self.begin_cut_off(base.clone());
-        self.act(Action::ServeOwnOnly(true));
+        self.act(Action::NotifyOwnOnly(true));
         if led {
             // Recorded calls are answered from now on, except forwarded ones, which their computers send elsewhere.
             let answered = self.outgoing.acknowledged;
@@ -34,13 +34,13 @@ impl Member {
         } else {
             // The standing changes first, so that no more calls are forwarded.
             self.publish_standing(Standing::Nobody { known: true });
-            self.act(Action::AskForwarded);
+            self.act(Action::CollectForwarded);
             let seq = self.machine.committed();
             self.outgoing.start(seq);
             let (held, state) = (base.clone(), Some(base));
-            self.act(Action::Lead { seq, held, state });
+            self.act(Action::StartRecording { seq, held, state });
         }
-        self.act(Action::StandIn);
+        self.act(Action::AnswerFromMirror);
         self.publish_standing(Standing::Alone);
         self.all_ready();
     }
@@ -77,14 +77,14 @@ impl Member {
     pub(super) fn keep_all(&mut self) {
         let kept = self.kept().map(|(base, calls)| (base.clone(), calls));
         self.act(match kept {
-            Some((base, calls)) => Action::KeepAll { base, calls },
-            None => Action::KeepNothing,
+            Some((base, calls)) => Action::ReplacePartitionWrites { base, calls },
+            None => Action::DeletePartitionWrites,
         });
     }
 
     pub(super) fn keep(&mut self, calls: Vec<Request>) {
         if !calls.is_empty() {
-            self.act(Action::Keep(calls));
+            self.act(Action::AddPartitionWrites(calls));
         }
     }
 }

@@ -95,7 +95,7 @@ impl Member {
         match self.chores.forget {
             Some((at, before)) if at <= now => {
                 self.chores.forget = Some((now + FORGET, revision));
-                self.act(Action::Forget(before));
+                self.act(Action::CompactEtcd(before));
             }
             None => self.chores.forget = Some((now + FORGET, revision)),
             Some(_) => {}

@@ -404,7 +404,7 @@ impl Member {
             outdated |= self.chores.notifying.note_entry(change);
         }
         if outdated && self.published.role == Role::Leading && !Mutant::LeavesOldNews.lives() {
-            self.act(Action::TellAll);
+            self.act(Action::NotifyAll);
         }
     }
 }

@@ -40,7 +40,7 @@ impl Member {
             false => self.begin_to_lead(now),
             true => {
                 self.report_news(News::LeadsAgain);
-                self.act(Action::ServeOwnOnly(false));
+                self.act(Action::NotifyOwnOnly(false));
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
                 let last = self.outgoing.last();
@@ -55,7 +55,7 @@ impl Member {
     /// Has the checkpoint name the present term.
     pub(super) fn keep_term(&mut self, term: u64) {
         if std::mem::replace(&mut self.before.term, term) != term {
-            self.act(Action::Term(term));
+            self.act(Action::StoreTerm(term));
         }
     }
 
@@ -82,9 +82,9 @@ impl Member {
             // Partition writes are merged later. They are not part of the state that the others get.
             false => (!self.cut_off.is_empty() && !owns).then(|| held.clone()),
         };
-        self.act(Action::Lead { seq, held, state });
+        self.act(Action::StartRecording { seq, held, state });
         let displaced = self.journal.displaced.at(now);
-        self.act(Action::TellDisplaced(displaced));
+        self.act(Action::ShutDownDisplaced(displaced));
         self.begin_master(cause);
     }
 
@@ -108,7 +108,7 @@ impl Member {
         if self.published.has_master && !may {
             self.report_news(News::Lapsed);
             self.end_master();
-            self.act(Action::StandIn);
+            self.act(Action::AnswerFromMirror);
         } else if !self.published.has_master && may && self.records() {
             self.begin_master(Cause::WasCutOff);
         }
@@ -123,12 +123,12 @@ impl Member {
         }
         // A computer that is cut off and serves has its own history.
         let binds = !self.keeps();
-        self.act(Action::Leave { binds });
+        self.act(Action::StopRecording { binds });
         let known = self.knows();
         self.publish_standing(Standing::Nobody { known });
         self.end_master();
-        self.act(Action::ServeOwnOnly(false));
-        self.act(Action::TurnAway);
+        self.act(Action::NotifyOwnOnly(false));
+        self.act(Action::AnswerNothing);
         self.adopt();
     }
 }

@@ -3,7 +3,7 @@
 use super::{Action, Holds, Member};
 use crate::cluster::{
     machine::Role,
-    standing::{JournalPosition, Pass, Standing},
+    standing::{AnsweredCalls, JournalPosition, Standing},
 };
 
 impl Member {
@@ -11,18 +11,18 @@ impl Member {
     pub(super) fn publish_standing(&mut self, standing: Standing) {
         if self.published.standing != standing {
             self.published.standing = standing.clone();
-            self.act(Action::Stand(standing));
+            self.act(Action::PublishStanding(standing));
         }
     }
 
     /// Publishes that this computer leads. Calls wait while partition writes are being merged.
     pub(super) fn publish_leading(&mut self, term: u64) {
-        let pass = match (self.cut_off.is_empty(), self.release.is_begun()) {
-            (false, _) => Pass::Nothing,
-            (true, true) => Pass::Reads,
-            (true, false) => Pass::Calls,
+        let answers = match (self.cut_off.is_empty(), self.release.is_begun()) {
+            (false, _) => AnsweredCalls::None,
+            (true, true) => AnsweredCalls::Reads,
+            (true, false) => AnsweredCalls::All,
         };
-        self.publish_standing(Standing::Leads { term, pass });
+        self.publish_standing(Standing::Leads { term, answers });
     }
 
     /// The address and term of the leader, if it is another computer that has not given up leadership. The leader of a

@@ -103,7 +103,7 @@ impl Merges {
                     }
                     Action::Report(outcomes) => self.lost += outcomes.len(),
                     Action::Merge { number, ask, .. } => asked = Some((number, ask)),
-                    Action::Tell(News::Merged { .. }) => return None,
+                    Action::Log(News::Merged { .. }) => return None,
                     _ => {}
                 }
             }
@@ -199,7 +199,7 @@ fn the_end_of_a_merge_keeps_the_file_of_writes_that_the_journal_lacks() {
     let keeps_nothing = |member: &mut Member| {
         member.merged(Instant::now());
         let mut actions = member.queue.actions.drain(..);
-        actions.any(|action| matches!(action, Action::KeepNothing))
+        actions.any(|action| matches!(action, Action::DeletePartitionWrites))
     };
     assert!(keeps_nothing(&mut Merges::new().member));
     let mut member = Merges::new().member;

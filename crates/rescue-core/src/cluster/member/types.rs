@@ -158,7 +158,7 @@ pub enum Input {
     Recorded(Vec<Change>),
     /// The result of [`Action::TakeAsState`].
     AsState(Option<Change>),
-    /// The result of [`Action::AskForwarded`]: writes of this computer's nodes that a leader has not answered.
+    /// The result of [`Action::CollectForwarded`]: writes of this computer's nodes that a leader has not answered.
     Forwarded(Vec<Request>),
     /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
     Prepared(Option<bool>),
@@ -271,15 +271,15 @@ pub enum Action {
         closed: bool,
     },
     /// Publish who has the master and where calls go.
-    Stand(Standing),
+    PublishStanding(Standing),
     /// Stop recording and acknowledging calls, and stop notifying nodes. If it `binds`, no later read on this computer
     /// may show less than the mirror has shown.
-    Leave {
+    StopRecording {
         binds: bool,
     },
     /// Record calls from now on, with numbers after `seq`. The other computers have the state `held`. `state` replaces
     /// the ledger's state, if set.
-    Lead {
+    StartRecording {
         seq: u64,
         held: Master,
         state: Option<Master>,
@@ -293,31 +293,31 @@ pub enum Action {
     /// Take the changes that the ledger has recorded but not yet handed out as a single one: its state. Ends with
     /// [`Input::AsState`].
     TakeAsState,
-    AskForwarded,
+    CollectForwarded,
     /// Tell these nodes, which lost their names to other nodes, to shut down again, because they may have missed it.
-    TellDisplaced(Vec<Displaced>),
+    ShutDownDisplaced(Vec<Displaced>),
     /// Notify every node of the present state, because it may have heard an older one from another computer since.
-    TellAll,
+    NotifyAll,
     /// Note in the checkpoint that this computer leads in this term.
-    Term(u64),
+    StoreTerm(u64),
     BeginMaster(Cause),
     /// Kill the master at once.
     EndMaster,
     /// Let the mirror answer, because this computer has no master.
-    StandIn,
+    AnswerFromMirror,
     /// Answer no call on this computer.
-    TurnAway,
+    AnswerNothing,
     /// Notify only this computer's own nodes if true, all nodes if false.
-    ServeOwnOnly(bool),
+    NotifyOwnOnly(bool),
     /// Keep exactly these partition writes. `base` is the state before them.
-    KeepAll {
+    ReplacePartitionWrites {
         base: Master,
         calls: Vec<Request>,
     },
     /// Keep these partition writes, too, until a leader has them.
-    Keep(Vec<Request>),
+    AddPartitionWrites(Vec<Request>),
     /// Delete the kept writes, because none is left to send.
-    KeepNothing,
+    DeletePartitionWrites,
     /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
     Merge {
         number: u64,
@@ -341,12 +341,12 @@ pub enum Action {
         displaced: Vec<Displaced>,
     },
     /// Compact etcd up to this revision.
-    Forget(u64),
+    CompactEtcd(u64),
     /// Answer a handover request with success, or with the reason why it failed.
     HandedOver(Result<(), String>),
     /// Stop roscore's other duties while calls still pass to the master.
     EndRosout,
-    Tell(News),
+    Log(News),
     /// Stop.
     End,
     /// Stop, because the computer at this address has the same name.

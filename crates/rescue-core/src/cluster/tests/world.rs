@@ -19,7 +19,7 @@ use crate::{
         member::{Action, Input, News},
         merge::wire::{self, Ask, WriteOutcome},
         sharing::Source,
-        standing::{JournalPosition, Pass, Standing},
+        standing::{AnsweredCalls, JournalPosition, Standing},
     },
     master::Notice,
     xmlrpc::{Reply, Value},
@@ -588,20 +588,20 @@ impl World {
                 let input = Input::Decided { seq, goes_on };
                 self.after(delay, Event::Input(at, life, input));
             }
-            Action::Stand(standing) => self.stand(at, standing),
-            Action::Leave { binds } => {
+            Action::PublishStanding(standing) => self.stand(at, standing),
+            Action::StopRecording { binds } => {
                 for (_, asker, _) in self.computers[at].leave(binds) {
                     self.merge_answered(asker, at, None);
                 }
                 self.owed[at] = Default::default();
             }
-            Action::Lead { seq, held, state } => {
+            Action::StartRecording { seq, held, state } => {
                 let computer = &mut self.computers[at];
                 computer.ledger.lead(seq, &held, state);
                 let leadership = computer.ledger.leadership;
                 self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
-            Action::TellAll => (0..COMPUTERS).for_each(|to| self.tell_state(at, to)),
+            Action::NotifyAll => (0..COMPUTERS).for_each(|to| self.tell_state(at, to)),
             Action::Follow(records) => {
                 let computer = &mut self.computers[at];
                 for record in &records {
@@ -620,12 +620,12 @@ impl World {
                 let state = ledger.sharing.as_mut().map(|of| of.take_as_state(mirror));
                 inputs.push_front(Input::AsState(state));
             }
-            Action::AskForwarded => {
+            Action::CollectForwarded => {
                 let waiting = self.computers[at].waiting.iter();
                 let calls = waiting.map(|(call, _)| self.history.request(*call));
                 inputs.push_front(Input::Forwarded(calls.collect()));
             }
-            Action::Term(term) => self.computers[at].disk.own.term = term,
+            Action::StoreTerm(term) => self.computers[at].disk.own.term = term,
             Action::BeginMaster(_) => {
                 self.masters += 1;
                 let master = self.masters;
@@ -640,18 +640,18 @@ impl World {
                 let leadership = computer.ledger.leadership;
                 self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
-            Action::ServeOwnOnly(own_only) => self.computers[at].own_only = own_only,
-            Action::KeepAll { base, calls } => {
+            Action::NotifyOwnOnly(own_only) => self.computers[at].own_only = own_only,
+            Action::ReplacePartitionWrites { base, calls } => {
                 let computer = &mut self.computers[at];
                 computer.disk.kept = Some((base, calls));
                 computer.synced.kept = computer.disk.kept.clone();
             }
-            Action::Keep(calls) => {
+            Action::AddPartitionWrites(calls) => {
                 if let Some((_, kept)) = &mut self.computers[at].disk.kept {
                     kept.extend(calls);
                 }
             }
-            Action::KeepNothing => self.forget_kept(at),
+            Action::DeletePartitionWrites => self.forget_kept(at),
             Action::Merge { number, ask, to } => {
                 let delay = self.delay();
                 let (to, term) = match to {
@@ -705,7 +705,7 @@ impl World {
                 let written = Input::SnapshotWritten(Some((progress, 1000)));
                 self.after(delay, Event::Input(at, life, written));
             }
-            Action::Tell(news) => match news {
+            Action::Log(news) => match news {
                 News::Alone { .. } => {
                     self.counts.alone += 1;
                     self.computers[at].times_alone += 1;
@@ -721,10 +721,10 @@ impl World {
                 self.computers[at].up = false;
             }
             Action::End => self.computers[at].up = false,
-            Action::StandIn
-            | Action::TurnAway
-            | Action::TellDisplaced(_)
-            | Action::Forget(_)
+            Action::AnswerFromMirror
+            | Action::AnswerNothing
+            | Action::ShutDownDisplaced(_)
+            | Action::CompactEtcd(_)
             | Action::HandedOver(_) => {}
         }
     }

@@ -293,9 +293,10 @@ impl World {
         let may = match &computer.standing {
             Standing::Alone => true,
             Standing::Leads {
-                pass: Pass::Calls, ..
+                answers: AnsweredCalls::All,
+                ..
             } => true,
-            Standing::Leads { pass, .. } => fresh && *pass == Pass::Reads,
+            Standing::Leads { answers, .. } => fresh && *answers == AnsweredCalls::Reads,
             Standing::Follows { .. } => fresh,
             Standing::Nobody { known } => fresh && *known,
         };
