@@ -81,8 +81,16 @@ impl Member {
             // The request is sent again when the journal has been checked.
             return EtcdAnswer::Silence;
         }
-        let EtcdAnswer::Is(view) = &answer else {
-            return answer;
+        let view = match &answer {
+            EtcdAnswer::Is(view) => view,
+            // An older copy is as the request expects, and shorter than the journal has become since.
+            EtcdAnswer::Applied { seq, .. }
+                if (1..self.view().seq()).contains(seq) && self.data_loss.present.is_none() =>
+            {
+                self.reading.load_by(now);
+                return EtcdAnswer::Silence;
+            }
+            EtcdAnswer::Applied { .. } | EtcdAnswer::Silence => return answer,
         };
         if self.machine.expects(number, view) && !trusts() {
             // The transaction failed although these keys are as it expects, so the journal's last entry is gone.
