@@ -23,7 +23,7 @@ use rescue_core::{
     cluster::{
         journal::{self, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
-        member::{Action, Entry, Input, Member, MemberEntryChange, PROBES, Read},
+        member::{Action, Input, Member, MemberEntryChange, PROBES, Read, WatchedEntry},
         merge::wire::{self, Ask},
         standing::{JournalPosition, Standing},
     },
@@ -276,7 +276,7 @@ impl ClusterDriver {
             Action::AddPartitionWrites(calls) => {
                 self.partition_writes.add(calls).await;
                 if self.partition_writes.has_outgrown()
-                    && let Some((base, calls)) = self.member.kept()
+                    && let Some((base, calls)) = self.member.partition_writes()
                 {
                     let path = &self.setup.context.checkpoint;
                     self.partition_writes
@@ -530,14 +530,14 @@ fn member_entry(
 }
 
 /// The journal entry that ends with record `seq`.
-fn entry(seq: u64, kv: &Kv) -> Entry {
+fn entry(seq: u64, kv: &Kv) -> WatchedEntry {
     let bytes = kv.value.len();
     match (
         Manifest::read(&kv.value),
         journal::records(&kv.key, &kv.value),
     ) {
-        (None, Ok(records)) => Entry::Records { records, bytes },
-        _ => Entry::Apart(seq),
+        (None, Ok(records)) => WatchedEntry::Records { records, bytes },
+        _ => WatchedEntry::Apart(seq),
     }
 }
 

@@ -7,7 +7,7 @@ use rescue_core::{
     cluster::{
         journal::Keys,
         machine::{ANSWER_LIMIT, Commit, Settings, View, WhenAlone},
-        member::{Member, Own},
+        member::{LocalCheckpoint, Member},
         standing::{JournalPosition, Standing},
     },
     hide::Hide,
@@ -112,7 +112,7 @@ pub(in crate::app) async fn join(
     let (partition_writes, left) =
         PartitionWritesFile::load(&context.checkpoint, setup.restored).await;
     let session = context.ledger.session();
-    let own = Own {
+    let own = LocalCheckpoint {
         state: context.ledger.with_mirror(Clone::clone),
         restored: setup.restored,
         term: session.term,

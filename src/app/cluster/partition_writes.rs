@@ -86,7 +86,7 @@ impl PartitionWritesFile {
             };
             Some(call)
         });
-        let left = CutOff::left(base.clone(), calls);
+        let left = CutOff::restored(base.clone(), calls);
         tracing::info!(
             calls = left.len(),
             "an earlier process was cut off; its writes are sent to the next leader"

@@ -50,7 +50,7 @@ pub struct CutOff {
 
 impl CutOff {
     /// Restores what an earlier process left: the state when it was cut off, and the writes answered since.
-    pub fn left(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
+    pub fn restored(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
         let mut period = Period::new(base);
         for call in calls {
             if Mutant::GuessesByValues.lives() {

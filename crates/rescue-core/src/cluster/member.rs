@@ -53,7 +53,10 @@ use self::{
 pub use self::{
     chores::PUBLISH_EVERY,
     probes::PROBES,
-    types::{Action, Cause, Entry, Holds, Input, MemberEntry, MemberEntryChange, News, Own, Read},
+    types::{
+        Action, Cause, Holds, Input, LocalCheckpoint, MemberEntry, MemberEntryChange, News, Read,
+        WatchedEntry,
+    },
 };
 
 /// Pause before a failed read of etcd is retried.
@@ -113,7 +116,7 @@ pub struct Member {
     keys: Keys,
     machine: Machine,
     published: LastPublished,
-    own: Own,
+    own: LocalCheckpoint,
     data_loss: DataLoss,
     journal: Journal,
     reading: Reading,
@@ -143,7 +146,13 @@ struct Queue {
 impl Member {
     /// Creates a member that waits for [`Input::Begin`]. `left` holds the partition writes of an earlier process.
     /// `id` is the unique name under which partition writes are sent to a leader.
-    pub fn new(settings: Settings, keys: Keys, own: Own, left: CutOff, id: String) -> Self {
+    pub fn new(
+        settings: Settings,
+        keys: Keys,
+        own: LocalCheckpoint,
+        left: CutOff,
+        id: String,
+    ) -> Self {
         let known = own.restored;
         let held = Holds {
             term: own.term,
@@ -300,7 +309,7 @@ impl Member {
     }
 
     /// The partition writes that have not reached a leader, with the state before them.
-    pub fn kept(&self) -> Option<(&Master, Vec<Request>)> {
+    pub fn partition_writes(&self) -> Option<(&Master, Vec<Request>)> {
         let base = self.cut_off.base()?;
         Some((base, self.cut_off.calls().cloned().collect()))
     }

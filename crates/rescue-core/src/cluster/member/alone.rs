@@ -75,7 +75,9 @@ impl Member {
 
     /// Stores exactly the writes that a leader must still get.
     pub(super) fn keep_all(&mut self) {
-        let kept = self.kept().map(|(base, calls)| (base.clone(), calls));
+        let kept = self
+            .partition_writes()
+            .map(|(base, calls)| (base.clone(), calls));
         self.act(match kept {
             Some((base, calls)) => Action::ReplacePartitionWrites { base, calls },
             None => Action::DeletePartitionWrites,

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::{AGAIN, Action, Entry, Member, MemberEntryChange, Read};
+use super::{AGAIN, Action, Member, MemberEntryChange, Read, WatchedEntry};
 use crate::{
     checkpoint::format::Record,
     cluster::{
@@ -141,7 +141,7 @@ impl Member {
         &mut self,
         now: Instant,
         view: View,
-        entries: Vec<Entry>,
+        entries: Vec<WatchedEntry>,
         deleted: Option<u64>,
     ) {
         // What the watch delivers late is older than the answers to requests, and says nothing.
@@ -172,15 +172,15 @@ impl Member {
     }
 
     /// Follows the journal with these entries, up to the first that does not continue it.
-    fn take_entries(&mut self, now: Instant, entries: Vec<Entry>) {
+    fn take_entries(&mut self, now: Instant, entries: Vec<WatchedEntry>) {
         let progress = &mut self.journal.progress;
         // All records at once, because each new state may take long.
         let mut records = Vec::new();
         for entry in entries {
             let new = match entry {
-                Entry::Records { records, bytes } => progress.take(records, bytes).ok(),
-                Entry::Apart(seq) if seq <= progress.seq => continue,
-                Entry::Apart(_) => None,
+                WatchedEntry::Records { records, bytes } => progress.take(records, bytes).ok(),
+                WatchedEntry::Apart(seq) if seq <= progress.seq => continue,
+                WatchedEntry::Apart(_) => None,
             };
             match new {
                 Some(new) => records.extend(new),

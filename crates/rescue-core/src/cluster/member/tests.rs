@@ -70,8 +70,8 @@ impl Merges {
             commit: Commit::Always,
             alone: WhenAlone::Serve,
         };
-        let left = CutOff::left(Master::default(), [set(-1)]);
-        let (keys, own) = (Keys::new("robot"), Own::default());
+        let left = CutOff::restored(Master::default(), [set(-1)]);
+        let (keys, own) = (Keys::new("robot"), LocalCheckpoint::default());
         Self {
             member: Member::new(settings, keys, own, left, "a-1".to_owned()),
             now: Instant::now(),
@@ -164,7 +164,7 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
     let mut merges = Merges::new();
     assert!(merges.next().is_some());
     let first = merges.journal.seq + 1;
-    let entries = (first..first + 50).map(|seq| Entry::Records {
+    let entries = (first..first + 50).map(|seq| WatchedEntry::Records {
         records: vec![record(seq)],
         bytes: 1,
     });
@@ -222,7 +222,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
     progress.take(records(1), 1).unwrap();
     let mut state = Master::default();
     state.apply(&set(1));
-    let own = Own {
+    let own = LocalCheckpoint {
         state,
         seq: 1,
         term: 1,
@@ -250,7 +250,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
     assert_eq!(followed(loaded), None);
     let late = Input::Watched {
         view: own_view(2),
-        entries: vec![Entry::Records {
+        entries: vec![WatchedEntry::Records {
             records: records(2),
             bytes: 1,
         }],

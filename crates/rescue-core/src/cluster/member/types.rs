@@ -19,7 +19,7 @@ use crate::{
 
 /// What this computer's checkpoint holds at the start.
 #[derive(Clone, Debug, Default)]
-pub struct Own {
+pub struct LocalCheckpoint {
     /// The state in the ledger.
     pub state: Master,
     /// Whether the state belongs to a session that continues.
@@ -83,7 +83,7 @@ impl MemberEntryChange {
 
 /// A journal entry as the watch on etcd delivers it.
 #[derive(Clone, Debug)]
-pub enum Entry {
+pub enum WatchedEntry {
     Records {
         records: Vec<Record>,
         bytes: usize,
@@ -92,7 +92,7 @@ pub enum Entry {
     Apart(u64),
 }
 
-impl Entry {
+impl WatchedEntry {
     /// Whether the first record of this entry has the number `seq`.
     pub(super) fn begins_with(&self, seq: u64) -> bool {
         match self {
@@ -145,7 +145,7 @@ pub enum Input {
     /// The watch on etcd delivers the keys `origin`, `leader` and `alive`, new journal entries, and changed member entries.
     Watched {
         view: View,
-        entries: Vec<Entry>,
+        entries: Vec<WatchedEntry>,
         /// The highest number of a record that a deleted key held; see [`Keys::record_of`](crate::cluster::journal::Keys::record_of).
         deleted: Option<u64>,
         members: Vec<MemberEntryChange>,

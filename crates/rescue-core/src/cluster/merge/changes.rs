@@ -96,7 +96,7 @@ pub(super) fn param_of(call: &Request) -> Option<String> {
 pub struct Changes {
     params: BTreeSet<String>,
     rest: HashSet<ChangeSubject>,
-    own: Own,
+    expected: ExpectedCalls,
 }
 
 impl Changes {
@@ -104,19 +104,19 @@ impl Changes {
     /// changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
         for call in calls {
-            self.own.add(call);
+            self.expected.add(call);
         }
     }
 
     /// Notes that this computer sent `call` to the journal as record `seq`, and the journal may contain it.
     pub fn expect_record(&mut self, seq: u64, call: Request) {
-        self.own.records.insert(seq, call);
+        self.expected.records.insert(seq, call);
     }
 
     /// Notes what record `seq` of the journal, a `call`, has changed, unless the call was expected.
     pub fn note(&mut self, seq: u64, call: &Request) {
         if self
-            .own
+            .expected
             .records
             .remove(&seq)
             .is_some_and(|own| own == *call)
@@ -124,7 +124,7 @@ impl Changes {
             return;
         }
         for call in call.calls() {
-            if !self.own.has(call) {
+            if !self.expected.has(call) {
                 ChangeSubject::of(call)
                     .into_iter()
                     .for_each(|it| self.add(it));
@@ -156,12 +156,12 @@ impl Changes {
         differing("/", was.params(), is.params(), &mut paths);
         for path in paths {
             let parts: Vec<&str> = names::parts(&path).collect();
-            if !self.own.explains(&path, value_at(is.params(), &parts)) {
+            if !self.expected.explains(&path, value_at(is.params(), &parts)) {
                 self.add(ChangeSubject::Param(path));
             }
         }
         for (node, api) in is.nodes() {
-            if was.api_of(node) != Some(api) && !self.own.registers(node, api) {
+            if was.api_of(node) != Some(api) && !self.expected.registers(node, api) {
                 self.add(ChangeSubject::Node(node.to_owned()));
             }
             for publishes in [true, false] {
@@ -171,7 +171,7 @@ impl Changes {
                 };
                 let new = topics.into_iter();
                 let new = new.filter(|topic| !was.has_topic(node, publishes, topic));
-                for topic in new.filter(|_| !self.own.registers(node, api)) {
+                for topic in new.filter(|_| !self.expected.registers(node, api)) {
                     let (topic, node) = (topic.to_owned(), node.to_owned());
                     self.rest.insert(ChangeSubject::Topic {
                         publishes,
@@ -184,7 +184,7 @@ impl Changes {
         for (name, service) in &is.registry().services {
             let node = is.api_of(&service.node).unwrap_or_default();
             if was.registry().services.get(name) != Some(service)
-                && !self.own.registers(&service.node, node)
+                && !self.expected.registers(&service.node, node)
             {
                 self.add(ChangeSubject::Service(name.clone()));
             }
@@ -217,7 +217,7 @@ impl Changes {
 
 /// Calls of this computer that the others may have run.
 #[derive(Clone, Debug, Default)]
-struct Own {
+struct ExpectedCalls {
     /// The calls, by method, caller and first argument.
     calls: HashMap<String, Vec<Request>>,
     /// The calls, by their numbers in the journal.
@@ -230,7 +230,7 @@ fn slot(call: &Request) -> String {
     format!("{} {caller} {name}", call.method().name())
 }
 
-impl Own {
+impl ExpectedCalls {
     fn add(&mut self, call: Request) {
         if !self.has(&call) {
             self.calls.entry(slot(&call)).or_default().push(call);

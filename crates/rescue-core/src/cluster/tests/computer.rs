@@ -8,7 +8,7 @@ use crate::{
         cut_off::CutOff,
         journal::Keys,
         machine::Settings,
-        member::{Member, Own},
+        member::{LocalCheckpoint, Member},
         merge::wire,
         sharing::{Sharing, Source},
         standing::{JournalPosition, Standing},
@@ -87,7 +87,7 @@ impl Ledger {
 /// The content of a computer's disk.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Disk {
-    pub(super) own: Own,
+    pub(super) own: LocalCheckpoint,
     pub(super) kept: Option<(Master, Vec<Request>)>,
 }
 
@@ -158,7 +158,7 @@ fn member(name: &str, index: usize, life: u64, plan: &Plan, disk: &Disk) -> Memb
         alone: plan.alone,
     };
     let left = match &disk.kept {
-        Some((base, calls)) => CutOff::left(base.clone(), calls.iter().cloned()),
+        Some((base, calls)) => CutOff::restored(base.clone(), calls.iter().cloned()),
         None => CutOff::default(),
     };
     let id = settings.id.clone();

@@ -9,7 +9,7 @@ use crate::{
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
         machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
-        member::{Entry, MemberEntry, MemberEntryChange, Read},
+        member::{MemberEntry, MemberEntryChange, Read, WatchedEntry},
     },
     master::{Displaced, Master, Request},
 };
@@ -476,15 +476,15 @@ impl Etcd {
 
     /// The entries of the journal after revision `after`, up to revision `upto`, as a watch shows them. `None` if a
     /// snapshot has replaced them.
-    pub(super) fn entries_after(&self, after: u64, upto: u64) -> Option<Vec<Entry>> {
+    pub(super) fn entries_after(&self, after: u64, upto: u64) -> Option<Vec<WatchedEntry>> {
         if after < self.compacted {
             return None;
         }
         let new = self.puts.iter();
         let new = new.filter(|(revision, ..)| (after + 1..=upto).contains(revision));
         let entries = new.map(|(_, seq, held, bytes)| match held {
-            Held::State(_) => Entry::Apart(*seq),
-            Held::Records(records) => Entry::Records {
+            Held::State(_) => WatchedEntry::Apart(*seq),
+            Held::Records(records) => WatchedEntry::Records {
                 records: records.clone(),
                 bytes: *bytes,
             },

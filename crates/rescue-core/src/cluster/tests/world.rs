@@ -817,7 +817,7 @@ impl World {
             if computer.ledger.mirror != self.etcd.state {
                 return Err(format!("the state of {at} is not that of the journal"));
             }
-            if computer.member.uncommitted() > 0 || computer.member.kept().is_some() {
+            if computer.member.uncommitted() > 0 || computer.member.partition_writes().is_some() {
                 return Err(format!("{at} still owes writes"));
             }
             if !computer.waiting.is_empty() {
