@@ -139,7 +139,7 @@ impl Ledger {
 
     /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded until the next complete
     /// checkpoint.
-    pub(super) fn give_up_disk(&self) {
+    pub(crate) fn give_up_disk(&self) {
         if let Some(journal) = &mut self.lock().journal {
             journal.give_up();
         }

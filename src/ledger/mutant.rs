@@ -14,6 +14,16 @@ pub(crate) enum Mutant {
     TellsOnce,
     /// What a lost master may not have told nodes is forgotten.
     OwesNothing,
+    /// A notification that the last process of rosrescue had on its way is not expected.
+    ForgetsLastProcess,
+    /// The mirror answers writes first although nothing would keep them if the process ended.
+    AnswersUnprotected,
+    /// The master's answer to a write counts for all writes before it.
+    AcknowledgesEarlier,
+    /// Writes that the mirror has answered first go to the next master, too, which has got the state.
+    KeepsAnswered,
+    /// The master is read although it has not run all writes that the mirror has answered first.
+    ReadsTooEarly,
 }
 
 #[cfg(test)]

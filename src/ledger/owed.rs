@@ -36,8 +36,10 @@ impl Telling {
             RecoveryOutcome::Adopted => Some(Self::Later),
             // The master may send outdated notifications now.
             RecoveryOutcome::Reconciled => Some(Self::Twice),
-            RecoveryOutcome::Begun | RecoveryOutcome::Injected if restarted => Some(Self::Twice),
-            RecoveryOutcome::Begun | RecoveryOutcome::Injected => Some(Self::Now),
+            RecoveryOutcome::Begun | RecoveryOutcome::Injected => {
+                let is_late = restarted && !Mutant::ForgetsLastProcess.lives();
+                Some(if is_late { Self::Twice } else { Self::Now })
+            }
         }
     }
 }

@@ -31,6 +31,7 @@ use crate::{
         Ledger, Mark,
         delivery::Delivery,
         first::{Acknowledged, AnsweredFirst},
+        mutant::Mutant,
     },
     limit::rarely,
     status::stats::Stats,
@@ -417,6 +418,9 @@ impl Dispatcher {
 
     /// Leaves out the calls that the mirror has answered first: the state that a master gets has them.
     fn leave_out_answered(&mut self) {
+        if Mutant::KeepsAnswered.lives() {
+            return;
+        }
         let (ledger, before) = (&self.ledger, self.queue.len());
         self.queue.retain(|item| {
             if let Some(First { seq, .. }) = &item.first {
@@ -571,7 +575,8 @@ impl Dispatcher {
         }
         // The mirror has applied calls that the master has not got.
         let is_ahead = self.queue.iter().any(Item::is_answered_first);
-        let inspects = !is_ahead && self.inspections.begin(now);
+        let is_early = is_ahead && !Mutant::ReadsTooEarly.lives();
+        let inspects = !is_early && self.inspections.begin(now);
         let items = match inspects {
             true => Vec::new(),
             false => self.next_batch(now),

@@ -75,7 +75,9 @@ impl Node {
     }
 
     /// The node's next call.
-    pub(super) fn call(&mut self, dice: &mut Dice, value: i32) -> Request {
+    /// `subscribes` says whether it may subscribe to parameters: no master tells who does, so these subscriptions are lost
+    /// if rosrescue dies while the disk has failed.
+    pub(super) fn call(&mut self, dice: &mut Dice, value: i32, subscribes: bool) -> Request {
         let topic = format!("/t{}", dice.below(TOPICS));
         let key = format!("/p{}", dice.below(PARAMS));
         let (name, api) = (self.name.as_str(), self.api.as_str());
@@ -94,7 +96,10 @@ impl Node {
                 self.published.insert(topic.clone());
                 Request::new(Method::RegisterPublisher, [name, &topic, "x/Y", api])
             }
-            6..8 if !self.set.contains(&key) && self.subscribed.insert(key.clone()) => {
+            6..8 if subscribes
+                && !self.set.contains(&key)
+                && self.subscribed.insert(key.clone()) =>
+            {
                 Request::new(Method::SubscribeParam, [name, api, &key])
             }
             // A node that sets a parameter is not notified of it by any master.

@@ -149,6 +149,7 @@ impl World {
                     | Event::Bypasses
                     | Event::Compares
                     | Event::WorkerDies
+                    | Event::DiskFails
                     | Event::Recovery(recovery::Event::Started | recovery::Event::Exits(_))
             )
         });
@@ -217,6 +218,29 @@ impl World {
         disk.is_writing = false;
         self.poll_checkpoint();
         self.give_safe();
+    }
+
+    pub(super) fn disk_fails(&mut self) {
+        // Only a living master keeps what the disk does not.
+        if !self.is_down && self.gate().is_open() {
+            if self.ledger.pending() > 0 {
+                return self.after(1_000, Event::DiskFails);
+            }
+            self.print(|| "the disk fails".to_owned());
+            // If the journal does not know which writes the master has run, and the next process does not learn it either,
+            // it runs them again (decision 53).
+            self.ledger.record_acknowledged();
+            self.ledger.run_jobs();
+            self.ledger.give_up_disk();
+            let time = 5_000 + self.dice.below(100_000);
+            self.after(time, Event::DiskRecovers);
+        }
+    }
+
+    pub(super) fn disk_recovers(&mut self) {
+        if !self.is_down {
+            self.begin_checkpoint();
+        }
     }
 
     fn begin_checkpoint(&mut self) {
