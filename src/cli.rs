@@ -2,7 +2,7 @@
 //! confirm a change, such as `--yes`, have none: a variable left over from an earlier command must not confirm
 //! anything. Nor have those that choose a time or a name in the log: the command would show another state than asked.
 
-pub(crate) mod cluster;
+pub(crate) mod cluster_args;
 pub(crate) mod config_file;
 mod files;
 mod live;
@@ -16,7 +16,7 @@ use std::ffi::OsString;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, error::ErrorKind};
 
 pub use self::{
-    cluster::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
+    cluster_args::{ClusterArg, ClusterArgs, ClusterSync, WhenCutOff},
     config_file::OptionValue,
     files::{
         CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, LogArgs, ParamsArgs, ReadArgs,

@@ -18,11 +18,11 @@ use crate::{
 };
 
 mod addresses;
-mod cluster;
+mod cluster_config;
 mod files;
 
 use self::addresses::{advertised_host, listen_addresses, parse_address};
-pub use self::cluster::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
+pub use self::cluster_config::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
 
 /// Name of the checkpoint of port 11311 in the log folder. The tool of the ROS Rescue paper uses
 /// the same name.

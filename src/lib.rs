@@ -11,7 +11,7 @@
 //!
 //! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
 //! * `clock`, `resolver`, `task`, `wait`: the wall clock; addresses of hosts; starting tasks; waiting for optional events.
-//! * `limit`, [`log`]: how often a line is logged; where the log goes.
+//! * `limit`, [`logging`]: how often a line is logged; where the log goes.
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
 //! * [`cluster`]: the robot's keys in etcd, for several computers.
@@ -42,7 +42,7 @@ pub(crate) mod gate;
 pub mod guardian;
 pub(crate) mod ledger;
 pub(crate) mod limit;
-pub mod log;
+pub mod logging;
 pub(crate) mod nodes;
 pub(crate) mod printable;
 pub(crate) mod process;

@@ -17,7 +17,7 @@ use crate::{
         self,
         handover::{Guard, Sockets},
     },
-    log::Stderr,
+    logging::Stderr,
     printable::Printable,
     resolver,
     ros_env::MasterUri,

@@ -2,7 +2,7 @@
 //! waits for it.
 
 pub(crate) mod call_times;
-pub(crate) mod cluster;
+pub(crate) mod cluster_facts;
 pub(crate) mod computers;
 pub(crate) mod condition;
 pub(crate) mod metrics;
@@ -90,7 +90,7 @@ pub struct Facts {
     pub(crate) master_is_open: bool,
     pub disk: DiskStatus,
     /// The facts about the other computers. `None` without `--cluster`.
-    pub cluster: Option<cluster::ClusterFacts>,
+    pub cluster: Option<cluster_facts::ClusterFacts>,
 }
 
 /// What happened in this session before this process started.

@@ -51,7 +51,7 @@ use crate::{
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
     server::others::{self, Forwarded, Handover, Shown},
-    status::cluster::MemberFacts,
+    status::cluster_facts::MemberFacts,
     task::boxed,
     upstream::{Head, peer::Peers},
     wait,

@@ -4,7 +4,7 @@ use std::{fmt, str::FromStr};
 
 use clap::Args;
 
-use super::{OutputArgs, TargetArgs, cluster::name};
+use super::{OutputArgs, TargetArgs, cluster_args::name};
 
 /// Options of `rosrescue top`.
 #[derive(Args, Clone, Debug)]

@@ -5,7 +5,7 @@ use std::{net::IpAddr, path::PathBuf};
 use clap::{Args, ValueEnum, builder::FalseyValueParser};
 use ipnet::IpNet;
 
-use super::{cluster::ClusterArgs, tools::HideArgs};
+use super::{cluster_args::ClusterArgs, tools::HideArgs};
 
 /// Heading of the options that few robots need.
 const ADVANCED: &str = "Advanced options";

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use super::etcd::{EtcdError, Tried};
-use crate::cli::cluster::ROBOT;
+use crate::cli::cluster_args::ROBOT;
 
 /// How long an endpoint may take to answer.
 pub const LIMIT: Duration = Duration::from_secs(3);

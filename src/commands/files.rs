@@ -8,8 +8,9 @@ use std::{
 };
 
 use checkpoint_store::{
-    OpenError, history,
-    log::{KnownTimes, NoPast, PastState, past_state},
+    OpenError,
+    change_log::{KnownTimes, NoPast, PastState, past_state},
+    history,
 };
 use rescue_core::checkpoint::{
     format::{RecordContent, Session},

@@ -200,7 +200,7 @@ async fn next_leader(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::status::cluster::ClusterFacts;
+    use crate::status::cluster_facts::ClusterFacts;
 
     fn shown(from: &str, to: Option<&str>, wanted: Option<&str>) -> (bool, String) {
         let running = Running {

@@ -4,11 +4,11 @@ use std::{
     collections::VecDeque, io, num::NonZero, path::Path, thread::ScopedJoinHandle, time::Duration,
 };
 
-use checkpoint_store::log::{LogFile, files as log_files};
+use checkpoint_store::change_log::{LogFile, files as log_files};
 use rescue_core::checkpoint::{
+    change_log::{LogEntry, LogReader},
     compare::{Difference, What},
     format,
-    log::{LogEntry, LogReader},
     putback::is_in,
 };
 use serde::Serialize;

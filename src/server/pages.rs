@@ -20,7 +20,7 @@ pub(crate) mod status;
 
 use std::sync::Arc;
 
-use checkpoint_store::log::KnownTimes;
+use checkpoint_store::change_log::KnownTimes;
 use hyper::{
     HeaderMap, StatusCode, Uri,
     header::{

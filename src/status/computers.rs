@@ -5,7 +5,7 @@ use std::fmt;
 use rescue_core::cluster::machine::Role;
 use serde::{Deserialize, Serialize};
 
-use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
+use super::cluster_facts::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
 use crate::{
     clock,
     printable::{Page, line},

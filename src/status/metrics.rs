@@ -226,7 +226,7 @@ fn head(text: &mut String, name: &str, help: &str, kind: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::status::cluster::ClusterFacts;
+    use crate::status::cluster_facts::ClusterFacts;
 
     #[test]
     fn openmetrics_names_the_family_of_a_counter_and_ends() {

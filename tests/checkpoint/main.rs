@@ -7,11 +7,11 @@
     reason = "a test"
 )]
 
+mod change_log;
 /// Files with damaged bytes.
 mod damaged_bytes;
 /// SIGKILL for a process that records.
 mod kill;
-mod log;
 /// The store on a disk: locks, generations, compaction.
 mod store;
 /// PyYAML reads a checkpoint like rosrescue.

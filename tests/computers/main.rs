@@ -24,6 +24,8 @@ mod traffic;
 
 /// Cables are cut and mended.
 mod cables;
+/// The log's addresses of callers on several computers.
+mod change_log;
 /// Computers die and come back.
 mod deaths;
 /// The checkpoint of a computer is older than the last acknowledged write.
@@ -36,8 +38,6 @@ mod etcd;
 mod handover;
 /// Random failures, and a check of all promises.
 mod history;
-/// The log's addresses of callers on several computers.
-mod log;
 /// Writes of a computer that was cut off are merged with the others' writes.
 mod lonely;
 /// Two computers cannot reach each other, or only some of each other's ports.

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use checkpoint_store::log;
+use checkpoint_store::change_log;
 use rescue_core::{
-    checkpoint::{compare::compare, log::moment},
+    checkpoint::{change_log::moment, compare::compare},
     replay::{Inspection, Plan, Skipped, Token},
 };
 use ros1_master::{
@@ -178,7 +178,7 @@ impl Rig {
     fn had_states(&self, instants: &[(u64, Master)]) -> Result<(), Failure> {
         let name = format!("latest-chkpt-{}.yaml", self.rescue.port());
         let path = self.scratch.log_dir().join(name);
-        let files = log::files(&path).map_err(|error| error.to_string())?;
+        let files = change_log::files(&path).map_err(|error| error.to_string())?;
         let texts: Vec<_> = files.iter().filter_map(|file| file.read().ok()).collect();
         let nothing_hidden = "".parse()?;
         for (time, expected) in instants {

@@ -105,7 +105,7 @@ mod cli {
     mod addresses;
     mod as_roscore;
     mod config_file;
-    mod log;
+    mod logging;
     mod options;
     mod secrets;
     mod start;

@@ -262,7 +262,8 @@ fn tests_that_the_table_of_decisions_names_exist() {
     let text = read(root().join("docs/architecture.md"));
     let (_, table) = text.split_once("## Where it is decided").unwrap();
     let table = table.split("\n## ").next().unwrap();
-    let tests = rust_files(&root().join("tests"));
+    let tests = ["tests", "crates"].map(|folder| rust_files(&root().join(folder)));
+    let tests = tests.into_iter().flatten();
     let sources: Vec<_> = sources().into_iter().chain(tests).map(read).collect();
     let mut tests = 0;
     for row in table.lines().filter(|line| line.starts_with("| ")) {

@@ -117,7 +117,7 @@ impl<S: Storage> Plan<S> {
             }
             other => other,
         }?;
-        super::log::locked(&self.log).keep(storage, names, &names.previous());
+        super::change_log::locked(&self.log).keep(storage, names, &names.previous());
         let wanted = self.ticket.lock();
         if !*wanted {
             return Err(names.superseded());
@@ -166,7 +166,7 @@ impl<S: Storage> Plan<S> {
     /// Removes the log, or if there is none, the previous generation, which would be replaced anyway. Never removes the
     /// present file, because it is the only copy until the new generation is complete.
     fn make_room(&self) -> bool {
-        if super::log::locked(&self.log).remove(&self.storage, &self.names) {
+        if super::change_log::locked(&self.log).remove(&self.storage, &self.names) {
             return true;
         }
         let wanted = self.ticket.lock();
@@ -235,7 +235,7 @@ impl<S: Storage> Store<S> {
         self.generation += 1;
         let generation = self.generation;
         if !checkpoint.follows || self.active.is_none() {
-            super::log::locked(&self.log).breaks_at(generation);
+            super::change_log::locked(&self.log).breaks_at(generation);
         }
         let ticket = Arc::new(Ticket(Mutex::new(true)));
         self.pending = Some(PendingGeneration {

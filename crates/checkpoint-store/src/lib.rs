@@ -14,6 +14,7 @@
 //! succeed. A [`CheckJob`] notices the change, which latches as well.
 
 mod aside;
+pub mod change_log;
 mod error;
 pub mod folder;
 mod generation;
@@ -21,7 +22,6 @@ pub mod history;
 mod journal;
 mod load;
 mod lock;
-pub mod log;
 mod names;
 pub mod regular_file;
 #[cfg(test)]
@@ -35,6 +35,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use aside::{LockedPath, Present, keep_aside, set_aside_previous};
+use change_log::LogKeeper;
 pub use error::{OpenError, StoreError};
 use generation::{COMPACTION_BYTES_MIN, PendingGeneration};
 pub use generation::{Compacted, CompactionJob};
@@ -43,7 +44,6 @@ pub use journal::{SyncJob, Synced};
 pub use load::Loaded;
 pub use lock::DiskLock;
 pub use lock::{LockHolder, holder_of};
-use log::LogKeeper;
 use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{CheckJob, Checked, ForeignChange};
@@ -204,7 +204,7 @@ impl<S: Storage> Store<S> {
     /// Keeps the records of replaced generations in the [log], in up to `bytes_max` bytes. 0 keeps none, and leaves
     /// the files of an earlier log alone.
     pub fn keep_log(&mut self, bytes_max: u64) {
-        log::locked(&self.log).bytes_max = bytes_max;
+        change_log::locked(&self.log).bytes_max = bytes_max;
     }
 
     /// Takes the reason why the log lacks records, if there was a new one.
@@ -273,7 +273,7 @@ impl<S: Storage> Store<S> {
         self.overtake();
         let (storage, names) = (&self.place.storage, &self.place.names);
         for path in [names.previous(), names.path.clone()] {
-            log::locked(&self.log).keep(storage, names, &path);
+            change_log::locked(&self.log).keep(storage, names, &path);
         }
         self.unprotected = Some("its file has been set aside".to_owned());
         self.place.set_aside(reason)

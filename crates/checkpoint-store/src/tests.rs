@@ -1,7 +1,7 @@
 //! Crashes at every operation, losses of power, and failing disks.
 
+mod change_log;
 mod faults;
-mod log;
 mod moved;
 
 use std::path::Path;

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
-use checkpoint_store::{Store, log::files};
+use checkpoint_store::{Store, change_log::files};
 use flate2::{Compression, read::MultiGzDecoder, write::GzEncoder};
 use rescue_core::checkpoint::format::{Checkpoint, Label, RecordContent, decode};
 use ros1_master::{

@@ -30,7 +30,7 @@ pub use unreachable::Unreachable;
 
 use std::collections::BTreeMap;
 
-use crate::{
+use ros1_master::{
     master::{self, Displaced, Master, Method, Request},
     xmlrpc::Value,
 };

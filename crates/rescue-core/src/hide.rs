@@ -9,7 +9,7 @@ use std::{borrow::Cow, str::FromStr};
 
 use regex::{Regex, RegexBuilder};
 
-use crate::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Regular expression for the parameter names whose values are hidden by default.
 pub const DEFAULT: &str =

@@ -25,5 +25,3 @@ pub mod hide;
 pub mod lifecycle;
 pub mod order;
 pub mod replay;
-
-use ros1_master::{master, xmlrpc};

@@ -37,7 +37,8 @@ use self::{
     outbox::{Outbox, Payload},
     under_way::UnderWay,
 };
-use crate::{health::port_of, master::Master, xmlrpc::Call};
+use crate::health::port_of;
+use ros1_master::{master::Master, xmlrpc::Call};
 
 /// How long a notification of rosrescue waits after an answer about the same [`Subject`] was written. A notification of
 /// rosmaster arrives at least 0.3 ms after the answer, because it goes through another thread and a new connection.

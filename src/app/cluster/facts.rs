@@ -13,7 +13,7 @@ use rescue_core::cluster::{
 use super::ClusterDriver;
 use crate::{
     server::others::MemberAddresses,
-    status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
+    status::cluster_facts::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };
 
 /// Facts about the other computers.

@@ -2,13 +2,13 @@
 
 use std::{collections::BTreeSet, fs, path::Path, sync::Arc};
 
-use checkpoint_store::log::files;
+use checkpoint_store::change_log::files;
 use hyper::StatusCode;
 use rescue_core::{
     checkpoint::{
+        change_log::{LogEntry, LogReader},
         compare::What,
         format,
-        log::{LogEntry, LogReader},
     },
     replay::Token,
 };

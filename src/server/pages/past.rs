@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path, sync::Arc};
 
-use checkpoint_store::log::{KnownTimes, PastState, oldest, past_state};
+use checkpoint_store::change_log::{KnownTimes, PastState, oldest, past_state};
 use hyper::StatusCode;
 use rescue_core::checkpoint::compare::{Described, compare};
 use serde::Serialize;

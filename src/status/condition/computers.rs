@@ -7,7 +7,7 @@ use rescue_core::cluster::machine::Role;
 use super::ConditionName;
 use crate::{
     gate::State,
-    status::cluster::{ClusterFacts, LeaderFacts, MemberFacts},
+    status::cluster_facts::{ClusterFacts, LeaderFacts, MemberFacts},
 };
 
 /// Time after which a missing leader is worth attention. A new leader normally takes over within `--cluster-ttl` plus

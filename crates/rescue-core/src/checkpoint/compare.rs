@@ -4,9 +4,8 @@ use std::collections::BTreeSet;
 
 use serde::Serialize;
 
-use crate::{
-    checkpoint::format::shown,
-    hide::Hide,
+use crate::{checkpoint::format::shown, hide::Hide};
+use ros1_master::{
     master::{Master, Snapshot},
     xmlrpc::{Struct, Value},
 };
@@ -269,7 +268,7 @@ impl Comparison<'_> {
                 _ => false,
             };
             if !told {
-                let words = |entry: &crate::master::ServiceEntry| {
+                let words = |entry: &ros1_master::master::ServiceEntry| {
                     format!("{} at {}", entry.node, entry.api)
                 };
                 let [in_a, in_b] = entries.map(|entry| entry.map(words));

@@ -22,7 +22,7 @@ use std::ops::Range;
 
 use thiserror::Error;
 
-use crate::master::{Displaced, Master, Request, Snapshot};
+use ros1_master::master::{Displaced, Master, Request, Snapshot};
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub use frame::{Framed, Line, head_length, push_body, push_record, read_records, scan, seal};

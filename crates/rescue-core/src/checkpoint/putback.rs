@@ -1,6 +1,6 @@
 //! Computes the changes that give a running master the parameters of a checkpoint.
 
-use crate::{
+use ros1_master::{
     master,
     xmlrpc::{Struct, Value},
 };

@@ -5,10 +5,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::{
-    checkpoint::format::{Checkpoint, Record, RecordContent, Session},
-    master::{Displaced, Master, Request},
-};
+use crate::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
+use ros1_master::master::{Displaced, Master, Request};
 
 /// When to restore a checkpoint at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -156,8 +154,8 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
 mod tests {
     use super::*;
     use crate::checkpoint::format::Label;
-    use crate::master::Method;
-    use crate::xmlrpc::Value;
+    use ros1_master::master::Method;
+    use ros1_master::xmlrpc::Value;
 
     fn write(seq: u64, pending: bool) -> Record {
         let params = [Value::from("/n"), format!("/p{seq}").into(), 1.into()];

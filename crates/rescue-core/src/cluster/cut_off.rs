@@ -10,8 +10,8 @@ use crate::{
         mutant::Mutant,
         sharing::Change,
     },
-    master::{Master, Request},
 };
+use ros1_master::master::{Master, Request};
 
 /// How many periods of being cut off are kept apart.
 const PERIODS_MOST: usize = 8;
@@ -221,7 +221,8 @@ impl CutOff {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cluster::sharing::Source, master::Method, xmlrpc::Value};
+    use crate::cluster::sharing::Source;
+    use ros1_master::{master::Method, xmlrpc::Value};
 
     fn set(key: &str, value: i32) -> Request {
         let params = [Value::from("/n"), key.into(), value.into()];

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::master::{Displaced, Master, Request};
+use ros1_master::master::{Displaced, Master, Request};
 
 /// How long it may take to tell a node to shut down, including retries.
 const TELLING: Duration = Duration::from_secs(60);
@@ -45,7 +45,7 @@ impl DisplacedLately {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Method;
+    use ros1_master::master::Method;
 
     fn publish(api: &str) -> Request {
         Request::new(Method::RegisterPublisher, ["/n", "/t", "x/Y", api])

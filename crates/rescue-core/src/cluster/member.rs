@@ -27,8 +27,8 @@ use crate::{
         outgoing::Outgoing,
         standing::{JournalPosition, Standing},
     },
-    master::{Master, Request},
 };
+use ros1_master::master::{Master, Request};
 
 mod alone;
 mod chores;

@@ -17,7 +17,7 @@ pub use self::{
     changes::{ChangeSubject, Changes, parameter_of},
     pending::{WritesToSend, weight},
 };
-use crate::{
+use ros1_master::{
     master::{Effect, Master, Method, Request, Write, names},
     xmlrpc::Value,
 };

@@ -8,6 +8,8 @@ use crate::{
         journal::{self, JournalError, Keys, Put},
         sharing::{Change, Source},
     },
+};
+use ros1_master::{
     master::{CALLER_ID, Master, Method, Request},
     xmlrpc::Value,
 };

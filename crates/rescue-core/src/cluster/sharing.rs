@@ -8,8 +8,8 @@ use crate::{
         merge::{self, ChangeSubject, Changes, Verdict},
         mutant::Mutant,
     },
-    master::{Master, Request},
 };
+use ros1_master::master::{Master, Request};
 
 /// How many changes are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
@@ -196,7 +196,7 @@ impl Sharing {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{master::Method, xmlrpc::Value};
+    use ros1_master::{master::Method, xmlrpc::Value};
 
     fn set_of(key: &str, value: i32) -> Request {
         let params = [Value::from("/n"), key.into(), value.into()];

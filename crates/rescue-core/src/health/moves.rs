@@ -4,10 +4,8 @@
 use std::net::IpAddr;
 
 use super::{Evidence, Reach, mutant::WrongRule, port_of};
-use crate::{
-    master::{Master, Request, Write},
-    replay::Token,
-};
+use crate::replay::Token;
+use ros1_master::master::{Master, Request, Write};
 
 /// Which dead nodes rosrescue unregisters on its own.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -133,7 +131,7 @@ impl Eviction {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Method;
+    use ros1_master::master::Method;
 
     fn publish(node: &str, api: &str) -> Request {
         Request::new(Method::RegisterPublisher, [node, "/t", "x/Y", api])
@@ -198,7 +196,7 @@ mod tests {
     fn master(calls: impl IntoIterator<Item = Request>) -> Master {
         let mut master = Master::default();
         for call in calls {
-            assert!(crate::master::is_success(&master.apply(&call).reply));
+            assert!(ros1_master::master::is_success(&master.apply(&call).reply));
         }
         master
     }
@@ -223,7 +221,7 @@ mod tests {
         assert_eq!(mirror.api_of("/old"), None);
         assert_eq!(mirror.snapshot().services, before);
         // No node is told to shut down.
-        let told = |notice| matches!(notice, crate::master::Notice::Shutdown { .. });
+        let told = |notice| matches!(notice, ros1_master::master::Notice::Shutdown { .. });
         assert!(!applied.notices.into_iter().any(told));
     }
 }

@@ -11,7 +11,7 @@ use super::{
     Death, Eviction, Evidence, LocalName, Moving, Owner, Process, Reach, Reap, Registrants,
     mutant::WrongRule, port_of,
 };
-use crate::master::{Master, Method, Request};
+use ros1_master::master::{Master, Method, Request};
 use test_support::dice::Dice;
 
 /// Few names, ports and process ids, so that all are reused often.

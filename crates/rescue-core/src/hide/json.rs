@@ -4,7 +4,7 @@ use base64::Engine as _;
 use serde::{Serialize, Serializer};
 
 use super::Masked;
-use crate::xmlrpc::Value;
+use ros1_master::xmlrpc::Value;
 
 /// Serializes a value. Dates, binary data (as base64), integers beyond 32 bits, decimal numbers, infinities and NaN
 /// become strings, because JSON lacks them.
@@ -43,7 +43,8 @@ impl Serialize for Json<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{hide::Hide, xmlrpc::Struct};
+    use crate::hide::Hide;
+    use ros1_master::xmlrpc::Struct;
 
     #[test]
     fn every_value_can_be_written_as_json() {

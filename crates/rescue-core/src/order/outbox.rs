@@ -7,7 +7,8 @@ use std::{
 };
 
 use super::Subject;
-use crate::{health::port_of, master::Master, xmlrpc::Call};
+use crate::health::port_of;
+use ros1_master::{master::Master, xmlrpc::Call};
 
 /// If more notifications than this wait for a node, those about the same topic or parameter become a single one with
 /// the state at the time of sending.

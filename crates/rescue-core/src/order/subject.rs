@@ -1,9 +1,7 @@
 //! What calls and notifications are about: topics, parameters and node names.
 
-use crate::{
-    health::port_of,
-    master::{Effect, Master, Method, Request, Write, names},
-};
+use crate::health::port_of;
+use ros1_master::master::{Effect, Master, Method, Request, Write, names};
 
 /// What a call or a notification is about.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -1,8 +1,8 @@
 //! Tests of single situations. `write_queue/tests` runs random schedules with nodes, masters and deaths.
 
 use super::*;
-use crate::{
-    health::port_of,
+use crate::health::port_of;
+use ros1_master::{
     master::{Method, Request},
     xmlrpc::Value,
 };

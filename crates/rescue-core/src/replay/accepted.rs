@@ -1,8 +1,8 @@
 //! Finds out which writes of a call a master has executed, and whether the mirror agrees.
 
 use super::order;
-use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
-use crate::xmlrpc::{Reply, Value};
+use ros1_master::master::{Entry, Master, Method, Request, entry_reply, is_success};
+use ros1_master::xmlrpc::{Reply, Value};
 
 /// A write that the master has answered, perhaps as an entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
@@ -195,7 +195,7 @@ pub(super) fn is_write_error(text: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::xmlrpc::Struct;
+    use ros1_master::xmlrpc::Struct;
     use test_support::calls::malformed;
 
     #[test]

@@ -1,7 +1,7 @@
 //! Describes how the states of the mirror and a master differ.
 
-use crate::master::{Master, OrderedMap};
-use crate::xmlrpc::{Struct, Value};
+use ros1_master::master::{Master, OrderedMap};
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Maximum number of sentences.
 const SENTENCES_MAX: usize = 20;

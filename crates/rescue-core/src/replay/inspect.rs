@@ -6,11 +6,11 @@ use indexmap::IndexMap;
 use thiserror::Error;
 
 use super::{Token, TokenState, order};
-use crate::master::names::{self, CALLER_ID};
-use crate::master::{
+use ros1_master::master::names::{self, CALLER_ID};
+use ros1_master::master::{
     Master, Method, OrderedMap, Registrations, Request, ServiceEntry, Snapshot, SnapshotNode,
 };
-use crate::xmlrpc::{Reply, Struct, Value};
+use ros1_master::xmlrpc::{Reply, Struct, Value};
 
 /// Why the answer to an inspection cannot be used.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]

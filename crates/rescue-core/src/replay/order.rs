@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use indexmap::IndexMap;
 
-use crate::xmlrpc::{Reply, Struct, Value};
+use ros1_master::xmlrpc::{Reply, Struct, Value};
 
 /// Puts `found` into the order of `known`. Whatever only `found` has comes last, in its own order.
 pub(super) fn arrange<'k, A>(

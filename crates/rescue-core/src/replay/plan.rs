@@ -7,8 +7,8 @@ use bytes::Bytes;
 use super::inspect::lookup;
 use super::restore::{self, Manner, Restore};
 use super::{Token, order};
-use crate::master::{CALLER_ID, Master, Method, Request, Write, reply_entry, returnable};
-use crate::xmlrpc::{self, ListWriter, Reply, Struct, Value};
+use ros1_master::master::{CALLER_ID, Master, Method, Request, Write, reply_entry, returnable};
+use ros1_master::xmlrpc::{self, ListWriter, Reply, Struct, Value};
 
 /// Maximum number of mismatches in an error.
 const MISMATCHES_MAX: usize = 20;

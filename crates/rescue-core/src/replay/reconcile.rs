@@ -2,8 +2,8 @@
 //! latest token: the one with the highest number that rosrescue knows.
 
 use super::{Token, restore};
-use crate::master::{Effect, Master, Method, Request, Write, names};
-use crate::xmlrpc::Value;
+use ros1_master::master::{Effect, Master, Method, Request, Write, names};
+use ros1_master::xmlrpc::Value;
 
 /// Which side wins where the mirror and a master with the latest [`Token`] differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -7,9 +7,9 @@ use indexmap::IndexMap;
 use super::Token;
 use super::plan::Skipped;
 use super::token::{HELPER, NO_API};
-use crate::master::names::{self, CALLER_ID};
-use crate::master::{Master, Method, Request, returnable};
-use crate::xmlrpc::{Reply, Struct, Value};
+use ros1_master::master::names::{self, CALLER_ID};
+use ros1_master::master::{Master, Method, Request, returnable};
+use ros1_master::xmlrpc::{Reply, Struct, Value};
 
 /// Generates the calls that change state and passes each, with its predicted answer, to `write`. Afterwards `model` has
 /// the state that the master will have.

@@ -7,8 +7,8 @@
 use std::time::Duration;
 
 use super::{TokenState, Treatment};
-use crate::master::{CALLER_ID, Master, Method, Request};
-use crate::xmlrpc::{Reply, Value};
+use ros1_master::master::{CALLER_ID, Master, Method, Request};
+use ros1_master::xmlrpc::{Reply, Value};
 
 const RUN_ID: &str = "/run_id";
 

@@ -3,6 +3,6 @@
 mod inspect;
 mod planning;
 
-use crate::master::{Master, Method, Notice, Request};
-use crate::xmlrpc::{Reply, Value};
+use ros1_master::master::{Master, Method, Notice, Request};
+use ros1_master::xmlrpc::{Reply, Value};
 use test_support::calls::*;

@@ -1,7 +1,7 @@
 //! The token that rosrescue leaves in a master to recognise that process later. An *incarnation* is one life of a
 //! master process. rosrescue numbers the incarnations.
 
-use crate::{
+use ros1_master::{
     master::{self, Method, Request},
     xmlrpc::Reply,
 };
@@ -120,7 +120,7 @@ fn lookup(name: &str) -> Request {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{master::Master, xmlrpc::Value};
+    use ros1_master::{master::Master, xmlrpc::Value};
 
     fn reads() -> Vec<Request> {
         let none = ["getSystemState", "getTopicTypes", "getParamNames"];

@@ -1,5 +1,5 @@
 use super::*;
-use crate::master::{Method, Request};
+use ros1_master::master::{Method, Request};
 
 fn call(method: Method, params: &[&str]) -> Request {
     Request::new(method, params.iter().copied())

@@ -4,8 +4,8 @@ use std::net::IpAddr;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
 use super::{Checkpoint, EncodeError, Label, Origin, RecordContent, Session, frame, yaml};
-use crate::master::{Displaced, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode};
-use crate::xmlrpc::{Call, Struct, Value};
+use ros1_master::master::{Displaced, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode};
+use ros1_master::xmlrpc::{Call, Struct, Value};
 
 /// Writes the document up to and including the line `journal:`.
 pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeError> {

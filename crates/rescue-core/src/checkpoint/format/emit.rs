@@ -8,7 +8,7 @@
 use std::io::Write;
 
 use super::{DEPTH_MAX, EncodeError};
-use crate::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Deepest level of structs with one line per member. Deeper ones are written in one line: their indentation would take
 /// more space than their content.

@@ -1,10 +1,8 @@
 //! Converts parameters to YAML for `rosparam load`.
 
 use super::{EncodeError, emit};
-use crate::{
-    hide::Masked,
-    xmlrpc::{Struct, Value},
-};
+use crate::hide::Masked;
+use ros1_master::xmlrpc::{Struct, Value};
 
 /// Maximum number of characters of a value in a message.
 const SHOWN: usize = 100;

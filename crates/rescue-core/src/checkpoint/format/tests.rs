@@ -1,7 +1,7 @@
 //! Damage to a file of realistic size, examined before its YAML is read.
 
 use super::*;
-use crate::{master::Method, xmlrpc::Value};
+use ros1_master::{master::Method, xmlrpc::Value};
 
 /// A file of at least 64 KiB with more than 500 records, and where each of its lines starts.
 fn file() -> (Vec<u8>, Vec<usize>) {

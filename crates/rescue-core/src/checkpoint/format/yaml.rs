@@ -11,7 +11,7 @@ use serde_saphyr::granit_parser::{self, Event, Parser, ScalarStyle, Tag};
 
 use super::DEPTH_MAX;
 use super::emit::{BIG_DECIMAL, BIG_INT, DATE_TIME, date_time};
-use crate::xmlrpc::{Struct, Value};
+use ros1_master::xmlrpc::{Struct, Value};
 
 const TAG_PREFIX: &str = "tag:yaml.org,2002:";
 

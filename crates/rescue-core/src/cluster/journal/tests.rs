@@ -1,10 +1,8 @@
 //! Tests that records and snapshots fit into etcd's limits and are read back as they were written.
 
 use super::*;
-use crate::{
-    checkpoint::format::{Checkpoint, RecordContent, Session},
-    master::{Method, Request},
-};
+use crate::checkpoint::format::{Checkpoint, RecordContent, Session};
+use ros1_master::master::{Method, Request};
 
 /// The largest value for one transaction, with room for the keys and the leader's `alive`.
 const REQUEST_BYTES: usize = 1_500_000;

@@ -1,10 +1,8 @@
 //! A computer that is cut off answers its own nodes, and keeps their writes for a leader.
 
 use super::{Action, Member, News, journal_writes::is_ours};
-use crate::{
-    cluster::{machine::WhenAlone, sharing::Change, standing::Standing},
-    master::{Master, Request},
-};
+use crate::cluster::{machine::WhenAlone, sharing::Change, standing::Standing};
+use ros1_master::master::{Master, Request};
 
 impl Member {
     pub(super) fn be_alone(&mut self) {

@@ -7,15 +7,15 @@ use std::{
 };
 
 use super::{Action, Member, News};
-use crate::{
-    cluster::{
-        machine::Role,
-        merge::{
-            self, Changes, TELLER, parameter_of, weight,
-            wire::{self, Ask, WriteOutcome},
-        },
-        mutant::Mutant,
+use crate::cluster::{
+    machine::Role,
+    merge::{
+        self, Changes, TELLER, parameter_of, weight,
+        wire::{self, Ask, WriteOutcome},
     },
+    mutant::Mutant,
+};
+use ros1_master::{
     master::{Master, Method, Request, names},
     xmlrpc::Value,
 };

@@ -3,14 +3,12 @@
 use std::time::Instant;
 
 use super::{Action, Cause, Member, News};
-use crate::{
-    cluster::{
-        machine::{JournalSession, Role},
-        mutant::Mutant,
-        standing::Standing,
-    },
-    master::Master,
+use crate::cluster::{
+    machine::{JournalSession, Role},
+    mutant::Mutant,
+    standing::Standing,
 };
+use ros1_master::master::Master;
 
 impl Member {
     pub(super) fn become_role(&mut self, now: Instant, role: Role) {

@@ -7,9 +7,8 @@ use crate::{
         machine::{Alive, Commit, EtcdAnswer, Leader},
         merge::wire::{Ask, MergeAnswer, WriteOutcome},
     },
-    master::Method,
-    xmlrpc::Value,
 };
+use ros1_master::{master::Method, xmlrpc::Value};
 
 /// Record `seq`, in which others set the parameter again.
 fn record(seq: u64) -> Record {

@@ -14,8 +14,8 @@ use crate::{
         sharing::Change,
         standing::Standing,
     },
-    master::{Displaced, Master, Request},
 };
+use ros1_master::master::{Displaced, Master, Request};
 
 /// What this computer's checkpoint holds at the start.
 #[derive(Clone, Debug, Default)]

@@ -8,8 +8,8 @@ use std::{
 };
 
 use super::TELLER;
-use crate::{
-    cluster::mutant::Mutant,
+use crate::cluster::mutant::Mutant;
+use ros1_master::{
     master::{Effect, Master, Request, Write, names},
     xmlrpc::{Struct, Value},
 };

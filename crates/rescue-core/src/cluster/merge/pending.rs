@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, HashMap};
 
 use super::changes::param_of;
-use crate::{
-    cluster::mutant::Mutant,
+use crate::cluster::mutant::Mutant;
+use ros1_master::{
     master::{Method, Request, Write, WriteTarget},
     xmlrpc::Value,
 };

@@ -5,7 +5,7 @@ use proptest::{collection::vec, prelude::*};
 mod model;
 
 use super::{Changes, Conflict, Merged, WritesToSend, changes::param_path, merge};
-use crate::{
+use ros1_master::{
     master::{Master, Method, Notice, Request, is_success},
     xmlrpc::Value,
 };

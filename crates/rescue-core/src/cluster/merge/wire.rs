@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::{Conflict, LostWrite, Verdict};
-use crate::{
+use ros1_master::{
     master::{CALLER_ID, Method, Request, entry_reply, is_success},
     xmlrpc::{Call, Reply, Value},
 };

@@ -3,18 +3,16 @@
 use std::time::{Duration, Instant};
 
 use super::world::Plan;
-use crate::{
-    cluster::{
-        cut_off::CutOff,
-        journal::Keys,
-        machine::Settings,
-        member::{LocalCheckpoint, Member},
-        merge::wire,
-        sharing::{Sharing, Source},
-        standing::{JournalPosition, Standing},
-    },
-    master::{Master, Notice, Request},
+use crate::cluster::{
+    cut_off::CutOff,
+    journal::Keys,
+    machine::Settings,
+    member::{LocalCheckpoint, Member},
+    merge::wire,
+    sharing::{Sharing, Source},
+    standing::{JournalPosition, Standing},
 };
+use ros1_master::master::{Master, Notice, Request};
 
 /// A call that was run on this computer, and whose answer waits.
 #[derive(Clone, Copy, Debug)]

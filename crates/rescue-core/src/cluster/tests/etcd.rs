@@ -11,8 +11,8 @@ use crate::{
         machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
         member::{MemberEntry, MemberEntryChange, Read, WatchedEntry},
     },
-    master::{Displaced, Master, Request},
 };
+use ros1_master::master::{Displaced, Master, Request};
 
 /// A request to etcd on its way.
 #[derive(Clone, Debug)]

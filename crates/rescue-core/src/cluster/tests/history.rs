@@ -6,9 +6,8 @@ use super::{
     etcd::{Etcd, Held},
     world::COMPUTERS,
 };
-use crate::{
-    checkpoint::format::RecordContent as JournalEntry,
-    cluster::machine::Commit,
+use crate::{checkpoint::format::RecordContent as JournalEntry, cluster::machine::Commit};
+use ros1_master::{
     master::{Master, Method, Request},
     xmlrpc::Value,
 };

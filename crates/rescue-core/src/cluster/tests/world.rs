@@ -12,15 +12,15 @@ use super::{
     etcd::{Etcd, Sent},
     history::{Beginning, History, KEYS, Read, Shows, key, subscriptions, value_of},
 };
-use crate::{
-    cluster::{
-        journal::Progress,
-        machine::{ANSWER_LIMIT, Commit, EtcdAnswer, Role, View, WhenAlone},
-        member::{Action, Input, News},
-        merge::wire::{self, Ask, WriteOutcome},
-        sharing::Source,
-        standing::{AnsweredCalls, JournalPosition, Standing},
-    },
+use crate::cluster::{
+    journal::Progress,
+    machine::{ANSWER_LIMIT, Commit, EtcdAnswer, Role, View, WhenAlone},
+    member::{Action, Input, News},
+    merge::wire::{self, Ask, WriteOutcome},
+    sharing::Source,
+    standing::{AnsweredCalls, JournalPosition, Standing},
+};
+use ros1_master::{
     master::Notice,
     xmlrpc::{Reply, Value},
 };

@@ -1,9 +1,7 @@
 use super::*;
-use crate::xmlrpc::{decode_call, encode_call, encode_reply};
-use crate::{
-    master::Kind,
-    replay::{Plan, Skipped, Token, difference},
-};
+use crate::replay::{Plan, Skipped, Token, difference};
+use ros1_master::master::Kind;
+use ros1_master::xmlrpc::{decode_call, encode_call, encode_reply};
 
 fn token() -> Token {
     Token::new("m", 1)

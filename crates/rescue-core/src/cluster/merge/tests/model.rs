@@ -6,7 +6,7 @@ use super::super::{
     judge_write, merge,
     wire::{MergeAnswer, WriteOutcome},
 };
-use crate::{
+use ros1_master::{
     master::{Master, Method, Request, is_success, names},
     xmlrpc::{Reply, Struct, Value},
 };

@@ -3,10 +3,10 @@
 use std::path::Path;
 use std::time::Instant;
 
-use checkpoint_store::{Store, log::files};
+use checkpoint_store::{Store, change_log::files};
 use rescue_core::checkpoint::{
+    change_log::LogReader,
     format::{Checkpoint, Label, Origin, RecordContent},
-    log::LogReader,
 };
 use ros1_master::{
     master::{Master, Method, Request},

@@ -13,7 +13,7 @@ use thiserror::Error;
 
 pub use crate::cli::{ClusterSync, WhenCutOff};
 use crate::{
-    cli::{ClusterArgs, cluster::name},
+    cli::{ClusterArgs, cluster_args::name},
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 

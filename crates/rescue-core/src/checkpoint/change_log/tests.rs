@@ -1,5 +1,6 @@
 use super::*;
-use crate::{checkpoint::format::Checkpoint, master::Method, xmlrpc::Value};
+use crate::checkpoint::format::Checkpoint;
+use ros1_master::{master::Method, xmlrpc::Value};
 use test_support::dice::Dice;
 
 fn set(key: &str, value: i32) -> Request {

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::*;
-use crate::log::files_on;
+use crate::change_log::files_on;
 use rescue_core::checkpoint::format;
 
 /// The numbers of all records in the history, from the files of the log and the checkpoint. Checks that each snapshot

@@ -1,4 +1,4 @@
-//! The log: the records of replaced generations, for people who ask what changed and when.
+//! The log of changes: the records of replaced generations, for people who ask what changed and when.
 //!
 //! The log consists of numbered *parts* beside the checkpoint. Each is a checkpoint file: a snapshot, and after it the
 //! records of as many generations as follow without a gap. The last part grows as `PATH.log-N`. When it is large, or
@@ -19,8 +19,8 @@ use super::load::FILE_BYTES_MAX;
 use super::names::previous;
 use super::{Disk, Names, Storage};
 use rescue_core::checkpoint::{
+    change_log::{self, Moment, Span},
     format::{self, Framed, Stamp},
-    log::{self, Moment, Span},
 };
 
 /// Size of the records for which a new part begins, in bytes.
@@ -393,7 +393,7 @@ pub fn past_state(path: &Path, time: u64, known: &mut KnownTimes) -> Result<Past
                     let seq = found.moment.seq;
                     let is_set_back = || {
                         let text = file.read().unwrap_or_default();
-                        log::is_set_back_after(&text, seq, time)
+                        change_log::is_set_back_after(&text, seq, time)
                     };
                     found.is_set_back |= span.snapshot_seq >= seq || is_set_back();
                 }
@@ -424,7 +424,7 @@ fn read_past(
     let mut text = None;
     let span = match known.0.get(&file.path).filter(|_| is_fixed) {
         Some(span) => *span,
-        None => log::span(text.insert(file.read()?)).map_err(io::Error::other)?,
+        None => change_log::span(text.insert(file.read()?)).map_err(io::Error::other)?,
     };
     if is_fixed {
         known.0.insert(file.path.clone(), span);
@@ -436,7 +436,7 @@ fn read_past(
         Some(text) => text,
         None => file.read()?,
     };
-    let moment = log::moment(&text, time).map_err(io::Error::other)?;
+    let moment = change_log::moment(&text, time).map_err(io::Error::other)?;
     let state = moment.map(|moment| PastState {
         bytes: text.len() as u64,
         path: file.path.clone(),

@@ -1,4 +1,4 @@
-//! The log: what has changed in the history of a checkpoint, when and by whom, and the state at any earlier time.
+//! The log of changes: what has changed in the history of a checkpoint, when and by whom, and the state at any earlier time.
 //!
 //! The history is a list of checkpoint files, oldest first, whose records may overlap. The order of the records is that
 //! of their numbers. Times are labels: where the clock has jumped back, they repeat.
@@ -12,8 +12,8 @@ use crate::{
         session::{Rebuilt, rebuild},
     },
     hide::Hide,
-    master::{Master, Request, Write, WriteTarget, names},
 };
+use ros1_master::master::{Master, Request, Write, WriteTarget, names};
 
 /// The state at an earlier time.
 #[derive(Debug)]
