@@ -9,7 +9,7 @@ use rescue_core::{
     replay,
 };
 use ros1_master::{
-    master::{Kind, Method, Request, is_success},
+    master::{Kind, Master, Method, Request, is_success},
     xmlrpc::{Reply, Value},
 };
 
@@ -31,7 +31,8 @@ const EXACT_ANSWER_MOST: usize = 1 << 20;
 impl Ledger {
     /// The master's predicted answer to a read. `None` for a multicall with too large an answer.
     pub fn answer(&self, read: &Request) -> Option<Reply> {
-        let mirror = &mut self.lock().mirror;
+        // A copy costs nothing, and reading it needs no lock.
+        let mut mirror = self.with_mirror(Master::clone);
         let fits = mirror.fits(read, ANSWER_MOST);
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
@@ -39,18 +40,11 @@ impl Ledger {
     /// The result of a read, if the present master would answer with the same bytes. The result includes every
     /// acknowledged write.
     pub fn exact_answer(&self, read: &Request) -> Option<Value> {
-        let mut inner = self.lock();
-        if inner.doubted || !inner.mirror.fits(read, EXACT_ANSWER_MOST) {
-            return None;
-        }
-        if *read.method() == Method::GetParamNames {
-            // Listing the names walks the whole tree, so it is done on a copy without the lock. Copying the tree costs
-            // nothing.
-            let mut params = inner.mirror.with_params_only();
-            drop(inner);
-            return params.exact_answer(read);
-        }
-        inner.mirror.exact_answer(read)
+        let inner = self.lock();
+        let mut mirror = (!inner.doubted).then(|| inner.mirror.clone())?;
+        drop(inner);
+        let fits = mirror.fits(read, EXACT_ANSWER_MOST);
+        fits.then(|| mirror.exact_answer(read))?
     }
 
     /// Like [`Self::answer`], for a write that changes nothing. Notifies nodes as a master would.

@@ -231,7 +231,8 @@ impl Ledger {
 
     /// A checkpoint of the present state.
     pub fn checkpoint(&self) -> Checkpoint {
-        self.lock().checkpoint()
+        let checkpoint = self.lock().checkpoint();
+        checkpoint()
     }
 
     /// Whether the mirror has changed without a record since the last checkpoint.

@@ -10,7 +10,7 @@ use rescue_core::{
     replay::{self, Token},
 };
 use ros1_master::{
-    master::{Master, Request},
+    master::{Master, Request, Snapshot},
     xmlrpc::Reply,
 };
 use tokio::sync::Notify;
@@ -338,8 +338,11 @@ impl Inner {
         last.map_or(self.session.cluster_seq, |last| last.seq)
     }
 
-    pub(super) fn checkpoint(&self) -> Checkpoint {
-        Checkpoint {
+    /// The checkpoint of this moment. A large state takes long to convert, so the returned function does that, which
+    /// needs no lock.
+    pub(super) fn checkpoint(&self) -> impl FnOnce() -> Checkpoint + Send + use<> {
+        let mirror = self.mirror.clone();
+        let rest = Checkpoint {
             seq: self.seq(),
             session: Session {
                 cluster_seq: self.cluster_seq(),
@@ -347,9 +350,13 @@ impl Inner {
                 ..self.session.clone()
             },
             pending: self.pending.calls().to_vec(),
-            snapshot: self.mirror.snapshot(),
+            snapshot: Snapshot::default(),
             displaced: self.activity.displaced_lately(Instant::now()),
             follows: !self.whole.is_due(),
+        };
+        move || Checkpoint {
+            snapshot: mirror.snapshot(),
+            ..rest
         }
     }
 }

@@ -226,7 +226,7 @@ impl Journal {
     /// passed to the store again.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
-        checkpoint: Checkpoint,
+        checkpoint: impl FnOnce() -> Checkpoint + Send + 'static,
         work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
     ) -> Option<oneshot::Receiver<T>> {
         self.gives = true;
@@ -238,7 +238,7 @@ impl Journal {
                 store.give_up(SILENT);
                 shared.seen().gaps_over = gaps;
             }
-            work(store, checkpoint)
+            work(store, checkpoint())
         });
         if given.is_none() {
             self.give_up();

@@ -318,8 +318,8 @@ async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
     let work = move || {
         let pages = &server.pages;
         let version = pages.ledger.version();
-        let params = pages.ledger.with_mirror(Master::with_params_only);
-        asked.answer(params.params(), &pages.hide, |params| {
+        let mirror = pages.ledger.with_mirror(Master::clone);
+        asked.answer(mirror.params(), &pages.hide, |params| {
             let robot = Robot::read(&pages.ledger, &pages.nodes);
             WholeState::new(version, robot, params, None)
         })

@@ -66,7 +66,7 @@ fn whole(journal: &Journal, values: std::ops::Range<i32>) -> Checkpoint {
 /// Writes a complete checkpoint.
 fn rewrite(journal: &mut Journal, values: std::ops::Range<i32>) {
     let checkpoint = whole(journal, values);
-    let done = journal.run_whole(checkpoint, |store, checkpoint| store.begin(&checkpoint));
+    let done = journal.run_whole(|| checkpoint, |store, checkpoint| store.begin(&checkpoint));
     journal.worker().work();
     done.unwrap().try_recv().unwrap().unwrap();
 }
@@ -127,7 +127,7 @@ fn a_whole_checkpoint_from_before_the_second_silence_protects_nothing() {
     journal.give_up();
     journal.append(entry(0));
     let checkpoint = whole(&journal, 0..1);
-    let _done = journal.run_whole(checkpoint, |store, checkpoint| store.begin(&checkpoint));
+    let _done = journal.run_whole(|| checkpoint, |store, checkpoint| store.begin(&checkpoint));
     journal.append(entry(1));
     journal.give_up();
     journal.append(entry(2));

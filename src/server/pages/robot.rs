@@ -60,15 +60,15 @@ impl Robot {
     /// Reads the mirror's present content.
     pub(super) fn read(ledger: &Ledger, nodes: &Nodes) -> Self {
         let lives = nodes.lives();
-        let (snapshot, pids) = ledger.with_activity(|mirror, activity| {
+        let (mirror, pids) = ledger.with_activity(|mirror, activity| {
             let pids = mirror.nodes().filter_map(|(name, api)| {
                 let (pid, _) = activity.pid_of(name, api)?;
                 Some((name.to_owned(), pid))
             });
             let pids: BTreeMap<String, i32> = pids.collect();
-            (mirror.snapshot(), pids)
+            (mirror.clone(), pids)
         });
-        let mut robot = Self::from_snapshot(snapshot);
+        let mut robot = Self::from_snapshot(mirror.snapshot());
         for node in &mut robot.nodes {
             node.pid = pids.get(&node.name).copied();
             if let Some(life) = lives.get(&node.name) {

@@ -132,17 +132,6 @@ impl Master {
         self.uri = uri;
     }
 
-    /// A master with the same parameters and nothing else. The parameters are shared, not copied.
-    pub fn with_params_only(&self) -> Self {
-        Self {
-            params: self.params.clone(),
-            inexact: self.inexact,
-            python: self.python,
-            old: self.old,
-            ..Self::default()
-        }
-    }
-
     /// Whether answers to reads may differ from rosmaster's. Ignored when two masters are compared.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()
