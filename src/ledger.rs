@@ -30,7 +30,7 @@ use checkpoint_store::Store;
 use rescue_core::{
     checkpoint::format::{Label, Origin, Record, RecordContent, Session},
     cluster::{
-        merge::Verdict,
+        merge::MergeVerdict,
         sharing::{Change, Sharing, Source},
     },
     order::{Order, Subject},
@@ -450,10 +450,17 @@ impl Ledger {
     /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
     /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
     /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
-    pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
+    pub(crate) fn merge_verdicts(
+        &self,
+        seq: u64,
+        merge: &str,
+        calls: &[&Request],
+    ) -> Option<Vec<MergeVerdict>> {
         let inner = self.lock();
         match &inner.shared {
-            Shared::Here { sharing, .. } => sharing.judge(&inner.mirror, seq, merge, calls),
+            Shared::Here { sharing, .. } => {
+                sharing.merge_verdicts(&inner.mirror, seq, merge, calls)
+            }
             _ => None,
         }
     }

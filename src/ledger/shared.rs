@@ -135,7 +135,7 @@ mod tests {
     use rescue_core::{
         checkpoint::format::{Origin, Record, RecordContent, Session},
         cluster::{
-            merge::Verdict,
+            merge::MergeVerdict,
             sharing::{Change, Source},
         },
     };
@@ -326,8 +326,13 @@ mod tests {
     fn judged(ledger: &Ledger, seq: u64, keys: &[&str]) -> Option<Vec<bool>> {
         let calls: Vec<_> = keys.iter().map(|key| set_of(key, -1)).collect();
         let calls: Vec<_> = calls.iter().collect();
-        let verdicts = ledger.judge(seq, "mine", &calls)?;
-        Some(verdicts.iter().map(|of| *of == Verdict::Runs).collect())
+        let verdicts = ledger.merge_verdicts(seq, "mine", &calls)?;
+        Some(
+            verdicts
+                .iter()
+                .map(|of| *of == MergeVerdict::Apply)
+                .collect(),
+        )
     }
 
     #[test]

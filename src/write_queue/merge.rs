@@ -7,7 +7,7 @@ use rescue_core::{
     checkpoint::format::Origin,
     cluster::{
         merge::{
-            Verdict,
+            MergeVerdict,
             wire::{self, Ask},
         },
         sharing::Source,
@@ -24,10 +24,10 @@ use crate::{ledger::Ledger, upstream::Head};
 
 /// Whether each write of an item conflicts with changes by other computers, as decided last.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Judged(Arc<Mutex<Option<Vec<Verdict>>>>);
+pub(super) struct Judged(Arc<Mutex<Option<Vec<MergeVerdict>>>>);
 
 impl Judged {
-    fn set(&self, verdicts: Option<Vec<Verdict>>) {
+    fn set(&self, verdicts: Option<Vec<MergeVerdict>>) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = verdicts;
     }
 
@@ -81,10 +81,10 @@ pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
         return Some(item);
     };
     let calls: Vec<&Request> = ask.calls.iter().collect();
-    let verdicts = ledger.judge(ask.seq, &ask.id, &calls);
+    let verdicts = ledger.merge_verdicts(ask.seq, &ask.id, &calls);
     let runs = verdicts.iter().flatten().zip(&ask.calls);
     let runs: Vec<_> = runs
-        .filter(|(verdict, _)| **verdict == Verdict::Runs)
+        .filter(|(verdict, _)| **verdict == MergeVerdict::Apply)
         .map(|(_, call)| call)
         .collect();
     judged.set(verdicts);

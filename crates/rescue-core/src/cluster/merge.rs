@@ -47,13 +47,13 @@ pub struct LostWrite {
 
 /// What happens to one partition write; see [`judge_write`].
 #[derive(Clone, Debug, PartialEq)]
-pub enum Verdict {
+pub enum MergeVerdict {
     /// The leader makes the write, because others have not changed the same parameter, node, service or topic
     /// registration.
-    Runs,
+    Apply,
     /// The write is unnecessary: others have made the same change, or what it unregisters is no longer registered.
-    Holds,
-    Lost(LostWrite),
+    Redundant,
+    Overtaken(LostWrite),
 }
 
 /// What others changed during the partition, so that a partition write is lost.
@@ -113,11 +113,12 @@ pub fn merge<'a>(
     for call in pending.into_iter().rev() {
         let path = param_of(call);
         match judge_write(changes, now, call) {
-            Verdict::Runs => merged.send.push(call.clone()),
-            Verdict::Holds => merged.equal.extend(parameter_of(call)),
+            MergeVerdict::Apply => merged.send.push(call.clone()),
+            MergeVerdict::Redundant => merged.equal.extend(parameter_of(call)),
             // A value that this computer itself deleted later does not count as lost.
-            Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
-            Verdict::Lost(lost) => merged.lost.push(lost),
+            MergeVerdict::Overtaken(_)
+                if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
+            MergeVerdict::Overtaken(lost) => merged.lost.push(lost),
         }
         if let Some(path) = path.filter(|_| *call.method() == Method::DeleteParam) {
             deleted.add(ChangeSubject::Param(path));
@@ -130,9 +131,9 @@ pub fn merge<'a>(
 
 /// Decides what happens to the partition write `call`, which must not be a multicall, after `changes` by others, whose
 /// state is `now`.
-pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> Verdict {
+pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> MergeVerdict {
     let Some(why) = conflict(changes, now, call) else {
-        return Verdict::Runs;
+        return MergeVerdict::Apply;
     };
     let path = param_of(call).unwrap_or_default();
     let parts: Vec<&str> = names::parts(&path).collect();
@@ -140,16 +141,16 @@ pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> Verdict {
     if matches!(why, Conflict::Parameter(_)) && !parts.is_empty() {
         let wanted = Write::of(call).and_then(|write| write.value());
         if wanted == present.as_ref() {
-            return Verdict::Holds;
+            return MergeVerdict::Redundant;
         }
     }
     // The present owner of the name or service has already ended that registration.
     let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
     if over && Write::of(call).is_some_and(|write| write.unregisters()) {
-        return Verdict::Holds;
+        return MergeVerdict::Redundant;
     }
     let call = call.clone();
-    Verdict::Lost(LostWrite { call, why, present })
+    MergeVerdict::Overtaken(LostWrite { call, why, present })
 }
 
 fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict> {

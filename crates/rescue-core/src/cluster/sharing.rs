@@ -5,7 +5,7 @@ use std::{collections::VecDeque, sync::Arc};
 use crate::{
     checkpoint::format::{self, Label, Record, RecordContent},
     cluster::{
-        merge::{self, ChangeSubject, Changes, Verdict},
+        merge::{self, ChangeSubject, Changes, MergeVerdict},
         mutant::Mutant,
     },
 };
@@ -170,13 +170,13 @@ impl Sharing {
     /// Decides what happens to the partition writes `calls` of a computer in the state `mirror`. That computer sends
     /// them under the name `merge`, and has taken the others' changes up to record `seq` into account.
     /// `None` if the changes after that record are no longer known, or the record is of a journal that etcd has lost.
-    pub fn judge(
+    pub fn merge_verdicts(
         &self,
         mirror: &Master,
         seq: u64,
         merge: &str,
         calls: &[&Request],
-    ) -> Option<Vec<Verdict>> {
+    ) -> Option<Vec<MergeVerdict>> {
         let changes = match Mutant::JudgesOnce.lives() {
             true => Changes::default(),
             false if seq > self.last => return None,
@@ -185,7 +185,9 @@ impl Sharing {
         let verdicts = calls.iter().map(|call| {
             match merge::judge_write(&changes, mirror, call) {
                 // It sets the present value again, so that nodes are notified.
-                Verdict::Holds if call.text(0) == Some(merge::TELLER) => Verdict::Runs,
+                MergeVerdict::Redundant if call.text(0) == Some(merge::TELLER) => {
+                    MergeVerdict::Apply
+                }
                 verdict => verdict,
             }
         });

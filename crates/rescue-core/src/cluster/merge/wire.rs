@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::{Conflict, LostWrite, Verdict};
+use super::{Conflict, LostWrite, MergeVerdict};
 use ros1_master::{
     master::{CALLER_ID, Method, Request, entry_reply, is_success},
     xmlrpc::{Call, Reply, Value},
@@ -93,17 +93,17 @@ pub enum MergeAnswer {
 
 impl MergeAnswer {
     /// The answer for writes that were decided on as in `verdicts`. `reply` is the master's reply to those that it ran.
-    pub fn of(verdicts: &[Verdict], reply: &Reply) -> Self {
+    pub fn of(verdicts: &[MergeVerdict], reply: &Reply) -> Self {
         let results = match reply {
             Reply::Value(Value::Array(results)) => results.as_slice(),
             _ => &[],
         };
         let mut results = results.iter();
         let outcomes = verdicts.iter().map(|verdict| match verdict {
-            Verdict::Holds => WriteOutcome::Holds,
-            Verdict::Lost(lost) => lost.into(),
+            MergeVerdict::Redundant => WriteOutcome::Holds,
+            MergeVerdict::Overtaken(lost) => lost.into(),
             // A write without a result was made; the master could not encode the whole answer.
-            Verdict::Runs => match results.next().and_then(entry_reply) {
+            MergeVerdict::Apply => match results.next().and_then(entry_reply) {
                 Some(reply) if !is_success(&reply) => WriteOutcome::Refused(text(&reply)),
                 _ => WriteOutcome::Holds,
             },
@@ -206,8 +206,13 @@ mod tests {
         let call = set("/a", 1);
         let why = Conflict::Parameter("/a".to_owned());
         let present = Some(Value::Int(2));
-        let lost = Verdict::Lost(LostWrite { call, why, present });
-        let verdicts = [Verdict::Runs, lost, Verdict::Holds, Verdict::Runs];
+        let lost = MergeVerdict::Overtaken(LostWrite { call, why, present });
+        let verdicts = [
+            MergeVerdict::Apply,
+            lost,
+            MergeVerdict::Redundant,
+            MergeVerdict::Apply,
+        ];
         let result = |code: i32, text: &str| {
             let reply: Vec<Value> = vec![code.into(), text.into(), 0.into()];
             Value::Array(vec![reply.into()])

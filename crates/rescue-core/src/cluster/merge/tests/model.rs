@@ -1,7 +1,7 @@
 //! Merges the writes of random periods of being cut off. Leaders are replaced, forget changes, and lose answers.
 
 use super::super::{
-    Changes, Verdict, WritesToSend,
+    Changes, MergeVerdict, WritesToSend,
     changes::{param_of, value_at},
     judge_write, merge,
     wire::{MergeAnswer, WriteOutcome},
@@ -85,7 +85,7 @@ impl There {
             .map(|call| judge_write(&changes, &self.state, call))
             .collect();
         let runs = verdicts.iter().zip(calls);
-        let runs = runs.filter(|(verdict, _)| **verdict == Verdict::Runs);
+        let runs = runs.filter(|(verdict, _)| **verdict == MergeVerdict::Apply);
         let runs: Vec<_> = runs.map(|(_, call)| call.clone()).collect();
         let results = runs.iter().map(|call| match self.run(By::Lonely, call) {
             Reply::Value(value) => Value::Array(vec![value]),

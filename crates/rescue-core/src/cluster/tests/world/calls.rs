@@ -184,14 +184,15 @@ impl World {
             let ledger = &mut self.computers[at].ledger;
             let mirror = &ledger.mirror;
             let sharing = ledger.sharing.as_ref();
-            let verdicts = sharing.and_then(|of| of.judge(mirror, ask.seq, &ask.id, &calls));
+            let verdicts =
+                sharing.and_then(|of| of.merge_verdicts(mirror, ask.seq, &ask.id, &calls));
             answer = Some(match verdicts {
                 None => wire::MergeAnswer::Again,
                 Some(verdicts) => {
                     let source = Source::Merge(ask.id.clone());
                     let mut results = Vec::new();
                     for (call, verdict) in ask.calls.iter().zip(&verdicts) {
-                        if *verdict == crate::cluster::merge::Verdict::Runs {
+                        if *verdict == crate::cluster::merge::MergeVerdict::Apply {
                             let ledger = &mut self.computers[at].ledger;
                             let ran = ledger.run(call, &source);
                             results.push(Value::Array(vec![
