@@ -387,7 +387,7 @@ impl World {
             }
             return;
         }
-        let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));
+        let body = Bytes::from(call.encode());
         let raw = Some((Head::default(), body));
         let (mut item, answered) = Item::new(raw, Some(Arc::new(call.clone())));
         item.patience = Some(self.instant() + Duration::from_micros(PATIENCE));

@@ -269,20 +269,14 @@ impl Request {
 
     /// Converts this call to an encoded entry of a multicall.
     pub fn into_entry(self) -> Value {
-        Call::from(self).into_entry()
+        let method = self.method.name().to_owned();
+        Call::new(method, self.into_wire_params()).into_entry()
     }
 }
 
 impl From<Call> for Request {
     fn from(call: Call) -> Self {
         Self::parse(Method::named(&call.method), call.params, 0)
-    }
-}
-
-impl From<Request> for Call {
-    fn from(request: Request) -> Self {
-        let method = request.method.name().to_owned();
-        Self::new(method, request.into_wire_params())
     }
 }
 
