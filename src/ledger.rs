@@ -99,6 +99,8 @@ pub struct Ledger {
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
     order_changed: watch::Sender<()>,
+    /// Signals that the master has run all writes that the mirror has answered first.
+    all_acknowledged: watch::Sender<()>,
     /// Whether a simulation decides when the disk writes.
     #[cfg(test)]
     writes_by_hand: AtomicBool,
@@ -129,6 +131,7 @@ impl Ledger {
             shared: Notify::new(),
             outbox_changed: Notify::new(),
             order_changed: watch::channel(()).0,
+            all_acknowledged: watch::channel(()).0,
             #[cfg(test)]
             writes_by_hand: AtomicBool::default(),
         };

@@ -7,7 +7,7 @@ use rescue_core::{
     order::Concern,
 };
 use ros1_master::{
-    master::{Request, Write},
+    master::{Effect, Request, Write, returnable},
     xmlrpc::{Reply, Value},
 };
 
@@ -45,7 +45,7 @@ impl Ledger {
     /// it. `None` if the master must run it first:
     ///
     /// * the mirror or the journal is in doubt, or nothing would keep the write if this process ended;
-    /// * the master may refuse the write, or would shut a node down;
+    /// * the master may refuse the write, would shut a node down, or may not be able to return a value;
     /// * the answer is about something of which the master may be notifying the caller right now;
     /// * too many writes wait for the master.
     pub(crate) fn answer_first(
@@ -68,6 +68,7 @@ impl Ledger {
             && inner.pending.has_room_for(call, UNACKNOWLEDGED_MAX)
             && !inner.mirror.is_inexact()
             && inner.mirror.accepts(&write)
+            && is_predictable(&write.effect)
             && inner.mirror.displaced_by(call).is_none()
             && inner.mirror.fits(call, ANSWER_MOST)
             && !inner.order.answer_must_wait(&inner.mirror, &heard);
@@ -126,10 +127,22 @@ impl Ledger {
         if inner.order.has_new_repeat() {
             self.outbox_changed.notify_one();
         }
+        if inner.pending.calls().is_empty() {
+            self.all_acknowledged.send_replace(());
+        }
         if awaited {
             self.order_changed.send_replace(());
         }
         Ok(())
+    }
+
+    /// Waits until the master has run all writes that the mirror has answered first.
+    pub(crate) async fn all_acknowledged(&self) {
+        let mut acknowledged = self.all_acknowledged.subscribe();
+        while self.pending() > 0 {
+            // This cannot fail: this owns the sender.
+            let _ = acknowledged.changed().await;
+        }
     }
 
     /// Notes that this master will not run the write as a call, because the state that a master gets has it.
@@ -147,6 +160,23 @@ impl Ledger {
         drop(inner);
         self.write();
         self.work.notify_one();
+    }
+}
+
+/// Whether the mirror surely knows what the master answers. A master accepts values that it cannot return.
+fn is_predictable(effect: &Effect<'_>) -> bool {
+    match effect {
+        Effect::SetParam { value, .. } => returnable::is_readable(value),
+        // The answer has the parameter's value.
+        Effect::SubscribeParam { .. } => false,
+        Effect::DeleteParam { .. }
+        | Effect::RegisterPublisher { .. }
+        | Effect::RegisterSubscriber { .. }
+        | Effect::RegisterService { .. }
+        | Effect::UnregisterPublisher { .. }
+        | Effect::UnregisterSubscriber { .. }
+        | Effect::UnregisterService { .. }
+        | Effect::UnsubscribeParam { .. } => true,
     }
 }
 

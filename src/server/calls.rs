@@ -352,6 +352,14 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
+                    if self.ledger.pending() > 0 {
+                        // The master must have run what was answered before this call came.
+                        tokio::select! {
+                            () = self.ledger.all_acknowledged() => {}
+                            () = gate.changed() => continue,
+                            () = tokio::time::sleep_until(patience) => {}
+                        }
+                    }
                     // While the mirror may be outdated, it does not answer for a late master. Nor does it answer a call
                     // of an unknown method, which that master may know.
                     let is_late =
