@@ -159,13 +159,13 @@ pub struct SupervisedConfig {
 
 impl Config {
     /// Maximum space for kept checkpoints, in bytes.
-    pub fn kept_bytes(&self) -> u64 {
+    pub fn checkpoint_bytes(&self) -> u64 {
         self.history / 4
     }
 
     /// Maximum space for the log of changes, in bytes.
     pub fn log_bytes(&self) -> u64 {
-        self.history - self.kept_bytes()
+        self.history - self.checkpoint_bytes()
     }
 
     /// The configuration of `rosrescue core` with `args` in the environment `env` on the computer

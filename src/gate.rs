@@ -106,7 +106,7 @@ impl Rx {
     }
 
     /// The present state, and whether it has changed since the last observation or since [`Self::changed`] returned.
-    pub fn look_changed(&mut self) -> (State, bool) {
+    pub fn observe_change(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
     }
@@ -136,13 +136,13 @@ mod tests {
     async fn an_observation_reports_a_change_that_was_not_waited_for() {
         let (tx, mut rx) = gate();
         tx.set(State::StandingIn);
-        assert_eq!(rx.look_changed(), (State::StandingIn, true));
-        assert_eq!(rx.look_changed(), (State::StandingIn, false));
+        assert_eq!(rx.observe_change(), (State::StandingIn, true));
+        assert_eq!(rx.observe_change(), (State::StandingIn, false));
         tx.set(State::Open { incarnation: 1 });
         tx.set(State::StandingIn);
-        assert_eq!(rx.look_changed(), (State::StandingIn, true));
+        assert_eq!(rx.observe_change(), (State::StandingIn, true));
         tx.set(State::Injecting);
         rx.changed().await;
-        assert_eq!(rx.look_changed(), (State::Injecting, false));
+        assert_eq!(rx.observe_change(), (State::Injecting, false));
     }
 }

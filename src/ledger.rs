@@ -653,7 +653,7 @@ impl Ledger {
         };
         behind.answered = true;
         order.late_answered(now);
-        told_by_master(now, order, mirror, &behind.tells);
+        note_master_notifications(now, order, mirror, &behind.tells);
         drop(inner);
         self.outbox_changed.notify_one();
     }
@@ -681,7 +681,7 @@ impl Ledger {
         let before = inner.token();
         inner.raise_incarnation();
         for (subject, nodes) in told {
-            inner.order.told_by_master(now, &subject, nodes);
+            inner.order.master_notifies(now, &subject, nodes);
         }
         Some(CatchUp::Run(Box::new(Missed {
             behind: behind.state,
@@ -729,14 +729,14 @@ impl Ledger {
 }
 
 /// Notes that the master begins to notify nodes about `tells`.
-fn told_by_master(now: Instant, order: &mut Order, mirror: &Master, tells: &[Subject]) {
+fn note_master_notifications(now: Instant, order: &mut Order, mirror: &Master, tells: &[Subject]) {
     for subject in tells {
         let nodes = match subject {
             Subject::Topic(topic) => mirror.subscribers_of(topic).len(),
             Subject::Param(_) => 1,
             Subject::Name(_) => continue,
         };
-        order.told_by_master(now, subject, nodes);
+        order.master_notifies(now, subject, nodes);
     }
 }
 

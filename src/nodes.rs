@@ -265,7 +265,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         tokio::select! {
             () = nodes.ledger.outbox_changed.notified() => empty_outbox(&nodes, &mut repeats),
             () = wait::sleep_until(tell_again_at.map(Into::into)) => {
-                nodes.ledger.with_order(|order, _| order.repeat(Instant::now()));
+                nodes.ledger.with_order(|order, _| order.queue_due_repeats(Instant::now()));
                 notifications::send_waiting(&nodes);
             }
             () = gate.changed() => match gate.observe() {

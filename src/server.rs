@@ -23,7 +23,7 @@ use tokio::sync::{Notify, Semaphore};
 
 use self::{
     access::{AccessRules, LastLogged},
-    answers::Answers,
+    answers::AnswerMemory,
     calls::Calls,
     clients::Clients,
     idle::Idle,
@@ -49,7 +49,7 @@ pub struct Server {
     /// Memory for large request bodies, in KiB.
     pub bodies: Semaphore,
     /// Memory for large answers.
-    pub answers: Arc<Answers>,
+    pub answers: Arc<AnswerMemory>,
     pub stats: &'static Stats,
     pub calls: Calls,
     pub pages: Pages,

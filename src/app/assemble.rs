@@ -24,7 +24,7 @@ use crate::{
     server::{
         Server,
         access::AccessRules,
-        answers::Answers,
+        answers::AnswerMemory,
         body,
         calls::Calls,
         clients::Clients,
@@ -142,7 +142,7 @@ pub(super) async fn assemble(
         supervision,
         probing: config.probing,
         probe_timeout: config.probe_timeout,
-        history: config.kept_bytes(),
+        history: config.checkpoint_bytes(),
         uri,
         checkpoint: config.checkpoint.clone(),
         node_timeout: config.node_timeout,
@@ -214,7 +214,7 @@ pub(super) fn server(
         idle: Idle::among(config.max_connections),
         max_body: config.max_body,
         bodies: body::budget(config.max_body),
-        answers: Answers::within(2 * config.max_body),
+        answers: AnswerMemory::within(2 * config.max_body),
         stats: context.stats,
         calls: Calls {
             gate: context.gate.clone(),

@@ -129,7 +129,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
     }
     if let Some(store) = &store {
-        let (path, most) = (store.path().to_owned(), config.kept_bytes());
+        let (path, most) = (store.path().to_owned(), config.checkpoint_bytes());
         crate::task::spawn_blocking(move || {
             if let Err(error) = history::trim(&path, most) {
                 tracing::debug!(%error, "cannot list the kept checkpoints");

@@ -57,7 +57,7 @@ impl Ledger {
         now: Instant,
         write: &Request,
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
-        let concern = Concern::of(Some(write));
+        let concern = Concern::of_call(Some(write));
         let mut inner = self.lock();
         // Unregistrations are left out: they may concern a registration that the master has not run yet. With several
         // computers, so is a parameter that is set again: this is its last write, which the journal must have.
@@ -69,11 +69,11 @@ impl Ledger {
             && !write.calls().into_iter().any(counts)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
-        let heard = concern.heard();
+        let heard = concern.recipients();
         if !idle || inner.order.read_must_wait(&heard) {
             return None;
         }
-        let number = inner.order.begin(now, heard);
+        let number = inner.order.begin_answer(now, heard);
         let reply = inner.apply(
             now,
             write,
@@ -161,8 +161,8 @@ impl Ledger {
             return None;
         }
         // The answer is begun before the call is applied, because the call may notify its own caller.
-        let heard = concern.heard();
-        let number = inner.order.begin(now, heard);
+        let heard = concern.recipients();
+        let number = inner.order.begin_answer(now, heard);
         let changes = inner.mirror.would_change(call);
         let before = call.ends_early().then(|| inner.mirror.clone());
         let reply = inner.apply(

@@ -3,7 +3,7 @@
 
 use std::{sync::Arc, time::Instant};
 
-use rescue_core::order::heard_by_read;
+use rescue_core::order::recipients_of_read;
 use ros1_master::master::Request;
 
 use super::Ledger;
@@ -38,10 +38,10 @@ impl Delivery {
     ) -> Result<Option<Self>, MustWait> {
         let Some(read) = read else { return Ok(None) };
         let begun = ledger.with_order(|order, mirror| {
-            let heard = heard_by_read(read, mirror);
+            let heard = recipients_of_read(read, mirror);
             match order.read_must_wait(&heard) {
                 true => Err(MustWait),
-                false => Ok(order.begin(now, heard)),
+                false => Ok(order.begin_answer(now, heard)),
             }
         });
         Ok(begun?.map(|number| Self::new(ledger, number)))
@@ -50,8 +50,8 @@ impl Delivery {
     /// Like [`Self::of_read`], but begins the answer even if the master may be notifying the caller right now.
     pub(crate) fn of_read_now(ledger: &Arc<Ledger>, read: &Request) -> Option<Self> {
         let begun = ledger.with_order(|order, mirror| {
-            let heard = heard_by_read(read, mirror);
-            order.begin(Instant::now(), heard)
+            let heard = recipients_of_read(read, mirror);
+            order.begin_answer(Instant::now(), heard)
         });
         Some(Self::new(ledger, begun?))
     }
@@ -63,7 +63,10 @@ impl Delivery {
     /// Notes that the answer is ready to be written.
     pub(crate) fn ready(&self) {
         if let Some(ledger) = &self.ledger {
-            ledger.lock().order.ready(Instant::now(), self.number);
+            ledger
+                .lock()
+                .order
+                .answer_ready(Instant::now(), self.number);
         }
     }
 
@@ -78,7 +81,7 @@ impl Delivery {
 impl Drop for Delivery {
     fn drop(&mut self) {
         if let Some(ledger) = &self.ledger {
-            ledger.release(|order| order.written(Instant::now(), self.number));
+            ledger.release(|order| order.answer_written(Instant::now(), self.number));
         }
     }
 }

@@ -13,7 +13,7 @@ use ros1_master::{
 
 use super::{
     Ledger, Mark, Superseded, answers::ANSWER_MOST, delivery::Delivery, inner::Notifier,
-    mutant::Mutant, shared::Shared, told_by_master,
+    mutant::Mutant, note_master_notifications, shared::Shared,
 };
 use crate::clock;
 
@@ -57,7 +57,7 @@ impl Ledger {
     ) -> Option<AnsweredFirst> {
         let mut inner = self.lock();
         let write = Write::of(call)?;
-        let heard = concern.heard();
+        let heard = concern.recipients();
         let is_certain = !inner.injecting
             && !inner.doubted
             && !inner.unconfirmed
@@ -76,7 +76,7 @@ impl Ledger {
             return None;
         }
         // The answer is begun before the call is applied, because the call may notify its own caller.
-        let number = inner.order.begin(now, heard);
+        let number = inner.order.begin_answer(now, heard);
         let reply = inner.apply(now, call, Notifier::MasterLater, &self.outbox_changed);
         origin.note_in(&mut inner.mirror, call);
         let at = clock::wall_millis();
@@ -88,7 +88,7 @@ impl Ledger {
         }]);
         inner.add_pending([call.clone()]);
         let (mark, seq) = (inner.mark(), inner.seq());
-        inner.order.answered_first(seq, concern.tells());
+        inner.order.answered_first(seq, concern.notified_subjects());
         drop(inner);
         self.recorded();
         Some(AnsweredFirst {
@@ -112,9 +112,9 @@ impl Ledger {
         }
         let mut awaited = false;
         for write in writes {
-            let tells = write.concern.tells();
+            let tells = write.concern.notified_subjects();
             awaited |= inner.order.acknowledged(write.seq, tells);
-            told_by_master(now, &mut inner.order, &inner.mirror, tells);
+            note_master_notifications(now, &mut inner.order, &inner.mirror, tells);
             if let Some(last) = inner.pending.acknowledge(write.seq) {
                 inner.acknowledged = last;
             }
@@ -147,7 +147,7 @@ impl Ledger {
 
     /// Notes that this master will not run the write as a call, because the state that a master gets has it.
     pub(crate) fn is_left_out(&self, seq: u64, concern: &Concern) {
-        self.release(|order| order.acknowledged(seq, concern.tells()));
+        self.release(|order| order.acknowledged(seq, concern.notified_subjects()));
     }
 
     /// Tells the journal which pending writes the master has run, if it does not know it yet.

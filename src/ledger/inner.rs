@@ -130,7 +130,7 @@ impl Inner {
                     match standing_in {
                         // A living master may still have older notifications to send, among them those of the write
                         // that made this one redundant. `Order` tells a state only after them.
-                        Some(false) => self.order.tell_state(port, subject),
+                        Some(false) => self.order.notify_of_state(port, subject),
                         _ => self.order.notify(now, port, subject, call),
                     }
                     outbox_changed.notify_one();
@@ -139,7 +139,7 @@ impl Inner {
             None if notifier == Notifier::MasterLater => {}
             None => {
                 for (subject, nodes) in noticed.subjects() {
-                    self.order.told_by_master(now, &subject, nodes);
+                    self.order.master_notifies(now, &subject, nodes);
                 }
                 if self.order.has_new_repeat() {
                     outbox_changed.notify_one();

@@ -73,11 +73,11 @@ impl Ledger {
         self.with_order(|order, mirror| {
             let mut tell = |api: &str, subject: Subject| {
                 if telling != Telling::Later {
-                    order.tell_state(port_of(api), subject.clone());
+                    order.notify_of_state(port_of(api), subject.clone());
                 }
                 let is_once = telling == Telling::Now || Mutant::TellsOnce.lives();
                 if !is_once {
-                    order.tell_state_at(now + BACKLOG, port_of(api), subject);
+                    order.notify_of_state_at(now + BACKLOG, port_of(api), subject);
                 }
             };
             topics.retain(|topic| {

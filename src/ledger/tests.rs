@@ -242,8 +242,8 @@ fn a_write_that_changes_nothing_tells_nodes_nothing_before_the_master_has() {
     assert!(ledger.answer_if_unchanged(now, &set(2)).is_some());
     let next = |at| {
         ledger.with_order(|order, mirror| {
-            order.repeat(at);
-            order.next(at, "http://n:1", mirror)
+            order.queue_due_repeats(at);
+            order.next_notification(at, "http://n:1", mirror)
         })
     };
     assert_eq!(next(now), NextNotification::Idle);
@@ -263,11 +263,11 @@ fn what_is_left_to_a_late_master_is_owed_until_the_next_one_serves() {
     ledger.stand_in(now, &call("registerSubscriber", &subscriber));
     ledger.delivered();
     let publish = publish("/t");
-    let concern = Concern::of(Some(&publish));
-    ledger.with_order(|order, _| order.sent(concern.tells(), Vec::new()));
+    let concern = Concern::of_call(Some(&publish));
+    ledger.with_order(|order, _| order.calls_sent(concern.notified_subjects(), Vec::new()));
     // The master is late with the call, so the mirror answers it. Then the master answers, and dies.
     ledger.stand_in(now, &publish);
-    ledger.fall_behind(now, concern.tells().to_vec(), true);
+    ledger.fall_behind(now, concern.notified_subjects().to_vec(), true);
     ledger.late_answered(now);
     ledger.abandon_batch();
     let queued = ledger.queue_owed(now, now, Telling::Now);

@@ -73,14 +73,14 @@ pub(super) fn notify_ports(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
         for (name, api) in mirror.nodes().filter(|(_, api)| ports(port_of(api))) {
             let port = port_of(api);
             for topic in mirror.subscriptions(name) {
-                order.tell_state(port, Subject::Topic(topic.to_owned()));
+                order.notify_of_state(port, Subject::Topic(topic.to_owned()));
             }
             // A parameter that is not set, and perhaps never was, needs no notification.
             for key in mirror
                 .param_subscriptions(name)
                 .filter(|key| mirror.is_set(key))
             {
-                order.tell_state(port, Subject::Param(key.to_owned()));
+                order.notify_of_state(port, Subject::Param(key.to_owned()));
             }
         }
     });
@@ -91,7 +91,7 @@ pub(super) fn notify_ports(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
 /// names.
 pub(crate) fn notify_node(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     let port = port_of(api);
-    let tell = |order: &mut Order, _: &Master| order.tell_state(port, subject);
+    let tell = |order: &mut Order, _: &Master| order.notify_of_state(port, subject);
     nodes.ledger.with_order(tell);
     send_waiting(nodes);
 }
@@ -123,7 +123,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         changed.mark_unchanged();
         let (call, number) = match nodes
             .ledger
-            .with_order(|order, mirror| order.next(Instant::now(), &port, mirror))
+            .with_order(|order, mirror| order.next_notification(Instant::now(), &port, mirror))
         {
             NextNotification::Send { call, number } => (call, number),
             NextNotification::Wait { until } => {
@@ -152,7 +152,9 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 asked.await
             }
         };
-        nodes.ledger.release(|order| order.taken(number));
+        nodes
+            .ledger
+            .release(|order| order.notification_taken(number));
         if is_param && sign == Reaction::Silent && is_answering(&nodes, &port).await {
             nodes.set_mute(&port, true);
             continue;
@@ -232,7 +234,7 @@ async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
     loop {
         changed.mark_unchanged();
         let under_way =
-            |order: &mut Order, _: &Master| order.is_under_way(Instant::now(), port, subject);
+            |order: &mut Order, _: &Master| order.answer_under_way(Instant::now(), port, subject);
         let Some(held) = nodes.ledger.with_order(under_way) else {
             return;
         };

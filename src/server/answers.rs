@@ -88,7 +88,7 @@ fn fast_until(before: Instant, now: Instant, bytes: usize) -> Instant {
 
 /// Memory for large answers.
 #[derive(Debug)]
-pub struct Answers {
+pub struct AnswerMemory {
     /// Size in KiB.
     size: u32,
     room: Arc<Semaphore>,
@@ -107,7 +107,7 @@ pub(crate) struct AnswerRoom(OwnedSemaphorePermit);
 struct Counted {
     bytes: Bytes,
     number: u64,
-    answers: Arc<Answers>,
+    answers: Arc<AnswerMemory>,
     _room: AnswerRoom,
 }
 
@@ -134,7 +134,7 @@ pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
     (size > SMALL).then_some(size)
 }
 
-impl Answers {
+impl AnswerMemory {
     /// Creates memory for large answers of `bytes` in total. A larger answer takes all of it.
     pub(crate) fn within(bytes: usize) -> Arc<Self> {
         let size = u32::try_from(bytes >> 10).unwrap_or(u32::MAX);
@@ -256,7 +256,7 @@ mod tests {
 
     const LARGE: usize = 100 << 10;
 
-    async fn sent(answers: &Arc<Answers>, reader: &Arc<Reader>) -> HttpReply {
+    async fn sent(answers: &Arc<AnswerMemory>, reader: &Arc<Reader>) -> HttpReply {
         let reply = text(StatusCode::OK, "x".repeat(LARGE));
         assert_eq!(size(&reply), Some(LARGE));
         let room = answers.reserve(LARGE).await;
@@ -282,7 +282,7 @@ mod tests {
 
     #[tokio::test]
     async fn room_is_held_until_the_bytes_are_gone() {
-        let answers = Answers::within(2 * LARGE);
+        let answers = AnswerMemory::within(2 * LARGE);
         let reader = Arc::default();
         let first = sent(&answers, &reader).await;
         let Ok(bytes) = first.into_body().collect().await;
@@ -297,7 +297,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_slowest_is_closed_when_there_is_no_room() {
-        let answers = Answers::within(2 * LARGE);
+        let answers = AnswerMemory::within(2 * LARGE);
         let readers = [(); 2].map(|()| Arc::<Reader>::default());
         let mut held = Vec::new();
         for reader in &readers {
@@ -324,7 +324,7 @@ mod tests {
 
     #[tokio::test]
     async fn there_is_room_for_an_answer_however_large_it_is() {
-        let answers = Answers::within(2 * LARGE);
+        let answers = AnswerMemory::within(2 * LARGE);
         assert!(answers.room_for(None, 100 * LARGE).await.is_some());
     }
 }

@@ -72,7 +72,7 @@ pub(crate) struct Others {
     /// The computers that are believed if they name the caller of a call that they forward.
     pub(crate) members: MemberAddresses,
     /// Answers that followers have not passed on to their callers yet.
-    pub(crate) passing: Arc<Passing>,
+    pub(crate) passing: Arc<ForwardedAnswers>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
     /// The last position in the journal of all computers that the mirror includes.
@@ -105,7 +105,7 @@ impl Shown {
 /// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
 /// the answer, because some notifications must wait for that.
 #[derive(Default)]
-pub(crate) struct Passing(Mutex<Inner>);
+pub(crate) struct ForwardedAnswers(Mutex<Inner>);
 
 #[derive(Default)]
 struct Inner {
@@ -114,20 +114,20 @@ struct Inner {
     held: VecDeque<(Instant, u64, UntilWritten)>,
 }
 
-impl std::fmt::Debug for Passing {
+impl std::fmt::Debug for ForwardedAnswers {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Passing")
+        f.write_str("ForwardedAnswers")
     }
 }
 
-impl Passing {
+impl ForwardedAnswers {
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Keeps `held`, which must not be dropped before the caller has the answer. Returns the answer's number, for
-    /// [`Self::end`]. Drops values that are older than [`ANSWER_LIMIT`], because their followers may have died.
-    fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
+    /// [`Self::release`]. Drops values that are older than [`ANSWER_LIMIT`], because their followers may have died.
+    fn add(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
         let Inner { last, held: kept } = &mut *passing;
@@ -142,7 +142,7 @@ impl Passing {
     }
 
     /// Notes that the answer with this number has been written to its caller, or never will be.
-    fn end(&self, number: u64) {
+    fn release(&self, number: u64) {
         let mut passing = self.lock();
         let at = passing.held.iter().position(|(_, of, _)| *of == number);
         let held = at.and_then(|at| passing.held.remove(at));
@@ -289,7 +289,7 @@ impl Others {
                         Err(Unanswered::Elsewhere) => None,
                         Ok(mut reply) if asked_term.is_some() => {
                             if let Some(held) = reply.extensions_mut().remove() {
-                                let number = self.passing.keep(Instant::now(), held);
+                                let number = self.passing.add(Instant::now(), held);
                                 let number = HeaderValue::from(number);
                                 reply.headers_mut().insert(peer::ANSWER_HEADER, number);
                             }

@@ -125,7 +125,7 @@ impl Item {
     ) -> (Self, oneshot::Receiver<AnswerAndDelivery>) {
         let (answer, answered) = oneshot::channel();
         let item = Self {
-            concern: Concern::of(call.as_deref()),
+            concern: Concern::of_call(call.as_deref()),
             raw,
             call,
             caller: Some(Caller(answer)),
@@ -283,7 +283,9 @@ pub(crate) fn pack(
         };
         bytes += item.weight();
         if !item.is_answered_first() {
-            item.delivery = order.begin(now, item.concern.heard()).map(&delivery);
+            item.delivery = order
+                .begin_answer(now, item.concern.recipients())
+                .map(&delivery);
         }
         batch.items.push(item);
         if is_alone {

@@ -583,16 +583,18 @@ impl Dispatcher {
         };
         if items.is_empty() && self.queue.is_empty() {
             // No call is left: the callers of lost calls have gone.
-            self.ledger.release(Order::settled);
+            self.ledger.release(Order::calls_settled);
         }
         if items.is_empty() && !inspects {
             return;
         }
         self.stats.write_batches.count();
         self.ledger.with_order(|order, _| {
-            let tells = items.iter().flat_map(|item| item.concern().tells());
+            let tells = items
+                .iter()
+                .flat_map(|item| item.concern().notified_subjects());
             let answers = items.iter().filter_map(|item| item.delivery.as_ref());
-            order.sent(tells, answers.map(Delivery::number).collect());
+            order.calls_sent(tells, answers.map(Delivery::number).collect());
         });
         if let [item] = items.as_slice()
             && !item.is_answered_first()
@@ -660,7 +662,7 @@ impl Dispatcher {
         }
         // A master that ran a lost batch may have notified nodes, and the mirror does not know yet of what.
         if !matches!(self.exchange, Exchange::Lost) {
-            self.ledger.release(Order::settled);
+            self.ledger.release(Order::calls_settled);
         }
     }
 
@@ -678,7 +680,7 @@ impl Dispatcher {
                 Report::Lost
             }
         }));
-        self.ledger.release(Order::settled);
+        self.ledger.release(Order::calls_settled);
     }
 
     fn inspected(&mut self, incarnation: u64, version: u64, state: Master) {
@@ -915,7 +917,7 @@ impl Dispatcher {
         self.take_back(opaque);
         self.answer_queue(now);
         self.ledger.withdraw();
-        self.ledger.release(Order::settled);
+        self.ledger.release(Order::calls_settled);
     }
 
     /// Answers from the mirror the batch that the master is late with, then the queue. The batch continues. When the
@@ -948,7 +950,7 @@ impl Dispatcher {
         let mut tells = Vec::new();
         for mut item in items {
             item.delivery = None;
-            tells.extend_from_slice(item.concern().tells());
+            tells.extend_from_slice(item.concern().notified_subjects());
             if let Some(First { seq, .. }) = &item.first {
                 self.ledger.is_left_out(*seq, item.concern());
                 continue;
@@ -991,7 +993,7 @@ impl Dispatcher {
             _ => Vec::new(),
         };
         self.ledger.withdraw();
-        self.ledger.release(Order::settled);
+        self.ledger.release(Order::calls_settled);
         let opaque = std::mem::take(&mut self.opaque).answers;
         let items = in_flight.into_iter();
         let items = items.chain(opaque.into_iter().map(|(item, _)| item));

@@ -99,7 +99,7 @@ impl Drain {
                 () = wait::sleep_until(deadline.map(Into::into)) => Input::Wake,
             };
             // Checked on every wake-up: once seen, a change is not notified again.
-            let (state, unseen) = self.gate.look_changed();
+            let (state, unseen) = self.gate.observe_change();
             let view = View {
                 now: Instant::now(),
                 gate: state,

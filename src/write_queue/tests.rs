@@ -408,7 +408,7 @@ impl World {
         if self.is_down {
             return;
         }
-        let (gate, gate_changed) = self.gate.look_changed();
+        let (gate, gate_changed) = self.gate.observe_change();
         let view = View {
             now: self.instant(),
             gate,
@@ -497,7 +497,7 @@ impl World {
     fn end_answer(&self, number: u64) {
         let now = self.instant();
         self.ledger
-            .with_order(|order, _| order.written(now, number));
+            .with_order(|order, _| order.answer_written(now, number));
     }
 
     /// Passes on what the write queue has answered.
@@ -548,7 +548,7 @@ impl World {
         let now = self.instant();
         let idle = self.ledger.with_order(|order, _| {
             if order.next_repeat().is_some_and(|at| at <= now) && !Mutant::NoRepeats.lives() {
-                order.repeat(now);
+                order.queue_due_repeats(now);
             }
             order.take_idle_ports()
         });
@@ -559,7 +559,7 @@ impl World {
         for port in ready {
             let next = self
                 .ledger
-                .with_order(|order, mirror| order.next(now, &port, mirror));
+                .with_order(|order, mirror| order.next_notification(now, &port, mirror));
             match next {
                 NextNotification::Send { call, number } => {
                     // The network is sometimes slow.
@@ -664,7 +664,8 @@ impl World {
                 self.taken_from_master(port);
             }
             Event::Taken(port, number) => {
-                self.ledger.with_order(|order, _| order.taken(number));
+                self.ledger
+                    .with_order(|order, _| order.notification_taken(number));
                 self.ports.insert(port, false);
             }
             Event::Dies => self.dies(),

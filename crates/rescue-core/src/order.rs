@@ -9,7 +9,7 @@
 //! * While the master serves, a write that can notify a node does not go to the master while an answer to
 //!   that node about the same subject is under way ([`Order::must_wait`]).
 //! * A notification that rosrescue sends waits for such an answer, and for [`LEAD`] after it. While the master may be
-//!   notifying the node of the same subject, rosrescue's notification is put off ([`Order::next`]).
+//!   notifying the node of the same subject, rosrescue's notification is put off ([`Order::next_notification`]).
 //! * A node that is notified shortly after such an answer, or by two senders in a row, is told the state once more
 //!   ([`REPEAT_AFTER`]), because it may have read the two in the wrong order. If the master notifies the node of
 //!   something newer in the meantime, rosrescue does not tell the state again: on a busy computer, older notifications
@@ -31,7 +31,7 @@ use std::{
 pub use self::{
     by_subject::BySubject,
     outbox::NextNotification,
-    subject::{Concern, Heard, Subject, heard_by_read},
+    subject::{Concern, Recipient, Subject, recipients_of_read},
 };
 use self::{
     outbox::{Outbox, Payload},
@@ -73,8 +73,8 @@ pub struct Order {
     /// What the master will notify nodes of when it runs the writes that the mirror has answered first, by the number of
     /// the write.
     unacknowledged: BySubject<u64>,
-    /// The topics, parameters and names about which the master has recently notified nodes.
-    told: Told,
+    /// The topics, parameters and names about which the master may still be notifying nodes.
+    master_notifications: MasterNotifications,
     /// Whether the master was late and has neither got calls again nor gone since. Then it may still be sending
     /// notifications while the mirror answers.
     is_late: bool,
@@ -87,46 +87,46 @@ pub struct Order {
 /// The calls that the master has not answered yet.
 #[derive(Debug, Default)]
 struct InFlight {
-    tells: BySubject<()>,
+    subjects: BySubject<()>,
     answers: Vec<u64>,
 }
 
 /// Says that a call or a notification has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MustWait {
-    /// When to ask again at the latest. Before that, ask again when [`Order::written`], [`Order::settled`] or
-    /// [`Order::taken`] returns true.
+    /// When to ask again at the latest. Before that, ask again when [`Order::answer_written`], [`Order::calls_settled`]
+    /// or [`Order::notification_taken`] returns true.
     pub until: Option<Instant>,
 }
 
 impl Order {
-    /// Adds an answer that is on its way and tells nodes about `heard`. Returns its number, for [`Self::written`].
-    /// `None` if `heard` is empty, because nothing needs to wait for such an answer.
-    pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
+    /// Adds an answer that is on its way and informs `recipients`. Returns its number, for [`Self::answer_written`].
+    /// `None` if there are no recipients, because nothing needs to wait for such an answer.
+    pub fn begin_answer(&mut self, now: Instant, recipients: Vec<Recipient>) -> Option<u64> {
         self.under_way.forget(now);
-        if heard.is_empty() {
+        if recipients.is_empty() {
             return None;
         }
-        for Heard { port, subject } in &heard {
+        for Recipient { port, subject } in &recipients {
             // Notifications that already wait for this node are older than the answer, so the node gets the present
             // state instead.
-            self.outbox.renew(port, subject);
+            self.outbox.replace_with_state(port, subject);
         }
         Some(
             self.under_way
-                .add(under_way::DeliveryKind::Answer, heard, None),
+                .add(under_way::DeliveryKind::Answer, recipients, None),
         )
     }
 
     /// Notes that the answer can be sent to its caller. From now on, calls and notifications wait for it for at most
     /// [`ANSWER_LIMIT`].
-    pub fn ready(&mut self, now: Instant, answer: u64) {
+    pub fn answer_ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
 
     /// Notes that the answer has been written to its caller, or never will be. Returns whether a call or a notification
     /// waits for that.
-    pub fn written(&mut self, now: Instant, answer: u64) -> bool {
+    pub fn answer_written(&mut self, now: Instant, answer: u64) -> bool {
         self.under_way.written(now, answer);
         std::mem::take(&mut self.awaited)
     }
@@ -134,9 +134,9 @@ impl Order {
     /// Whether a call must wait before it goes to the master. It must wait if it may notify a node while an answer to
     /// that node about the same [`Subject`] is on its way.
     pub fn must_wait(&mut self, now: Instant, concern: &Concern) -> Option<MustWait> {
-        let wait = match concern.is_anything() {
+        let wait = match concern.may_change_anything() {
             true => self.under_way.must_wait(now),
-            false => concern.tells().iter().find_map(|subject| {
+            false => concern.notified_subjects().iter().find_map(|subject| {
                 let port = concern.port_if_name(subject);
                 self.under_way.must_wait_for(now, subject, port)
             }),
@@ -145,41 +145,48 @@ impl Order {
         wait
     }
 
-    /// Whether a read about `heard` must wait until the master has answered its calls. If the read did not wait, its
-    /// answer could be older than a notification that the master sends to the reader.
-    pub fn read_must_wait(&mut self, heard: &[Heard]) -> bool {
-        let mut heard = heard.iter();
-        let waits = heard.any(|heard| self.master_will_tell(&heard.subject));
+    /// Whether a read whose answer informs `recipients` must wait until the master has answered its calls. If the read did
+    /// not wait, its answer could be older than a notification that the master sends to the reader.
+    pub fn read_must_wait(&mut self, recipients: &[Recipient]) -> bool {
+        let mut recipients = recipients.iter();
+        let waits = recipients.any(|recipients| self.master_will_notify(&recipients.subject));
         self.awaited |= waits;
         waits
     }
 
     /// Whether the answer to a write may not be given before the master has run it: the answer is about something of
     /// which the master may be notifying the caller, who has subscribed to it before.
-    pub fn answer_must_wait(&self, mirror: &Master, heard: &[Heard]) -> bool {
-        let is_told = |heard: &Heard| match &heard.subject {
+    pub fn answer_must_wait(&self, mirror: &Master, recipients: &[Recipient]) -> bool {
+        let is_told = |recipients: &Recipient| match &recipients.subject {
             Subject::Topic(topic) => {
                 let subscribers = mirror.subscribers_of(topic);
-                subscribers.iter().any(|api| port_of(api) == heard.port)
+                subscribers
+                    .iter()
+                    .any(|api| port_of(api) == recipients.port)
             }
             Subject::Param(_) => true,
             Subject::Name(_) => false,
         };
-        let mut heard = heard.iter();
-        heard.any(|heard| is_told(heard) && self.master_will_tell(&heard.subject))
+        let mut recipients = recipients.iter();
+        recipients
+            .any(|recipients| is_told(recipients) && self.master_will_notify(&recipients.subject))
     }
 
     /// Whether the master may notify nodes of `subject` because of calls that it has not answered.
-    fn master_will_tell(&self, subject: &Subject) -> bool {
-        self.in_flight.tells.has(subject) || self.unacknowledged.has(subject)
+    fn master_will_notify(&self, subject: &Subject) -> bool {
+        self.in_flight.subjects.has(subject) || self.unacknowledged.has(subject)
     }
 
-    /// Notes that the mirror has answered a write first, and that the master may notify nodes about `tells` when it runs
+    /// Notes that the mirror has answered a write first, and that the master may notify nodes of `subjects` when it runs
     /// it. `write` is any number that identifies it.
-    pub fn answered_first<'a>(&mut self, write: u64, tells: impl IntoIterator<Item = &'a Subject>) {
-        let tells = tells.into_iter();
-        let tells = tells.filter(|it| !matches!(it, Subject::Name(_)));
-        tells.for_each(|subject| self.unacknowledged.add(subject, write));
+    pub fn answered_first<'a>(
+        &mut self,
+        write: u64,
+        subjects: impl IntoIterator<Item = &'a Subject>,
+    ) {
+        let subjects = subjects.into_iter();
+        let subjects = subjects.filter(|it| !matches!(it, Subject::Name(_)));
+        subjects.for_each(|subject| self.unacknowledged.add(subject, write));
     }
 
     /// Notes that the master has run the write of [`Self::answered_first`], or never will. Returns whether a call or a
@@ -187,37 +194,41 @@ impl Order {
     pub fn acknowledged<'a>(
         &mut self,
         write: u64,
-        tells: impl IntoIterator<Item = &'a Subject>,
+        subjects: impl IntoIterator<Item = &'a Subject>,
     ) -> bool {
-        let tells = tells.into_iter();
-        tells.for_each(|subject| self.unacknowledged.remove(subject, write));
+        let subjects = subjects.into_iter();
+        subjects.for_each(|subject| self.unacknowledged.remove(subject, write));
         std::mem::take(&mut self.awaited)
     }
 
-    /// Notes that the master gets calls because of which it may notify nodes about `tells`. `answers` are the numbers
-    /// that [`Self::begin`] gave the answers to these calls.
-    pub fn sent<'a>(&mut self, tells: impl IntoIterator<Item = &'a Subject>, answers: Vec<u64>) {
+    /// Notes that the master gets calls because of which it may notify nodes of `subjects`. `answers` are the numbers
+    /// that [`Self::begin_answer`] gave the answers to these calls.
+    pub fn calls_sent<'a>(
+        &mut self,
+        subjects: impl IntoIterator<Item = &'a Subject>,
+        answers: Vec<u64>,
+    ) {
         // A call never displaces its own node, so the node's other calls need not wait for its own name.
-        let told = tells
+        let notified = subjects
             .into_iter()
             .filter(|it| !matches!(it, Subject::Name(_)));
-        for subject in told {
-            self.in_flight.tells.add(subject, ());
+        for subject in notified {
+            self.in_flight.subjects.add(subject, ());
         }
         self.in_flight.answers = answers;
     }
 
     /// Notes that the master has no unanswered calls left, or that the mirror has answered these calls. Returns whether
     /// a call or a notification waits for that.
-    pub fn settled(&mut self) -> bool {
+    pub fn calls_settled(&mut self) -> bool {
         let in_flight = std::mem::take(&mut self.in_flight);
-        !in_flight.tells.is_empty() && std::mem::take(&mut self.awaited)
+        !in_flight.subjects.is_empty() && std::mem::take(&mut self.awaited)
     }
 
     /// Notes that the master now notifies nodes of a change of `subject`. `nodes` is the number of these nodes.
-    pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
-        let until = self.told.add(now, subject, nodes);
-        self.outbox.renew_all(subject);
+    pub fn master_notifies(&mut self, now: Instant, subject: &Subject, nodes: usize) {
+        let until = self.master_notifications.add(now, subject, nodes);
+        self.outbox.replace_all_with_state(subject);
         let about = self.under_way.about(now, subject);
         let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
         self.repeats.drop_all_but(subject, &ports, until);
@@ -233,30 +244,30 @@ impl Order {
     /// delays the master's notifications as much as its answers.
     pub fn master_answered(&mut self, took: Duration, calls: usize) {
         let per_call = took / u32::try_from(calls.max(1)).unwrap_or(u32::MAX);
-        self.told.pace = per_call.max(self.told.pace * 7 / 8);
+        self.master_notifications.pace = per_call.max(self.master_notifications.pace * 7 / 8);
     }
 
     /// Notes that the master has not answered for a while, so the mirror answers. Until [`Self::late_answered`], the
     /// master's notifications make no progress either.
     pub fn master_is_late(&mut self, now: Instant) {
         self.is_late = true;
-        self.told.stop(now);
+        self.master_notifications.pause(now);
     }
 
     /// Notes that the late master has answered its calls.
     pub fn late_answered(&mut self, now: Instant) {
-        self.told.go_on(now);
+        self.master_notifications.resume(now);
     }
 
     /// Notes that calls pass to the master again, or that the late master may be gone.
     pub fn lateness_is_over(&mut self) {
-        (self.is_late, self.told.stopped) = (false, None);
+        (self.is_late, self.master_notifications.paused_since) = (false, None);
     }
 
     /// Whether the master, and not rosrescue, may notify nodes of what the mirror answers now: it is late, or is still
     /// being examined since it was, or it has not answered its calls. It may die before it sends these notifications.
     pub fn is_left_to_master(&self) -> bool {
-        self.is_late || !self.in_flight.tells.is_empty() || !self.unacknowledged.is_empty()
+        self.is_late || !self.in_flight.subjects.is_empty() || !self.unacknowledged.is_empty()
     }
 
     /// Whether the master is late, or is still being examined since it was.
@@ -268,7 +279,10 @@ impl Order {
     /// Notes that the master has been away for a while, so it is taken for gone. Returns when to ask again if it was
     /// only late and may still be sending notifications.
     pub fn master_is_away(&mut self, now: Instant) -> Option<Instant> {
-        let until = self.told.last(now).filter(|_| self.is_late);
+        let until = self
+            .master_notifications
+            .all_sent_by(now)
+            .filter(|_| self.is_late);
         if until.is_none() {
             self.master_is_gone();
         }
@@ -277,7 +291,7 @@ impl Order {
 
     /// Notes that the master is gone and sends no more notifications.
     pub fn master_is_gone(&mut self) {
-        (self.told, self.is_late) = Default::default();
+        (self.master_notifications, self.is_late) = Default::default();
     }
 
     /// Queues `call`, which a master would send now, for the node at `port`. If a master that is gone may already have
@@ -285,25 +299,28 @@ impl Order {
     /// present state instead. If the master is only late and may still have notifications about `subject` to send, they
     /// come first: either the master then also sends the newer one, or the node is told the state.
     pub fn notify(&mut self, now: Instant, port: &str, subject: Subject, call: Arc<Call>) {
-        let told = self.told.until(now, &subject).filter(|_| self.is_late);
-        if let Some(until) = told {
+        let sending_until = self
+            .master_notifications
+            .sent_by(now, &subject)
+            .filter(|_| self.is_late);
+        if let Some(until) = sending_until {
             self.repeats.add(until, port.to_owned(), subject);
             return;
         }
-        let is_news = !self.master_will_tell(&subject);
+        let is_news = !self.master_will_notify(&subject);
         let content = is_news.then_some(Payload::Call(call));
         self.outbox
             .add(port, subject, content.unwrap_or(Payload::State));
     }
 
     /// Queues a notification for the node at `port` with the state of `subject` at the time of sending.
-    pub fn tell_state(&mut self, port: &str, subject: Subject) {
+    pub fn notify_of_state(&mut self, port: &str, subject: Subject) {
         self.outbox.add(port, subject, Payload::State);
     }
 
     /// Queues, at the time `at`, a notification for the node at `port` with the state of `subject` at the time of
     /// sending.
-    pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
+    pub fn notify_of_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
         self.repeats.last.insert((subject.clone(), port.to_owned()));
         self.repeats.add(at, port.to_owned(), subject);
     }
@@ -314,7 +331,12 @@ impl Order {
     }
 
     /// What to do next about the notifications for the node at `port`.
-    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> NextNotification {
+    pub fn next_notification(
+        &mut self,
+        now: Instant,
+        port: &str,
+        mirror: &Master,
+    ) -> NextNotification {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
             let answer = self.under_way.answer_to(now, port, subject);
@@ -332,15 +354,15 @@ impl Order {
                 None => false,
             };
             let subject = subject.clone();
-            let told = self.told.until(now, &subject);
-            let is_being_told = self.master_will_tell(&subject);
+            let sending_until = self.master_notifications.sent_by(now, &subject);
+            let may_be_notified_now = self.master_will_notify(&subject);
             let Some(notification) = self.outbox.pop(port) else {
                 continue;
             };
             // The master may be notifying the node of the same subject. The slower of the two senders may send
             // something older, so the node is told the state again after both.
-            if is_being_told || told.is_some() && notification.is_state() {
-                let again = told.unwrap_or(now + REPEAT_AFTER);
+            if may_be_notified_now || sending_until.is_some() && notification.is_state() {
+                let again = sending_until.unwrap_or(now + REPEAT_AFTER);
                 self.repeats.add(again, port.to_owned(), subject);
                 continue;
             }
@@ -348,17 +370,17 @@ impl Order {
             let Some(call) = self.outbox.call(port, notification, mirror) else {
                 continue;
             };
-            if written && !is_repeat || told.is_some() {
+            if written && !is_repeat || sending_until.is_some() {
                 let again = now + REPEAT_AFTER;
                 self.repeats.add(again, port.to_owned(), subject.clone());
             }
-            let heard = Heard {
+            let recipient = Recipient {
                 port: port.to_owned(),
                 subject,
             };
             let limit = Some(now + NOTIFICATION_LIMIT);
             let kind = under_way::DeliveryKind::Notification;
-            let number = self.under_way.add(kind, vec![heard], limit);
+            let number = self.under_way.add(kind, vec![recipient], limit);
             return NextNotification::Send { call, number };
         }
         self.outbox.remove(port);
@@ -368,7 +390,7 @@ impl Order {
     /// Notes that the node has taken the notification `number`, or that the notification could not be delivered. A node
     /// reads later notifications after one that it has taken. Returns whether a call or a notification waits for this
     /// one.
-    pub fn taken(&mut self, number: u64) -> bool {
+    pub fn notification_taken(&mut self, number: u64) -> bool {
         self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
     }
@@ -381,12 +403,12 @@ impl Order {
     /// Drops all waiting notifications. From now on another computer notifies nodes.
     pub fn forget_notifications(&mut self) {
         self.outbox.clear();
-        (self.told, self.repeats) = Default::default();
+        (self.master_notifications, self.repeats) = Default::default();
     }
 
     /// Queues the notifications whose time has come: those that tell a state once more (see [`REPEAT_AFTER`]), and
-    /// those of [`Self::tell_state_at`].
-    pub fn repeat(&mut self, now: Instant) {
+    /// those of [`Self::notify_of_state_at`].
+    pub fn queue_due_repeats(&mut self, now: Instant) {
         while let Some((_, repeat)) = self.repeats.at.take_due(now) {
             self.repeats.last.remove(&repeat);
             let (subject, port) = repeat;
@@ -399,13 +421,13 @@ impl Order {
         std::mem::take(&mut self.repeats.is_new)
     }
 
-    /// When to call [`Self::repeat`] next.
+    /// When to call [`Self::queue_due_repeats`] next.
     pub fn next_repeat(&self) -> Option<Instant> {
         self.repeats.at.next()
     }
 
     /// Whether an answer to the node at `port` about `subject` is on its way, and until when to wait for it.
-    pub fn is_under_way(
+    pub fn answer_under_way(
         &mut self,
         now: Instant,
         port: &str,
@@ -423,77 +445,77 @@ impl Order {
 
 /// The topics, parameters and names about which the master may still be notifying nodes.
 #[derive(Debug, Default)]
-struct Told {
+struct MasterNotifications {
     /// For each [`Subject`], when the master will certainly have sent all notifications about it.
-    until: BySubject<Instant>,
-    ends: Schedule<Subject>,
+    sent_by: BySubject<Instant>,
+    schedule: Schedule<Subject>,
     /// When the master is expected to have sent all notifications that it has begun.
-    busy: Option<Instant>,
+    busy_until: Option<Instant>,
     /// How long the master recently took for a call.
     pace: Duration,
     /// Since when the master does not answer, so its notifications make no progress.
-    stopped: Option<Instant>,
+    paused_since: Option<Instant>,
 }
 
-impl Told {
-    fn stop(&mut self, now: Instant) {
-        self.forget(now);
-        self.stopped.get_or_insert(now);
+impl MasterNotifications {
+    fn pause(&mut self, now: Instant) {
+        self.drop_sent(now);
+        self.paused_since.get_or_insert(now);
     }
 
-    /// Gives the master the time that it has lost since [`Self::stop`].
-    fn go_on(&mut self, now: Instant) {
-        self.forget(now);
-        let Some(since) = self.stopped.take() else {
+    /// Gives the master the time that it has lost since [`Self::pause`].
+    fn resume(&mut self, now: Instant) {
+        self.drop_sent(now);
+        let Some(since) = self.paused_since.take() else {
             return;
         };
         let lost = now.duration_since(since).min(BACKLOG_MAX);
-        self.busy = self.busy.map(|busy| busy + lost);
-        for (subject, until) in std::mem::take(&mut self.ends).at {
-            self.until.remove(&subject, until);
-            self.until.add(&subject, until + lost);
-            self.ends.set(subject, until + lost);
+        self.busy_until = self.busy_until.map(|busy| busy + lost);
+        for (subject, until) in std::mem::take(&mut self.schedule).at {
+            self.sent_by.remove(&subject, until);
+            self.sent_by.add(&subject, until + lost);
+            self.schedule.set(subject, until + lost);
         }
     }
 
     /// Notes that the master has begun to notify `nodes` nodes of `subject`. Returns when the master will certainly
     /// have sent all these notifications.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
-        self.forget(now);
+        self.drop_sent(now);
         let takes = MASTER_TAKES.max(self.pace) * u32::try_from(nodes).unwrap_or(u32::MAX);
-        let busy = self.busy.map_or(now, |busy| busy.max(now));
+        let busy = self.busy_until.map_or(now, |busy| busy.max(now));
         let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MAX);
-        self.busy = Some(busy);
+        self.busy_until = Some(busy);
         let until = busy + REPEAT_AFTER;
-        if let Some(before) = self.ends.set(subject.clone(), until) {
-            self.until.remove(subject, before);
+        if let Some(before) = self.schedule.set(subject.clone(), until) {
+            self.sent_by.remove(subject, before);
         }
-        self.until.add(subject, until);
+        self.sent_by.add(subject, until);
         until
     }
 
-    fn until(&mut self, now: Instant, subject: &Subject) -> Option<Instant> {
-        self.forget(now);
-        let until = self.until.about(subject).max()?;
+    fn sent_by(&mut self, now: Instant, subject: &Subject) -> Option<Instant> {
+        self.drop_sent(now);
+        let until = self.sent_by.about(subject).max()?;
         // How long the master stays stopped is not known.
-        let again = self.stopped.map(|_| now + REPEAT_AFTER);
+        let again = self.paused_since.map(|_| now + REPEAT_AFTER);
         Some(again.map_or(until, |again| again.max(until)))
     }
 
     /// When the master will certainly have sent all notifications.
-    fn last(&mut self, now: Instant) -> Option<Instant> {
-        self.forget(now);
-        self.ends.queue.last().map(|(until, _)| *until)
+    fn all_sent_by(&mut self, now: Instant) -> Option<Instant> {
+        self.drop_sent(now);
+        self.schedule.queue.last().map(|(until, _)| *until)
     }
 
-    fn forget(&mut self, now: Instant) {
+    fn drop_sent(&mut self, now: Instant) {
         // While the master is stopped, its time stands still, but not for ever.
-        let now = self.stopped.map_or(now, |since| {
+        let now = self.paused_since.map_or(now, |since| {
             let earliest = now.checked_sub(BACKLOG_MAX);
             earliest.map_or(since, |earliest| earliest.max(since))
         });
-        while let Some((until, subject)) = self.ends.take_due(now) {
-            self.until.remove(&subject, until);
+        while let Some((until, subject)) = self.schedule.take_due(now) {
+            self.sent_by.remove(&subject, until);
         }
     }
 }

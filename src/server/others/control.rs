@@ -83,7 +83,7 @@ impl Others {
             }
             Control::HandOver(to) => self.hand_over(call, to).await,
             Control::AnswerPassedOn(number) => {
-                self.passing.end(number);
+                self.passing.release(number);
                 Ok(passed_on())
             }
         }

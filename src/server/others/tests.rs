@@ -148,7 +148,7 @@ fn made_by(call: &Request) -> Reply {
 }
 
 /// The answer that a leader gives to a call, if it gives one.
-type Says = Option<(StatusCode, Vec<u8>)>;
+type LeaderAnswer = Option<(StatusCode, Vec<u8>)>;
 
 /// A leader that says 421 to each call, or nothing at all.
 async fn leader(says: Option<StatusCode>) -> Standing {
@@ -159,7 +159,7 @@ async fn leader(says: Option<StatusCode>) -> Standing {
 
 /// A leader that gives one of these answers after the other, and the last one to all later calls. Also returns how many
 /// calls it has got.
-async fn leader_with(answers: Vec<Says>) -> (Standing, watch::Receiver<usize>) {
+async fn leader_with(answers: Vec<LeaderAnswer>) -> (Standing, watch::Receiver<usize>) {
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
     let (count, calls) = watch::channel(0);
@@ -350,9 +350,9 @@ async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
 }
 
 /// Sends a report when it is dropped.
-struct Told(mpsc::Sender<u64>, u64);
+struct SendOnDrop(mpsc::Sender<u64>, u64);
 
-impl Drop for Told {
+impl Drop for SendOnDrop {
     fn drop(&mut self) {
         let _ = self.0.try_send(self.1);
     }
@@ -361,14 +361,14 @@ impl Drop for Told {
 #[test]
 fn an_answer_is_held_until_its_follower_has_passed_it_on_or_says_nothing() {
     let (tell, mut told) = mpsc::channel(8);
-    let passing = Passing::default();
+    let passing = ForwardedAnswers::default();
     let now = Instant::now();
-    let keep = |at, number| passing.keep(at, UntilWritten::new(Told(tell.clone(), number)));
+    let keep = |at, number| passing.add(at, UntilWritten::new(SendOnDrop(tell.clone(), number)));
     let first = keep(now, 1);
     let second = keep(now, 2);
     assert!(told.try_recv().is_err());
-    passing.end(second);
-    passing.end(second);
+    passing.release(second);
+    passing.release(second);
     assert_eq!(told.try_recv(), Ok(2));
     assert_ne!(first, second);
     keep(now + 2 * ANSWER_LIMIT, 3);

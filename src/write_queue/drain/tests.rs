@@ -33,10 +33,11 @@ const PUBLISHER: &str = "http://b:1/";
 
 /// The publishers in the notification that is sent now, if one is.
 fn told(ledger: &Ledger) -> Option<Value> {
-    match ledger.with_order(|order, mirror| order.next(Instant::now(), port_of(SUBSCRIBER), mirror))
-    {
+    match ledger.with_order(|order, mirror| {
+        order.next_notification(Instant::now(), port_of(SUBSCRIBER), mirror)
+    }) {
         Notification::Send { call, number } => {
-            ledger.release(|order| order.taken(number));
+            ledger.release(|order| order.notification_taken(number));
             call.params.get(2).cloned()
         }
         _ => None,
@@ -119,11 +120,11 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
 
     let ledger = &served.ledger;
     let topic = Subject::Topic("/t".to_owned());
-    ledger.with_order(|order, _| order.tell_state(port_of(SUBSCRIBER), topic));
+    ledger.with_order(|order, _| order.notify_of_state(port_of(SUBSCRIBER), topic));
     assert_eq!(told(ledger), None);
     served.gate.set(State::StandingIn);
     answered.await.unwrap();
-    ledger.with_order(|order, _| order.repeat(Instant::now() + REPEAT_AFTER));
+    ledger.with_order(|order, _| order.queue_due_repeats(Instant::now() + REPEAT_AFTER));
     assert_eq!(told(ledger), Some(Value::Array(Vec::new())));
 }
 

@@ -17,7 +17,7 @@ const QUEUE_MAX: usize = 256;
 /// What to do next about the notifications for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NextNotification {
-    /// Send `call`, then pass `number` to [`taken`](super::Order::taken).
+    /// Send `call`, then pass `number` to [`notification_taken`](super::Order::notification_taken).
     Send { call: Arc<Call>, number: u64 },
     /// Ask again when the answer that is on its way to the node has been written, or at `until` at the latest.
     Wait { until: Option<Instant> },
@@ -73,13 +73,13 @@ impl Outbox {
             return;
         };
         let subject = &notification.subject;
-        let is_told = |other: &Notification| other.is_state() && other.subject == *subject;
-        if notification.is_state() && queue.iter().any(is_told) {
+        let is_queued = |other: &Notification| other.is_state() && other.subject == *subject;
+        if notification.is_state() && queue.iter().any(is_queued) {
             return;
         }
         queue.push_back(notification);
         if queue.len() > QUEUE_MAX {
-            renew(queue, |_| true);
+            replace_with_state(queue, |_| true);
         }
     }
 
@@ -120,44 +120,44 @@ impl Outbox {
         // Waiting notifications about the same subject are older than the present state, so they are dropped. Those
         // about keys above or below a parameter get the present state.
         let queue = self.ports.get_mut(port)?;
-        renew(queue, |other| other.concerns(&subject));
+        replace_with_state(queue, |other| other.concerns(&subject));
         queue.retain(|other| other.subject != subject);
-        state(mirror, port, &subject)
+        state_notification(mirror, port, &subject)
     }
 
     /// Replaces the notifications to `port` about `subject` by one with the state at the time of sending.
-    pub(super) fn renew(&mut self, port: &str, subject: &Subject) {
+    pub(super) fn replace_with_state(&mut self, port: &str, subject: &Subject) {
         if let Some(queue) = self.ports.get_mut(port) {
-            renew(queue, |other| other.concerns(subject));
+            replace_with_state(queue, |other| other.concerns(subject));
         }
     }
 
     /// Replaces, for each port, the notifications about `subject` by one with the state at the time of sending.
-    pub(super) fn renew_all(&mut self, subject: &Subject) {
+    pub(super) fn replace_all_with_state(&mut self, subject: &Subject) {
         for queue in self.ports.values_mut() {
-            renew(queue, |other| other.concerns(subject));
+            replace_with_state(queue, |other| other.concerns(subject));
         }
     }
 }
 
 /// Replaces the notifications about each subject that `is_it` accepts by a single one with the state at the time of
 /// sending.
-fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
+fn replace_with_state(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     let is_old = |it: &Notification| !it.is_state() && is_it(&it.subject);
     if !queue.iter().any(is_old) {
         return;
     }
-    let mut told = HashSet::new();
+    let mut seen = HashSet::new();
     queue.retain_mut(|notification| {
         if !notification.is_state() && is_it(&notification.subject) {
             notification.content = Payload::State;
         }
-        !notification.is_state() || told.insert(notification.subject.clone())
+        !notification.is_state() || seen.insert(notification.subject.clone())
     });
 }
 
-/// The call that tells the node at `port` the state of `subject`. `None` if the node does not subscribe to `subject`.
-fn state(mirror: &Master, port: &str, subject: &Subject) -> Option<Arc<Call>> {
+/// The call that notifies the node at `port` of the state of `subject`. `None` if the node does not subscribe to it.
+fn state_notification(mirror: &Master, port: &str, subject: &Subject) -> Option<Arc<Call>> {
     let at = |api: &str| port_of(api) == port;
     match subject {
         Subject::Topic(topic) => mirror

@@ -27,34 +27,34 @@ impl Subject {
     }
 }
 
-/// A [`Subject`] about which the node at a port is told, by an answer or a notification.
+/// A node that an answer or a notification informs about a [`Subject`].
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub struct Heard {
+pub struct Recipient {
     /// The node's port; see [`port_of`].
     pub port: String,
     pub subject: Subject,
 }
 
-/// The [`Subject`]s of a write: those about which nodes may be notified, and those about which its answer tells the
+/// The [`Subject`]s of a write: those about which nodes may be notified, and those about which its answer informs the
 /// caller.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
     /// The topics, parameters and names about which the master may notify nodes because of the write.
-    tells: Vec<Subject>,
-    /// The topics, parameters and names about which the answer tells the caller.
-    hears: Vec<Heard>,
+    notified: Vec<Subject>,
+    /// The caller, once for each topic, parameter or name about which the answer informs it.
+    recipients: Vec<Recipient>,
     /// The port of the node that registers; see [`port_of`].
     port: Option<String>,
-    /// Whether the call may change anything, because it cannot be decoded.
-    anything: bool,
+    /// Whether the call cannot be decoded, so that it may change anything.
+    may_change_anything: bool,
 }
 
 impl Concern {
     /// What a call is about. `None` stands for a call that could not be decoded.
-    pub fn of(call: Option<&Request>) -> Self {
+    pub fn of_call(call: Option<&Request>) -> Self {
         let Some(call) = call else {
             return Self {
-                anything: true,
+                may_change_anything: true,
                 ..Self::default()
             };
         };
@@ -66,7 +66,7 @@ impl Concern {
     fn add(&mut self, write: &Write<'_>) {
         let topic = |topic: &str| Some(Subject::Topic(topic.to_owned()));
         let param = |key: &str| Some(Subject::Param(names::param_key(key)));
-        let (told, heard) = match &write.effect {
+        let (notified, answered) = match &write.effect {
             Effect::RegisterPublisher { topic: name, .. }
             | Effect::UnregisterPublisher { topic: name, .. } => (topic(name), None),
             Effect::SetParam { key, .. } | Effect::DeleteParam { key } => (param(key), None),
@@ -77,16 +77,16 @@ impl Concern {
             | Effect::UnregisterSubscriber { .. }
             | Effect::UnsubscribeParam { .. } => (None, None),
         };
-        self.tells.extend(told);
+        self.notified.extend(notified);
         let Some((node, api)) = write.registrant() else {
             return;
         };
         let port = port_of(api);
         // A node of this name at another address will be shut down.
         let name = Subject::Name(node.to_owned());
-        self.tells.push(name.clone());
-        let subjects = [Some(name), heard].into_iter().flatten();
-        self.hears.extend(subjects.map(|subject| Heard {
+        self.notified.push(name.clone());
+        let subjects = [Some(name), answered].into_iter().flatten();
+        self.recipients.extend(subjects.map(|subject| Recipient {
             port: port.to_owned(),
             subject,
         }));
@@ -94,12 +94,12 @@ impl Concern {
     }
 
     /// The topics, parameters and names about which the master may notify nodes because of the write.
-    pub fn tells(&self) -> &[Subject] {
-        &self.tells
+    pub fn notified_subjects(&self) -> &[Subject] {
+        &self.notified
     }
 
-    pub fn is_anything(&self) -> bool {
-        self.anything
+    pub fn may_change_anything(&self) -> bool {
+        self.may_change_anything
     }
 
     /// The caller's port if `subject` is a node name. The call need not wait for answers to that port, because it never
@@ -111,22 +111,22 @@ impl Concern {
         }
     }
 
-    /// The topics, parameters and names about which the answer tells the caller.
-    pub fn heard(&self) -> Vec<Heard> {
-        self.hears.clone()
+    /// The caller, once for each topic, parameter or name about which the answer informs it.
+    pub fn recipients(&self) -> Vec<Recipient> {
+        self.recipients.clone()
     }
 
     /// All [`Subject`]s of the write.
     pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
-        self.tells
+        self.notified
             .iter()
-            .chain(self.hears.iter().map(|heard| &heard.subject))
+            .chain(self.recipients.iter().map(|recipient| &recipient.subject))
     }
 }
 
-/// The parameters about which the answer to a read tells the caller, if the caller subscribes to them. roscpp uses the
+/// The caller of a read, once for each parameter to which it subscribes and which the answer contains. roscpp uses the
 /// value that `getParam` returns until it is notified of a newer one.
-pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
+pub fn recipients_of_read(read: &Request, mirror: &Master) -> Vec<Recipient> {
     let of = |call: &Request| {
         let (caller, key) = (call.caller()?, call.text(1)?);
         if *call.method() != Method::GetParam || key.is_empty() || !mirror.subscribes_params(caller)
@@ -138,7 +138,7 @@ pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
         if !subscribed.any(|other| other.starts_with(&key) || key.starts_with(other)) {
             return None;
         }
-        Some(Heard {
+        Some(Recipient {
             port: port_of(mirror.api_of(caller)?).to_owned(),
             subject: Subject::Param(key),
         })

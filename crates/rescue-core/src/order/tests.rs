@@ -32,12 +32,14 @@ fn param(key: &str) -> Subject {
 }
 
 fn begin(order: &mut Order, now: Instant, call: &Request) -> u64 {
-    let heard = Concern::of(Some(call)).heard();
-    order.begin(now, heard).unwrap()
+    let recipients = Concern::of_call(Some(call)).recipients();
+    order.begin_answer(now, recipients).unwrap()
 }
 
 fn holds(order: &mut Order, now: Instant, call: &Request) -> bool {
-    order.must_wait(now, &Concern::of(Some(call))).is_some()
+    order
+        .must_wait(now, &Concern::of_call(Some(call)))
+        .is_some()
 }
 
 /// The list of publishers in the `publisherUpdate` to send, and the number of the notification.
@@ -70,10 +72,10 @@ fn a_write_that_notifies_a_node_waits_for_an_answer_to_that_node_about_the_same_
     ] {
         assert_eq!(holds(&mut order, now, &write), waits, "{write:?}");
     }
-    assert!(order.must_wait(now, &Concern::of(None)).is_some());
-    assert!(order.written(now, subscribed));
+    assert!(order.must_wait(now, &Concern::of_call(None)).is_some());
+    assert!(order.answer_written(now, subscribed));
     assert!(!holds(&mut order, now, &publish("/b", "/t")));
-    assert!(order.must_wait(now, &Concern::of(None)).is_none());
+    assert!(order.must_wait(now, &Concern::of_call(None)).is_none());
 
     let watch = call("subscribeParam", &["/a", "http://a:1/", "/k/x"]);
     begin(&mut order, now, &watch);
@@ -89,25 +91,31 @@ fn the_answer_to_a_read_of_a_subscribed_parameter_counts_as_well() {
     let (mut order, mut mirror) = (Order::default(), Master::default());
     let now = Instant::now();
     let read = call("getParam", &["/a", "/k/x"]);
-    assert_eq!(heard_by_read(&read, &mirror), []);
+    assert_eq!(recipients_of_read(&read, &mirror), []);
     mirror.apply(&call("subscribeParam", &["/a", "http://a:1/", "/k"]));
-    assert_eq!(heard_by_read(&call("getParam", &["/a", "/l"]), &mirror), []);
-    assert_eq!(heard_by_read(&call("hasParam", &["/a", "/k"]), &mirror), []);
-    let heard = heard_by_read(&Request::multicall([read]), &mirror);
-    let expected = Heard {
+    assert_eq!(
+        recipients_of_read(&call("getParam", &["/a", "/l"]), &mirror),
+        []
+    );
+    assert_eq!(
+        recipients_of_read(&call("hasParam", &["/a", "/k"]), &mirror),
+        []
+    );
+    let recipients = recipients_of_read(&Request::multicall([read]), &mirror);
+    let expected = Recipient {
         port: A.to_owned(),
         subject: param("/k/x/"),
     };
-    assert_eq!(heard, [expected]);
+    assert_eq!(recipients, [expected]);
     assert!(!holds(
         &mut order,
         now,
         &call("setParam", &["/b", "/k/x", "1"])
     ));
-    order.sent(&[param("/k/")], Vec::new());
-    assert!(order.read_must_wait(&heard));
-    assert!(order.settled());
-    assert!(!order.read_must_wait(&heard));
+    order.calls_sent(&[param("/k/")], Vec::new());
+    assert!(order.read_must_wait(&recipients));
+    assert!(order.calls_settled());
+    assert!(!order.read_must_wait(&recipients));
 }
 
 #[test]
@@ -120,17 +128,17 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     order.notify(start, A, topic("/t"), update.clone());
     assert_eq!(order.take_idle_ports(), [A]);
     assert_eq!(
-        order.next(start, A, &mirror),
+        order.next_notification(start, A, &mirror),
         NextNotification::Wait { until: None }
     );
-    assert!(order.written(start, number));
+    assert!(order.answer_written(start, number));
     let until = Some(start + LEAD);
     assert_eq!(
-        order.next(start, A, &mirror),
+        order.next_notification(start, A, &mirror),
         NextNotification::Wait { until }
     );
     let now = start + LEAD;
-    let (list, number) = sent(order.next(now, A, &mirror));
+    let (list, number) = sent(order.next_notification(now, A, &mirror));
     assert_eq!(list, update.params[2]);
     // While the answer is on its way, writes that would notify the node of something newer wait, but not forever.
     assert!(holds(&mut order, now, &publish("/c", "/t")));
@@ -139,17 +147,23 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
         now + NOTIFICATION_LIMIT,
         &publish("/c", "/t")
     ));
-    order.taken(number);
-    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    order.notification_taken(number);
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
 
     let again = order.next_repeat().unwrap();
     assert_eq!(again, now + REPEAT_AFTER);
-    order.repeat(again);
+    order.queue_due_repeats(again);
     assert_eq!(order.take_idle_ports(), [A]);
-    let (_, number) = sent(order.next(again, A, &mirror));
-    order.taken(number);
+    let (_, number) = sent(order.next_notification(again, A, &mirror));
+    order.notification_taken(number);
     assert_eq!(
-        (order.next(again, A, &mirror), order.next_repeat()),
+        (
+            order.next_notification(again, A, &mirror),
+            order.next_repeat()
+        ),
         (NextNotification::Idle, None)
     );
 }
@@ -166,27 +180,30 @@ fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
         order.notify(now, A, topic("/t"), update);
     }
     // The notifications are sent one by one, as a master would send them.
-    let (first, number) = sent(order.next(now, A, &mirror));
+    let (first, number) = sent(order.next_notification(now, A, &mirror));
     assert_eq!(first, lists[0]);
-    order.taken(number);
+    order.notification_taken(number);
     // Another part of rosrescue asks for the present state, so older notifications are left out.
-    order.tell_state(A, topic("/t"));
-    order.begin(
+    order.notify_of_state(A, topic("/t"));
+    order.begin_answer(
         now,
-        vec![Heard {
+        vec![Recipient {
             port: A.to_owned(),
             subject: topic("/t"),
         }],
     );
     assert_eq!(
-        order.next(now, A, &mirror),
+        order.next_notification(now, A, &mirror),
         NextNotification::Wait { until: None }
     );
-    order.written(now, 2);
-    let (last, number) = sent(order.next(now + LEAD, A, &mirror));
+    order.answer_written(now, 2);
+    let (last, number) = sent(order.next_notification(now + LEAD, A, &mirror));
     assert_eq!(last, lists[2]);
-    order.taken(number);
-    assert_eq!(order.next(now + LEAD, A, &mirror), NextNotification::Idle);
+    order.notification_taken(number);
+    assert_eq!(
+        order.next_notification(now + LEAD, A, &mirror),
+        NextNotification::Idle
+    );
 }
 
 #[test]
@@ -203,9 +220,9 @@ fn notifications_that_pile_up_are_reduced_to_one_per_subject() {
         order.notify(now, A, param("/k/"), update);
     }
     let mut values = Vec::new();
-    while let NextNotification::Send { call, number } = order.next(now, A, &mirror) {
+    while let NextNotification::Send { call, number } = order.next_notification(now, A, &mirror) {
         values.push(call.params[2].as_int().unwrap());
-        order.taken(number);
+        order.notification_taken(number);
     }
     assert!(values.is_sorted() && values.len() < 300, "{values:?}");
     assert_eq!(values.last(), Some(&999));
@@ -217,27 +234,36 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     mirror.apply(&subscribe("/a", "/t"));
     let old = Arc::new(mirror.publisher_update("/t"));
     order.notify(now, A, topic("/t"), old);
-    order.sent(&[topic("/t")], Vec::new());
-    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    order.calls_sent(&[topic("/t")], Vec::new());
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
     mirror.apply(&publish("/b", "/t"));
-    order.told_by_master(now, &topic("/t"), 1);
-    assert!(!order.settled());
-    order.tell_state(A, topic("/t"));
-    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    order.master_notifies(now, &topic("/t"), 1);
+    assert!(!order.calls_settled());
+    order.notify_of_state(A, topic("/t"));
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
     let later = order.next_repeat().unwrap();
     assert_eq!(later, now + MASTER_TAKES + REPEAT_AFTER);
-    order.repeat(later);
-    let (list, number) = sent(order.next(later, A, &mirror));
+    order.queue_due_repeats(later);
+    let (list, number) = sent(order.next_notification(later, A, &mirror));
     assert_eq!(list, mirror.publisher_update("/t").params[2]);
-    order.taken(number);
-    assert_eq!(order.next(later, A, &mirror), NextNotification::Idle);
+    order.notification_taken(number);
+    assert_eq!(
+        order.next_notification(later, A, &mirror),
+        NextNotification::Idle
+    );
     // After the master's death, rosrescue's notification is sent at once. It is repeated, because the node may read the
     // master's notification later.
-    order.told_by_master(later, &topic("/t"), 1);
+    order.master_notifies(later, &topic("/t"), 1);
     let update = Arc::new(mirror.publisher_update("/t"));
     order.notify(later, A, topic("/t"), update);
-    let (_, number) = sent(order.next(later, A, &mirror));
-    order.taken(number);
+    let (_, number) = sent(order.next_notification(later, A, &mirror));
+    order.notification_taken(number);
     assert_eq!(order.next_repeat(), Some(later + REPEAT_AFTER));
 }
 
@@ -245,31 +271,40 @@ fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
 fn what_a_late_master_still_has_to_send_comes_first() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
-    order.told_by_master(now, &topic("/t"), 1);
+    order.master_notifies(now, &topic("/t"), 1);
     let takes = MASTER_TAKES + REPEAT_AFTER;
     order.master_is_late(now);
     mirror.apply(&publish("/b", "/t"));
     let update = Arc::new(mirror.publisher_update("/t"));
     order.notify(now, A, topic("/t"), update.clone());
-    assert_eq!(order.next(now, A, &mirror), NextNotification::Idle);
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
     // The master's notifications make no progress before it answers.
     let answered = now + 4 * takes;
-    order.repeat(answered);
-    assert_eq!(order.next(answered, A, &mirror), NextNotification::Idle);
+    order.queue_due_repeats(answered);
+    assert_eq!(
+        order.next_notification(answered, A, &mirror),
+        NextNotification::Idle
+    );
     order.late_answered(answered);
     // It is examined. It is not gone before it must have sent them.
     let until = answered + takes;
     assert_eq!(order.master_is_away(answered), Some(until));
     order.notify(answered, A, topic("/t"), update.clone());
     assert_eq!(order.next_repeat(), Some(until));
-    order.repeat(until);
-    let (list, number) = sent(order.next(until, A, &mirror));
+    order.queue_due_repeats(until);
+    let (list, number) = sent(order.next_notification(until, A, &mirror));
     assert_eq!(list, update.params[2]);
-    order.taken(number);
+    order.notification_taken(number);
     // A master that has sent everything holds up nothing.
     assert!(order.is_late());
     order.notify(until, A, topic("/t"), update.clone());
-    assert_eq!(sent(order.next(until, A, &mirror)).0, update.params[2]);
+    assert_eq!(
+        sent(order.next_notification(until, A, &mirror)).0,
+        update.params[2]
+    );
     assert_eq!(order.master_is_away(until), None);
     assert!(!order.is_late());
 }
@@ -278,7 +313,7 @@ fn what_a_late_master_still_has_to_send_comes_first() {
 fn a_master_that_stays_late_is_not_waited_for_for_ever() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
-    order.told_by_master(now, &topic("/t"), 1);
+    order.master_notifies(now, &topic("/t"), 1);
     order.master_is_late(now);
     let update = Arc::new(mirror.publisher_update("/t"));
     order.notify(now, A, topic("/t"), update.clone());
@@ -286,34 +321,37 @@ fn a_master_that_stays_late_is_not_waited_for_for_ever() {
     while let Some(next) = order.next_repeat() {
         assert!(next > at && next < now + 2 * BACKLOG_MAX);
         at = next;
-        order.repeat(at);
-        if let NextNotification::Send { call, number } = order.next(at, A, &mirror) {
+        order.queue_due_repeats(at);
+        if let NextNotification::Send { call, number } = order.next_notification(at, A, &mirror) {
             assert_eq!(call, update);
-            order.taken(number);
+            order.notification_taken(number);
         }
     }
     assert!(at >= now + BACKLOG_MAX);
     // A master that dies holds up nothing either.
-    order.told_by_master(at, &topic("/t"), 1);
+    order.master_notifies(at, &topic("/t"), 1);
     order.master_is_gone();
     order.notify(at, A, topic("/t"), update.clone());
-    assert_eq!(sent(order.next(at, A, &mirror)).0, update.params[2]);
+    assert_eq!(
+        sent(order.next_notification(at, A, &mirror)).0,
+        update.params[2]
+    );
 }
 
 #[test]
 fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     let (mut order, now) = (Order::default(), Instant::now());
     let number = begin(&mut order, now, &subscribe("/a", "/t"));
-    order.sent([], vec![number]);
+    order.calls_sent([], vec![number]);
     // In a batch the master only notifies because of calls before the answered one, so the answer is newer.
-    order.told_by_master(now, &topic("/t"), 1);
-    order.settled();
+    order.master_notifies(now, &topic("/t"), 1);
+    order.calls_settled();
     assert_eq!(order.next_repeat(), None);
-    order.written(now, number);
-    order.told_by_master(now, &topic("/t"), 1);
+    order.answer_written(now, number);
+    order.master_notifies(now, &topic("/t"), 1);
     assert!(order.has_new_repeat());
     let late = now + RECENT;
-    order.told_by_master(late, &topic("/t"), 1);
+    order.master_notifies(late, &topic("/t"), 1);
     // The master's own notification takes the place of the repeat.
     assert_eq!(order.next_repeat(), None);
     assert_eq!(port_of("http://a:1/"), A);
@@ -325,19 +363,22 @@ fn a_master_that_answers_slowly_is_given_time_for_its_notifications() {
     let (mut order, now) = (Order::default(), Instant::now());
     let slow = Duration::from_millis(80);
     order.master_answered(2 * slow, 2);
-    order.told_by_master(now, &topic("/t"), 3);
-    let until = order.told.until(now, &topic("/t"));
+    order.master_notifies(now, &topic("/t"), 3);
+    let until = order.master_notifications.sent_by(now, &topic("/t"));
     assert_eq!(until, Some(now + 3 * slow + REPEAT_AFTER));
     // One quick answer does not prove that the backlog is gone; twenty do.
     order.master_answered(Duration::from_millis(1), 1);
-    assert!(order.told.pace > slow / 2);
+    assert!(order.master_notifications.pace > slow / 2);
     for _ in 0..20 {
         order.master_answered(Duration::from_millis(1), 1);
     }
     let mut quick = Order::default();
-    quick.told.pace = order.told.pace;
-    quick.told_by_master(now, &topic("/t"), 1);
-    let until = quick.told.until(now, &topic("/t")).unwrap();
+    quick.master_notifications.pace = order.master_notifications.pace;
+    quick.master_notifies(now, &topic("/t"), 1);
+    let until = quick
+        .master_notifications
+        .sent_by(now, &topic("/t"))
+        .unwrap();
     assert!(until < now + 2 * MASTER_TAKES + REPEAT_AFTER);
 }
 
@@ -346,22 +387,32 @@ fn a_parameter_that_is_set_again_and_again_takes_no_more_memory() {
     let (mut order, now) = (Order::default(), Instant::now());
     for step in 0..10_000 {
         let now = now + Duration::from_micros(100) * step;
-        order.told_by_master(now, &param("/k/"), 4);
+        order.master_notifies(now, &param("/k/"), 4);
     }
-    assert_eq!(order.told.until.about(&param("/k/")).count(), 1);
-    assert_eq!(order.told.ends.queue.len(), 1);
-    let until = order.told.until(now, &param("/")).unwrap();
+    assert_eq!(
+        order
+            .master_notifications
+            .sent_by
+            .about(&param("/k/"))
+            .count(),
+        1
+    );
+    assert_eq!(order.master_notifications.schedule.queue.len(), 1);
+    let until = order
+        .master_notifications
+        .sent_by(now, &param("/"))
+        .unwrap();
     assert!(until < now + Duration::from_secs(1) + BACKLOG_MAX + 2 * REPEAT_AFTER);
-    assert_eq!(order.told.until(until, &param("/")), None);
+    assert_eq!(order.master_notifications.sent_by(until, &param("/")), None);
 }
 
 /// Loggers subscribe to the same parameter again and again, even while the master runs a call of the same node.
 #[test]
 fn a_node_does_not_wait_for_its_own_registrations() {
     let mut order = Order::default();
-    let watch = Concern::of(Some(&call("subscribeParam", &["/a", "http://a:1/", "/k"])));
-    order.sent(watch.tells(), Vec::new());
-    assert!(!order.read_must_wait(&watch.heard()));
+    let watch = Concern::of_call(Some(&call("subscribeParam", &["/a", "http://a:1/", "/k"])));
+    order.calls_sent(watch.notified_subjects(), Vec::new());
+    assert!(!order.read_must_wait(&watch.recipients()));
 }
 
 /// Another sender, such as the last process of rosrescue, may have an older notification on its way.
@@ -370,12 +421,12 @@ fn a_state_that_must_come_last_is_told_after_newer_notifications_of_the_master()
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
     let at = now + Duration::from_secs(1);
-    order.tell_state_at(at, A, topic("/t"));
-    order.told_by_master(now, &topic("/t"), 1);
+    order.notify_of_state_at(at, A, topic("/t"));
+    order.master_notifies(now, &topic("/t"), 1);
     assert_eq!(order.next_repeat(), Some(at));
-    order.told_by_master(at, &topic("/t"), 1);
+    order.master_notifies(at, &topic("/t"), 1);
     assert!(order.next_repeat() > Some(at));
-    order.repeat(at + Duration::from_secs(1));
+    order.queue_due_repeats(at + Duration::from_secs(1));
     assert_eq!(order.next_repeat(), None);
-    sent(order.next(at + Duration::from_secs(1), A, &mirror));
+    sent(order.next_notification(at + Duration::from_secs(1), A, &mirror));
 }

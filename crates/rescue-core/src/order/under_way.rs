@@ -5,19 +5,19 @@ use std::{
     time::Instant,
 };
 
-use super::{BySubject, Heard, MustWait, RECENT, Subject};
+use super::{BySubject, MustWait, RECENT, Recipient, Subject};
 
 /// The answers and notifications on their way, by number, and the answers written recently.
 #[derive(Debug, Default)]
 pub(super) struct UnderWay {
     last: u64,
-    entries: HashMap<u64, Entry>,
+    deliveries: HashMap<u64, Delivery>,
     by_subject: BySubject<u64>,
     /// Written answers, oldest first.
     written: VecDeque<(Instant, u64)>,
     /// The last written answer about each subject to each port. Earlier ones no longer count, so a node that makes many
     /// calls does not make each of them slower.
-    newest: HashMap<Heard, u64>,
+    newest: HashMap<Recipient, u64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,16 +27,16 @@ pub(super) enum DeliveryKind {
 }
 
 #[derive(Debug)]
-struct Entry {
+struct Delivery {
     kind: DeliveryKind,
-    heard: Vec<Heard>,
+    recipients: Vec<Recipient>,
     /// When calls and notifications stop waiting for this answer, or calls for this notification. `None` if there is no
     /// limit yet.
     limit: Option<Instant>,
     written: Option<Instant>,
 }
 
-impl Entry {
+impl Delivery {
     /// Whether calls or notifications must wait for this answer or notification, and until when.
     fn delays(&self, now: Instant) -> Option<MustWait> {
         let delays = self.written.is_none() && self.limit.is_none_or(|limit| now < limit);
@@ -55,78 +55,78 @@ pub(super) enum Answer {
 }
 
 impl UnderWay {
-    /// Adds an answer or a notification about `heard`. `limit` is explained at [`Entry::limit`]. Returns its number.
+    /// Adds an answer or a notification to `recipients`; for `limit` see [`Delivery::limit`]. Returns its number.
     pub(super) fn add(
         &mut self,
         kind: DeliveryKind,
-        heard: Vec<Heard>,
+        recipients: Vec<Recipient>,
         limit: Option<Instant>,
     ) -> u64 {
         self.last += 1;
-        for (index, one) in heard.iter().enumerate() {
-            let mut before = heard.iter().take(index);
+        for (index, one) in recipients.iter().enumerate() {
+            let mut before = recipients.iter().take(index);
             if !before.any(|other| other.subject == one.subject) {
                 self.by_subject.add(&one.subject, self.last);
             }
         }
-        let entry = Entry {
+        let delivery = Delivery {
             kind,
-            heard,
+            recipients,
             limit,
             written: None,
         };
-        self.entries.insert(self.last, entry);
+        self.deliveries.insert(self.last, delivery);
         self.last
     }
 
     pub(super) fn limit(&mut self, number: u64, limit: Instant) {
-        if let Some(entry) = self.entries.get_mut(&number) {
-            entry.limit = Some(limit);
+        if let Some(delivery) = self.deliveries.get_mut(&number) {
+            delivery.limit = Some(limit);
         }
     }
 
     /// Notes that the answer has been written to its caller.
     pub(super) fn written(&mut self, now: Instant, number: u64) {
-        let Some(entry) = self.entries.get_mut(&number) else {
+        let Some(delivery) = self.deliveries.get_mut(&number) else {
             return;
         };
-        entry.written = Some(now);
+        delivery.written = Some(now);
         self.written.push_back((now, number));
-        for heard in entry.heard.clone() {
-            if let Some(before) = self.newest.insert(heard.clone(), number)
+        for recipient in delivery.recipients.clone() {
+            if let Some(before) = self.newest.insert(recipient.clone(), number)
                 && before != number
             {
-                self.leave_out(before, &heard);
+                self.drop_recipient(before, &recipient);
             }
         }
     }
 
-    /// Removes one of the things that an answer is about.
-    fn leave_out(&mut self, number: u64, heard: &Heard) {
-        let Some(entry) = self.entries.get_mut(&number) else {
+    /// Removes a recipient of an answer.
+    fn drop_recipient(&mut self, number: u64, recipient: &Recipient) {
+        let Some(delivery) = self.deliveries.get_mut(&number) else {
             return;
         };
-        entry.heard.retain(|other| other != heard);
-        let mut others = entry.heard.iter();
-        if !others.any(|other| other.subject == heard.subject) {
-            self.by_subject.remove(&heard.subject, number);
+        delivery.recipients.retain(|other| other != recipient);
+        let mut others = delivery.recipients.iter();
+        if !others.any(|other| other.subject == recipient.subject) {
+            self.by_subject.remove(&recipient.subject, number);
         }
-        if entry.heard.is_empty() {
-            self.entries.remove(&number);
+        if delivery.recipients.is_empty() {
+            self.deliveries.remove(&number);
         }
     }
 
     /// Removes an answer or a notification.
     pub(super) fn remove(&mut self, number: u64) {
-        for heard in self
-            .entries
+        for recipient in self
+            .deliveries
             .remove(&number)
             .into_iter()
-            .flat_map(|entry| entry.heard)
+            .flat_map(|delivery| delivery.recipients)
         {
-            self.by_subject.remove(&heard.subject, number);
-            if self.newest.get(&heard) == Some(&number) {
-                self.newest.remove(&heard);
+            self.by_subject.remove(&recipient.subject, number);
+            if self.newest.get(&recipient) == Some(&number) {
+                self.newest.remove(&recipient);
             }
         }
     }
@@ -144,7 +144,9 @@ impl UnderWay {
 
     /// Whether a call that may change anything must wait for an answer or a notification on its way, and until when.
     pub(super) fn must_wait(&self, now: Instant) -> Option<MustWait> {
-        self.entries.values().find_map(|entry| entry.delays(now))
+        self.deliveries
+            .values()
+            .find_map(|delivery| delivery.delays(now))
     }
 
     /// Whether a call about `subject` must wait for an answer or a notification on its way to a port other than `port`,
@@ -155,47 +157,52 @@ impl UnderWay {
         subject: &Subject,
         port: Option<&str>,
     ) -> Option<MustWait> {
-        let mut entries = self.concerned(subject);
-        entries.find_map(|(_, entry, heard)| match port == Some(&heard.port) {
-            true => None,
-            false => entry.delays(now),
-        })
+        let mut deliveries = self.deliveries_about(subject);
+        deliveries.find_map(
+            |(_, delivery, recipient)| match port == Some(&recipient.port) {
+                true => None,
+                false => delivery.delays(now),
+            },
+        )
     }
 
     /// Numbers and ports of the answers and notifications about `subject` that are on their way, and of answers about
     /// it that were written recently.
     pub(super) fn about(&mut self, now: Instant, subject: &Subject) -> Vec<(u64, String)> {
         self.forget(now);
-        self.concerned(subject)
-            .map(|(number, _, heard)| (number, heard.port.clone()))
+        self.deliveries_about(subject)
+            .map(|(number, _, recipient)| (number, recipient.port.clone()))
             .collect()
     }
 
     /// The last answer to the node at `port` about `subject`, if it is on its way or was written recently.
     pub(super) fn answer_to(&self, now: Instant, port: &str, subject: &Subject) -> Option<Answer> {
         let to_port = self
-            .concerned(subject)
-            .filter(|(_, entry, heard)| entry.kind == DeliveryKind::Answer && heard.port == port);
+            .deliveries_about(subject)
+            .filter(|(_, delivery, recipient)| {
+                delivery.kind == DeliveryKind::Answer && recipient.port == port
+            });
         let mut last = None;
-        for (_, entry, _) in to_port {
-            if let Some(MustWait { until }) = entry.delays(now) {
+        for (_, delivery, _) in to_port {
+            if let Some(MustWait { until }) = delivery.delays(now) {
                 return Some(Answer::UnderWay { limit: until });
             }
-            last = last.max(entry.written);
+            last = last.max(delivery.written);
         }
         last.map(|at| Answer::Written { at })
     }
 
-    fn concerned<'a>(
+    fn deliveries_about<'a>(
         &'a self,
         subject: &'a Subject,
-    ) -> impl Iterator<Item = (u64, &'a Entry, &'a Heard)> {
-        let entries = self.by_subject.about(subject);
-        let entries = entries.filter_map(|number| Some((number, self.entries.get(&number)?)));
-        entries.flat_map(move |(number, entry)| {
-            let heard = entry.heard.iter();
-            let heard = heard.filter(|heard| heard.subject.concerns(subject));
-            heard.map(move |heard| (number, entry, heard))
+    ) -> impl Iterator<Item = (u64, &'a Delivery, &'a Recipient)> {
+        let deliveries = self.by_subject.about(subject);
+        let deliveries =
+            deliveries.filter_map(|number| Some((number, self.deliveries.get(&number)?)));
+        deliveries.flat_map(move |(number, delivery)| {
+            let recipients = delivery.recipients.iter();
+            let recipients = recipients.filter(|recipient| recipient.subject.concerns(subject));
+            recipients.map(move |recipient| (number, delivery, recipient))
         })
     }
 }
@@ -206,8 +213,8 @@ mod tests {
 
     use super::*;
 
-    fn heard(port: &str, topic: &str) -> Heard {
-        Heard {
+    fn recipient(port: &str, topic: &str) -> Recipient {
+        Recipient {
             port: port.to_owned(),
             subject: Subject::Topic(topic.to_owned()),
         }
@@ -217,9 +224,13 @@ mod tests {
     #[test]
     fn only_the_last_written_answer_to_a_port_about_a_subject_is_remembered() {
         let (mut under_way, start) = (UnderWay::default(), Instant::now());
-        let both = vec![heard("a", "/t"), heard("b", "/t"), heard("a", "/u")];
+        let both = vec![
+            recipient("a", "/t"),
+            recipient("b", "/t"),
+            recipient("a", "/u"),
+        ];
         let first = under_way.add(DeliveryKind::Answer, both, None);
-        let second = under_way.add(DeliveryKind::Answer, vec![heard("a", "/t")], None);
+        let second = under_way.add(DeliveryKind::Answer, vec![recipient("a", "/t")], None);
         let later = start + Duration::from_millis(1);
         under_way.written(start, first);
         under_way.written(later, second);
@@ -231,12 +242,12 @@ mod tests {
         assert_eq!(to("a"), Some(Answer::Written { at: later }));
         assert_eq!(to("b"), Some(Answer::Written { at: start }));
         for _ in 0..1_000 {
-            let next = under_way.add(DeliveryKind::Answer, vec![heard("a", "/u")], None);
+            let next = under_way.add(DeliveryKind::Answer, vec![recipient("a", "/u")], None);
             under_way.written(later, next);
         }
-        assert_eq!(under_way.entries.len(), 3);
+        assert_eq!(under_way.deliveries.len(), 3);
         under_way.forget(later + RECENT);
-        assert!(under_way.entries.is_empty() && under_way.newest.is_empty());
+        assert!(under_way.deliveries.is_empty() && under_way.newest.is_empty());
         assert!(under_way.by_subject.is_empty());
     }
 }
