@@ -36,8 +36,6 @@ pub mod clock;
 pub mod cluster;
 pub mod commands;
 pub mod config;
-#[cfg(test)]
-use test_support::dice;
 pub(crate) mod gate;
 pub mod guardian;
 pub(crate) mod ledger;

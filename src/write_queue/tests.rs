@@ -44,9 +44,10 @@ use ros1_master::{
     xmlrpc::{self, Call, Reply, Value},
 };
 
+use test_support::dice::Dice;
+
 use crate::{
     cli::{SyncPolicy, Writes},
-    dice::Dice,
     gate::{self, State},
     ledger::{Ledger, delivery::Delivery, mutant::Mutant},
     recovery::examine::Examiner,

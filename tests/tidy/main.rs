@@ -121,8 +121,8 @@ fn named<'a>(code: &'a str, root: &str) -> Vec<&'a str> {
 
 /// The modules, each above all that it may import: `docs/decisions/0020`.
 #[rustfmt::skip]
-const LAYERS: [&str; 27] = [
-    "clock", "dice", "limit", "printable", "logging", "task", "wait", "cli", "ros_env",
+const LAYERS: [&str; 26] = [
+    "clock", "limit", "printable", "logging", "task", "wait", "cli", "ros_env",
     "config", "resolver", "cluster", "gate", "status", "ledger", "upstream", "write_queue", "guardian", "process", "nodes",
     "recovery", "roscore", "server", "app", "commands", "program", "main",
 ];

@@ -201,8 +201,8 @@ impl<S: Storage> Store<S> {
         })
     }
 
-    /// Keeps the records of replaced generations in the [log], in up to `bytes_max` bytes. 0 keeps none, and leaves
-    /// the files of an earlier log alone.
+    /// Keeps the records of replaced generations in the [log](change_log), in up to `bytes_max` bytes. 0 keeps none, and
+    /// leaves the files of an earlier log alone.
     pub fn keep_log(&mut self, bytes_max: u64) {
         change_log::locked(&self.log).bytes_max = bytes_max;
     }

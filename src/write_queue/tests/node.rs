@@ -9,7 +9,7 @@ use ros1_master::{
 };
 
 use super::{PARAMS, TOPICS, text};
-use crate::dice::Dice;
+use test_support::dice::Dice;
 
 /// When each parameter was first and last set to each value.
 pub(super) type Values = HashMap<(String, Option<i32>), (u64, u64)>;

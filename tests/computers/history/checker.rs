@@ -113,6 +113,9 @@ pub(crate) fn violations(history: &History, end: &End) -> Vec<String> {
     wrong
 }
 
+/// A write that later reads on the same computer must show, and the time from which they must.
+type Floor<'a> = (Time, &'a Op);
+
 /// A write and what is known about it.
 #[derive(Clone, Copy, Debug)]
 struct Write<'a> {
@@ -266,7 +269,8 @@ impl<'a> Judge<'a> {
         }
         floors.values_mut().for_each(|of| of.sort_by_key(|it| it.0));
         reads.sort_by_key(|(op, _)| op.start);
-        let mut at: BTreeMap<usize, (usize, Option<(Time, &Op)>)> = BTreeMap::new();
+        // Per computer, how many floors have been looked at, and the highest one.
+        let mut at = BTreeMap::<usize, (usize, Option<Floor<'_>>)>::new();
         for (op, write) in reads {
             let Some(floors) = floors.get(&op.computer) else {
                 continue;

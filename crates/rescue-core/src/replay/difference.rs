@@ -92,7 +92,7 @@ impl Sentences {
                 None => self.add(|| format!("{what} `{key}` is only in the mirror")),
             }
         }
-        for key in b.keys().filter(|key| !a.contains_key(*key)) {
+        for key in b.keys().filter(|key| !a.contains_key(key)) {
             self.add(|| format!("{what} `{key}` is only in the master"));
         }
     }

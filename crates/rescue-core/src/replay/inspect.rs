@@ -303,7 +303,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
         if let Some(before) = before.filter(|before| before.api == node.api) {
             let lost = |service: &&String| {
                 services
-                    .get(*service)
+                    .get(service)
                     .is_none_or(|entry| entry.node != *caller_id)
             };
             let known = previous.taken_over(caller_id, before).filter(lost);

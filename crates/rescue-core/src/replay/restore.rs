@@ -333,7 +333,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             });
         }
         for caller_id in losers {
-            let node = self.found.registry().nodes.get(*caller_id);
+            let node = self.found.registry().nodes.get(caller_id);
             let there = node.is_some_and(|node| node.services.contains(service));
             if self.api(caller_id).is_some() && !there {
                 self.skipped.push(Skipped::Reference {

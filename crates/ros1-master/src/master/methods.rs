@@ -34,7 +34,7 @@ impl Master {
                 let shared = SharedRegistration::Publishers;
                 let bumped = self.registry.register(shared, &topic, caller_id, api);
                 self.notify_bumped(caller_id, bumped, notices);
-                if topic_type != "*" || !self.topic_types.contains_key(&*topic) {
+                if topic_type != "*" || !self.topic_types.contains_key(&topic) {
                     self.topic_types
                         .insert(topic.to_string(), topic_type.to_owned());
                 }
@@ -50,7 +50,7 @@ impl Master {
                 let shared = SharedRegistration::Subscribers;
                 let bumped = self.registry.register(shared, &topic, caller_id, api);
                 self.notify_bumped(caller_id, bumped, notices);
-                if topic_type != "*" && !self.topic_types.contains_key(&*topic) {
+                if topic_type != "*" && !self.topic_types.contains_key(&topic) {
                     self.topic_types
                         .insert(topic.to_string(), topic_type.to_owned());
                 }
@@ -131,7 +131,7 @@ impl Master {
     pub(crate) fn lookup_service(&mut self, of: Arguments<'_>) -> MethodResult {
         let [service] = of.params()?;
         let service = checks::resource("service", service, of.caller_id)?;
-        Ok(match self.registry.services.get(&*service) {
+        Ok(match self.registry.services.get(&service) {
             Some(entry) => {
                 let message = format!("rosrpc URI: [{}]", entry.api);
                 (1, message, entry.api.as_str().into())
@@ -143,7 +143,7 @@ impl Master {
     pub(crate) fn lookup_node(&mut self, of: Arguments<'_>) -> MethodResult {
         let [node] = of.params()?;
         let node = checks::name("node", node, of.caller_id)?;
-        Ok(match self.registry.nodes.get(&*node) {
+        Ok(match self.registry.nodes.get(&node) {
             Some(found) => (1, "node api".to_owned(), found.api.as_str().into()),
             None => (-1, format!("unknown node [{node}]"), "".into()),
         })

@@ -366,7 +366,7 @@ impl Master {
         node: &'a Node,
     ) -> impl Iterator<Item = &'a String> {
         node.services.iter().filter(move |service| {
-            let entry = self.registry.services.get(*service);
+            let entry = self.registry.services.get(service);
             entry.is_none_or(|entry| entry.node != caller_id)
         })
     }
