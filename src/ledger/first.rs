@@ -115,9 +115,8 @@ impl Ledger {
             let tells = write.concern.notified_subjects();
             awaited |= inner.order.acknowledged(write.seq, tells);
             note_master_notifications(now, &mut inner.order, &inner.mirror, tells);
-            if let Some(last) = inner.pending.acknowledge(write.seq) {
-                inner.acknowledged = last;
-            }
+            inner.pending.acknowledge(write.seq);
+            inner.acknowledged = write.seq;
             let reply = write.reply;
             if !reply.is_some_and(|reply| is_same_result(write.predicted, reply)) {
                 self.stats.divergences.count();

@@ -18,8 +18,8 @@ pub(crate) enum Mutant {
     ForgetsLastProcess,
     /// The mirror answers writes first although nothing would keep them if the process ended.
     AnswersUnprotected,
-    /// The master's answer to a write counts for all writes before it.
-    AcknowledgesEarlier,
+    /// Calls overtake a write that the mirror has answered first.
+    Overtakes,
     /// Writes that the mirror has answered first go to the next master, too, which has got the state.
     KeepsAnswered,
     /// The master is read although it has not run all writes that the mirror has answered first.

@@ -1,10 +1,6 @@
 //! Writes that the mirror has answered and that the present master may not have run.
 
-use std::collections::BTreeSet;
-
 use ros1_master::{master::Request, xmlrpc::Value};
-
-use super::mutant::Mutant;
 
 /// Maximum number of pending writes.
 const COUNT_MAX: usize = 10_000;
@@ -22,8 +18,6 @@ pub(super) struct PendingWrites {
     calls: Vec<Request>,
     /// The number of each write's record in the journal.
     seqs: Vec<u64>,
-    /// The records of writes that the master has run before an earlier one.
-    run: BTreeSet<u64>,
     bytes: usize,
     /// Number of pending writes that come from a checkpoint.
     restored: usize,
@@ -65,18 +59,9 @@ impl PendingWrites {
         self.drop_first(self.restored);
     }
 
-    /// Notes that the master has run the write with record `seq`, and drops it once all earlier ones have been run. The
-    /// master may run writes in another order if they are about different things. Returns the record of the last write
-    /// that was dropped.
-    pub(super) fn acknowledge(&mut self, seq: u64) -> Option<u64> {
-        self.run.insert(seq);
-        let is_run =
-            |of: &&u64| self.run.contains(of) || **of <= seq && Mutant::AcknowledgesEarlier.lives();
-        let count = self.seqs.iter().take_while(is_run).count();
-        let last = self.seqs.get(count.checked_sub(1)?).copied();
-        self.drop_first(count);
-        self.run.retain(|seq| Some(*seq) > last);
-        last
+    /// Drops the writes up to record `seq`, which the master has run.
+    pub(super) fn acknowledge(&mut self, seq: u64) {
+        self.drop_first(self.seqs.partition_point(|of| *of <= seq));
     }
 
     fn drop_first(&mut self, count: usize) {

@@ -43,6 +43,9 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// How long a batch may continue after calls no longer pass to the master, before the mirror answers it. A killed
 /// master closes its connections within milliseconds. A master that only closed an idle connection still answers.
 const GRACE: Duration = Duration::from_millis(5);
+/// Longest time for which a write that the mirror has answered waits for answers on their way to nodes. Those nodes may
+/// be notified of it before they read the answers, and are told the state again.
+const FIRST_WAITS: Duration = Duration::from_millis(20);
 /// How long the journal may not know which writes the master has run. A rosrescue that starts meanwhile gives them to
 /// the master once more, although a program may have changed the master directly since.
 const ACKNOWLEDGE_AFTER: Duration = Duration::from_millis(10);
@@ -407,6 +410,7 @@ impl Dispatcher {
         item.first = Some(First {
             reply: reply.clone(),
             seq,
+            latest: now + FIRST_WAITS,
         });
         let answers = Answers {
             mark: self.ledger.to_await(mark),
@@ -444,6 +448,7 @@ impl Dispatcher {
             let First {
                 reply: predicted,
                 seq,
+                ..
             } = item.first.as_ref()?;
             Some(Acknowledged {
                 seq: *seq,
