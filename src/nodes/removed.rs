@@ -27,7 +27,7 @@ impl Removed {
         removed.push_back((node.to_owned(), at));
     }
 
-    /// Those of the last ten minutes. Some may have come back.
+    /// The nodes that were unregistered in the last ten minutes, with the time. Some may have come back.
     pub(crate) fn lately(&self, now: Instant) -> Vec<(String, Instant)> {
         let mut list = self.list();
         list.retain(|(_, at)| now.duration_since(*at) < LATELY);

@@ -94,7 +94,7 @@ fn program_of(pid: u32) -> String {
 pub(crate) struct MasterAddresses {
     port: u16,
     addresses: Vec<IpAddr>,
-    /// Whether one of the addresses belongs to this computer.
+    /// Whether the master is on this computer.
     is_here: bool,
 }
 

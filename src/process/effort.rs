@@ -5,7 +5,7 @@ use std::{fs, time::Duration};
 
 use rescue_core::lifecycle::evidence::Effort;
 
-/// Maximum number of processes that are counted together.
+/// Maximum number of processes that are counted as one: the master and its descendants.
 const FAMILY_MOST: usize = 64;
 
 /// What the threads of the process `pid` and its descendants do: a wrapper may have started the master. `None` if there

@@ -50,7 +50,7 @@ struct Name {
     taken: Vec<Instant>,
 }
 
-/// The names that programs have taken from others that were still running.
+/// The names that two running programs take from each other.
 #[derive(Debug, Default)]
 pub struct Feuds(BTreeMap<String, Name>);
 
