@@ -970,6 +970,8 @@ impl Dispatcher {
 
     /// Answers the queue from the mirror. Calls that only a master can answer wait.
     fn answer_queue(&mut self, now: Instant) {
+        // The mirror must not apply these again: they may have been in flight until now.
+        self.leave_out_answered();
         let ledger = self.ledger.clone();
         let mut answers = MirrorAnswers::default();
         for item in std::mem::take(&mut self.queue) {

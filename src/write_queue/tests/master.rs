@@ -172,7 +172,9 @@ impl World {
     /// The connection of the request in flight ends. Its answer may have been sent before.
     pub(super) fn break_request(&mut self) {
         if let Some(number) = self.in_flight {
-            let time = self.dice.below(3_000);
+            // Sometimes only after the mirror has begun to stand in.
+            let most = if self.dice.one_in(4) { 12_000 } else { 3_000 };
+            let time = self.dice.below(most);
             self.after(time, Event::Broken(number, Failure::MayHaveRun));
         }
     }

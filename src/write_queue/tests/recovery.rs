@@ -56,7 +56,7 @@ pub(super) enum Event {
     /// The notifications that a dead master may not have sent are due, and nobody serves.
     OwesInOutage,
     /// The health check after a recovery.
-    Checks,
+    Checks(Telling),
 }
 
 /// What an examination waits for.
@@ -179,8 +179,6 @@ pub(super) struct Recovery {
     probes: u64,
     /// When calls last ceased to pass to the master.
     outage: Instant,
-    /// When nodes get the notifications that they may lack.
-    telling: Option<Telling>,
     /// Whether nodes lack notifications of a process of rosrescue that has ended.
     news: News,
     /// When the mirror's own notifications are due in an outage.
@@ -205,7 +203,6 @@ impl Recovery {
             probe: None,
             probes: 0,
             outage: Instant::now(),
-            telling: None,
             news: match is_restored {
                 true => News::Owed,
                 false => News::Sent,
@@ -455,11 +452,12 @@ impl World {
                     self.ledger
                         .with_activity(|mirror, activity| activity.notice_all(mirror, now));
                 }
-                self.recovery.telling = Telling::after(outcome, news == News::Owed);
+                if let Some(telling) = Telling::after(outcome, news == News::Owed) {
+                    let time = self.dice.below(20_000);
+                    self.then(time, Event::Checks(telling));
+                }
                 let new = outcome.is_new();
                 self.recover(Input::Examined { new });
-                let time = self.dice.below(20_000);
-                self.then(time, Event::Checks);
             }
             Outcome::Examined(Err(error)) => self.recover(error.as_input()),
             Outcome::CaughtUp(Ok(true)) => {
@@ -548,13 +546,11 @@ impl World {
                     }
                 }
             }
-            Event::Checks if self.gate().is_open() => {
-                if let Some(telling) = self.recovery.telling {
-                    let (now, outage) = (self.instant(), self.recovery.outage);
-                    self.ledger.queue_owed(now, outage, telling);
-                }
+            Event::Checks(telling) if self.gate().is_open() => {
+                let (now, outage) = (self.instant(), self.recovery.outage);
+                self.ledger.queue_owed(now, outage, telling);
             }
-            Event::Checks => self.then(1_000, Event::Checks),
+            Event::Checks(telling) => self.then(1_000, Event::Checks(telling)),
             _ => {}
         }
     }
