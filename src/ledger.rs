@@ -298,6 +298,8 @@ impl Ledger {
         let at = clock::wall_millis();
         let entry = RecordContent::labelled(Request::clone(call), Label { at, origin });
         self.stats.writes_recorded.count();
+        // Otherwise the next process would let the master run pending writes after this call.
+        inner.note_acknowledged();
         inner.append(vec![entry]);
         inner.ahead = Some(call.clone());
         drop(inner);

@@ -5,7 +5,9 @@ use std::process::Command;
 use std::sync::mpsc;
 use std::thread;
 
-use crate::support::{FakeNode, Scratch, alive, free_port, is_isolated, isolate, report};
+use crate::support::{
+    FakeNode, Scratch, alive, eventually, free_port, is_isolated, isolate, report,
+};
 
 /// Runs `test` like a test named `name`. Returns `None` if it panics.
 fn run<T: Send + 'static>(name: &str, test: impl FnOnce() -> T + Send + 'static) -> Option<T> {
@@ -54,7 +56,8 @@ fn a_process_that_a_test_leaves_behind_ends_with_it() {
         });
         assert_eq!(ended.is_none(), fails);
         let left = receive.recv().unwrap();
-        assert!(!alive(left), "{left}");
+        // It has been killed, and a busy computer takes a moment to end it.
+        eventually(&format!("process {left} ends"), || !alive(left));
     }
 }
 
