@@ -12,7 +12,7 @@ quick:
 test:
     tests/run.sh
 
-# Measure all tables of docs/benchmarks.md and write them (20 minutes on two cores; needs root)
+# Measure all tables of docs/benchmarks.md and write them (takes long; needs root and a quiet computer)
 benchmarks:
     benches/run.sh
 

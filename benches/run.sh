@@ -1,6 +1,6 @@
 #!/bin/sh
 # Measures every table of docs/benchmarks.md on this computer and writes them, with the present commit in each caption.
-# It takes some 20 minutes on two cores after the build. Nothing else should run meanwhile.
+# The build alone takes more than eight minutes on two cores. Nothing else should run meanwhile.
 set -eu
 cd "$(dirname "$0")/.."
 

@@ -145,7 +145,7 @@ impl Ledger {
     }
 
     /// Notes that this master will not run the write as a call, because the state that a master gets has it.
-    pub(crate) fn is_left_out(&self, seq: u64, concern: &Concern) {
+    pub(crate) fn note_left_out(&self, seq: u64, concern: &Concern) {
         self.release(|order| order.acknowledged(seq, concern.notified_subjects()));
     }
 

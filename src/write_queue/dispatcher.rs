@@ -428,7 +428,7 @@ impl Dispatcher {
         let (ledger, before) = (&self.ledger, self.queue.len());
         self.queue.retain(|item| {
             if let Some(First { seq, .. }) = &item.first {
-                ledger.is_left_out(*seq, item.concern());
+                ledger.note_left_out(*seq, item.concern());
             }
             !item.is_answered_first()
         });
@@ -957,7 +957,7 @@ impl Dispatcher {
             item.delivery = None;
             tells.extend_from_slice(item.concern().notified_subjects());
             if let Some(First { seq, .. }) = &item.first {
-                self.ledger.is_left_out(*seq, item.concern());
+                self.ledger.note_left_out(*seq, item.concern());
                 continue;
             }
             if let Some(item) = answers.add(&self.ledger, now, item) {

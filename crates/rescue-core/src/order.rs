@@ -149,7 +149,7 @@ impl Order {
     /// not wait, its answer could be older than a notification that the master sends to the reader.
     pub fn read_must_wait(&mut self, recipients: &[Recipient]) -> bool {
         let mut recipients = recipients.iter();
-        let waits = recipients.any(|recipients| self.master_will_notify(&recipients.subject));
+        let waits = recipients.any(|it| self.master_will_notify(&it.subject));
         self.awaited |= waits;
         waits
     }
@@ -157,19 +157,16 @@ impl Order {
     /// Whether the answer to a write may not be given before the master has run it: the answer is about something of
     /// which the master may be notifying the caller, who has subscribed to it before.
     pub fn answer_must_wait(&self, mirror: &Master, recipients: &[Recipient]) -> bool {
-        let is_told = |recipients: &Recipient| match &recipients.subject {
+        let is_told = |recipient: &Recipient| match &recipient.subject {
             Subject::Topic(topic) => {
                 let subscribers = mirror.subscribers_of(topic);
-                subscribers
-                    .iter()
-                    .any(|api| port_of(api) == recipients.port)
+                subscribers.iter().any(|api| port_of(api) == recipient.port)
             }
             Subject::Param(_) => true,
             Subject::Name(_) => false,
         };
         let mut recipients = recipients.iter();
-        recipients
-            .any(|recipients| is_told(recipients) && self.master_will_notify(&recipients.subject))
+        recipients.any(|it| is_told(it) && self.master_will_notify(&it.subject))
     }
 
     /// Whether the master may notify nodes of `subject` because of calls that it has not answered.
