@@ -250,9 +250,9 @@ impl ClusterDriver {
                 let state = ledger.take_as_state();
                 self.inbox.push_front(Input::AsState(state));
             }
-            Action::CollectForwarded => {
-                let calls = self.forwarded.writes();
-                self.inbox.push_front(Input::Forwarded(calls));
+            Action::CollectForwarded { base } => {
+                let writes = self.forwarded.writes(self.member.position());
+                self.inbox.push_front(Input::Forwarded { base, writes });
             }
             Action::ShutDownDisplaced(nodes) => {
                 ledger.with_activity(|_, activity| activity.restore_displaced(nodes));

@@ -73,7 +73,7 @@ pub(crate) struct Others {
     pub(crate) members: MemberAddresses,
     /// Answers that followers have not passed on to their callers yet.
     pub(crate) passing: Arc<ForwardedAnswers>,
-    /// Writes of this computer that a leader has not answered yet.
+    /// Writes of this computer that were sent to a leader and have not been read in the journal yet.
     pub(crate) forwarded: Arc<Forwarded>,
     /// The last position in the journal of all computers that the mirror includes.
     pub(crate) followed: watch::Receiver<JournalPosition>,
@@ -318,7 +318,12 @@ impl Others {
                     let asked = Instant::now();
                     tokio::select! {
                         answered = call.forward(&leader, term, hold.time_left()) => match answered {
-                            Ok(reply) => return Ok(instead(reply, removed)),
+                            Ok(reply) => {
+                                if let Some(sent) = unanswered {
+                                    sent.answered(self.shown.get(), *self.followed.borrow());
+                                }
+                                return Ok(instead(reply, removed));
+                            }
                             Err(may_have_run) => {
                                 hold.spend(asked.elapsed());
                                 removed = removed.or_else(|| removes.filter(|_| may_have_run));

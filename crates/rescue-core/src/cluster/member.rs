@@ -54,8 +54,8 @@ pub use self::{
     chores::PUBLISH_EVERY,
     probes::PROBES,
     types::{
-        Action, Cause, Holds, Input, LocalCheckpoint, MemberEntry, MemberEntryChange, News, Read,
-        WatchedEntry,
+        Action, Cause, ForwardedWrites, Holds, Input, LocalCheckpoint, MemberEntry,
+        MemberEntryChange, News, Read, WatchedEntry,
     },
 };
 
@@ -208,7 +208,7 @@ impl Member {
             Input::Loaded(read) => self.loaded(now, read),
             Input::Recorded(changes) => self.recorded(changes),
             Input::AsState(state) => self.recorded_as_state(state),
-            Input::Forwarded(calls) => self.cut_off.expect(calls),
+            Input::Forwarded { base, writes } => self.serve_from(base, writes),
             Input::Prepared(leads) => self.prepared(leads),
             Input::Decided { seq, goes_on } => {
                 self.reading.deciding = false;

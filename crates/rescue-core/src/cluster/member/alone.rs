@@ -1,7 +1,11 @@
 //! A computer that is cut off answers its own nodes, and keeps their writes for a leader.
 
-use super::{Action, Member, News, journal_writes::is_ours};
-use crate::cluster::{machine::WhenAlone, sharing::Change, standing::Standing};
+use super::{Action, ForwardedWrites, Member, News, journal_writes::is_ours};
+use crate::cluster::{
+    machine::{Role, WhenAlone},
+    sharing::Change,
+    standing::Standing,
+};
 use ros1_master::master::{Master, Request};
 
 impl Member {
@@ -20,24 +24,50 @@ impl Member {
         };
         // The nodes continue from what they wrote in earlier periods of being cut off.
         let base = self.cut_off.on(base);
-        self.begin_cut_off(base.clone());
-        self.act(Action::NotifyOwnOnly(true));
         if led {
+            self.begin_cut_off(base);
             // Recorded calls are answered from now on, except forwarded ones, which their computers send elsewhere.
             let answered = self.outgoing.acknowledged;
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
             self.keep(kept);
+            self.serve_alone();
         } else {
             // The standing changes first, so that no more calls are forwarded.
             self.publish_standing(Standing::Nobody { known: true });
-            self.act(Action::CollectForwarded);
-            let seq = self.machine.committed();
-            self.outgoing.start(seq);
-            let (held, state) = (base.clone(), Some(base));
-            self.act(Action::StartRecording { seq, held, state });
+            self.act(Action::CollectForwarded { base });
         }
+    }
+
+    /// Begins to serve this computer's nodes after it was cut off from a leader: in the state `base`, with the writes of
+    /// these nodes that the leader answered.
+    ///
+    /// The journal has these writes, although this computer has not read them. With `--cluster-sync interval` they may
+    /// not be in the journal; then the leader sends them later.
+    pub(super) fn serve_from(&mut self, mut base: Master, forwarded: ForwardedWrites) {
+        if self.published.role != Role::Alone || self.records() {
+            // This computer's role has changed again since.
+            return;
+        }
+        let ForwardedWrites {
+            unanswered,
+            answered,
+        } = forwarded;
+        for call in &answered {
+            base.apply_telling(call, &mut ());
+        }
+        self.begin_cut_off(base.clone());
+        self.cut_off.expect(unanswered.into_iter().chain(answered));
+        let seq = self.machine.committed();
+        self.outgoing.start(seq);
+        let (held, state) = (base.clone(), Some(base));
+        self.act(Action::StartRecording { seq, held, state });
+        self.serve_alone();
+    }
+
+    fn serve_alone(&mut self) {
+        self.act(Action::NotifyOwnOnly(true));
         self.act(Action::AnswerFromMirror);
         self.publish_standing(Standing::Alone);
         self.all_ready();

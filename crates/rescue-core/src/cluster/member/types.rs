@@ -17,6 +17,16 @@ use crate::{
 };
 use ros1_master::master::{Displaced, Master, Request};
 
+/// Writes of this computer's nodes that were sent to a leader.
+#[derive(Clone, Debug, Default)]
+pub struct ForwardedWrites {
+    /// The leader may run them, or have run them.
+    pub unanswered: Vec<Request>,
+    /// The leader has answered them, in this order, and the journal as this computer has read it lacks them. With
+    /// `--cluster-sync interval` etcd may lack them, too.
+    pub answered: Vec<Request>,
+}
+
 /// What this computer's checkpoint holds at the start.
 #[derive(Clone, Debug, Default)]
 pub struct LocalCheckpoint {
@@ -158,8 +168,11 @@ pub enum Input {
     Recorded(Vec<Change>),
     /// The result of [`Action::TakeAsState`].
     AsState(Option<Change>),
-    /// The result of [`Action::CollectForwarded`]: writes of this computer's nodes that a leader has not answered.
-    Forwarded(Vec<Request>),
+    /// The result of [`Action::CollectForwarded`], with its state.
+    Forwarded {
+        base: Master,
+        writes: ForwardedWrites,
+    },
     /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
     Prepared(Option<bool>),
     /// The result of [`Action::Decide`].
@@ -293,7 +306,11 @@ pub enum Action {
     /// Take the changes that the ledger has recorded but not yet handed out as a single one: its state. Ends with
     /// [`Input::AsState`].
     TakeAsState,
-    CollectForwarded,
+    /// Find the writes of this computer's nodes that may be missing in the journal as this computer has read it. Ends
+    /// with [`Input::Forwarded`], before any other input.
+    CollectForwarded {
+        base: Master,
+    },
     /// Tell these nodes, which lost their names to other nodes, to shut down again, because they may have missed it.
     ShutDownDisplaced(Vec<Displaced>),
     /// Notify every node of the present state, because it may have heard an older one from another computer since.

@@ -131,6 +131,8 @@ pub(super) struct Computer {
     pub(super) standing: Standing,
     /// Calls of the computer's nodes that wait. Each is sent again only after the time beside it.
     pub(super) waiting: Vec<(usize, u64)>,
+    /// Calls that a leader has answered, with the position that its answers had shown by then.
+    pub(super) answered: Vec<(JournalPosition, usize)>,
     /// The furthest position in the journal that a leader's answer has shown.
     pub(super) told: JournalPosition,
     /// The last position that it may have shown, if it led until its role changed last.
@@ -199,6 +201,7 @@ impl Computer {
             cut: (0, 0),
             standing: Standing::Nobody { known: false },
             waiting: Vec::new(),
+            answered: Vec::new(),
             told: JournalPosition::at_start(),
             left: None,
             followed: JournalPosition::default(),
@@ -229,6 +232,7 @@ impl Computer {
         self.watch += 1;
         self.standing = Standing::Nobody { known: true };
         self.waiting.clear();
+        self.answered.clear();
     }
 
     /// Notes the position in the journal that a leader's answer shows.

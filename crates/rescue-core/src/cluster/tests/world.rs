@@ -15,7 +15,7 @@ use super::{
 use crate::cluster::{
     journal::Progress,
     machine::{ANSWER_LIMIT, Commit, EtcdAnswer, Role, View, WhenAlone},
-    member::{Action, Input, News},
+    member::{Action, ForwardedWrites, Input, News},
     merge::wire::{self, Ask, WriteOutcome},
     sharing::Source,
     standing::{AnsweredCalls, JournalPosition, Standing},
@@ -107,6 +107,8 @@ pub(super) struct World {
     pub(super) counts: Counts,
     /// The only computer whose nodes write, if set.
     pub(super) writer: Option<usize>,
+    /// Whether the nodes of each computer write a parameter that no others write.
+    pub(super) is_apart: bool,
 }
 
 impl World {
@@ -134,6 +136,7 @@ impl World {
             term: 0,
             counts: Counts::default(),
             writer: None,
+            is_apart: false,
         };
         for index in 0..COMPUTERS {
             let computer = &mut world.computers[index];
@@ -255,7 +258,9 @@ impl World {
             }
             Event::Done(at, life, call, position) => {
                 if self.lives(at, life) {
-                    self.computers[at].tell_of(position);
+                    let computer = &mut self.computers[at];
+                    computer.tell_of(position);
+                    computer.answered.push((computer.told, call));
                     self.done(at, call);
                 }
             }
@@ -620,10 +625,19 @@ impl World {
                 let state = ledger.sharing.as_mut().map(|of| of.take_as_state(mirror));
                 inputs.push_front(Input::AsState(state));
             }
-            Action::CollectForwarded => {
-                let waiting = self.computers[at].waiting.iter();
-                let calls = waiting.map(|(call, _)| self.history.request(*call));
-                inputs.push_front(Input::Forwarded(calls.collect()));
+            Action::CollectForwarded { base } => {
+                let computer = &mut self.computers[at];
+                let followed = computer.member.position();
+                computer
+                    .answered
+                    .retain(|(shown, _)| !followed.shows(*shown));
+                let waiting = computer.waiting.iter().map(|(call, _)| call);
+                let answered = computer.answered.iter().map(|(_, call)| call);
+                let writes = ForwardedWrites {
+                    unanswered: waiting.map(|of| self.history.request(*of)).collect(),
+                    answered: answered.map(|of| self.history.request(*of)).collect(),
+                };
+                inputs.push_front(Input::Forwarded { base, writes });
             }
             Action::StoreTerm(term) => self.computers[at].disk.own.term = term,
             Action::BeginMaster(_) => {

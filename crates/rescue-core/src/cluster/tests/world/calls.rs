@@ -239,7 +239,10 @@ impl World {
         if !self.computers[at].up || self.network.healed_for(self.now, 2_000 * MS) {
             return;
         }
-        let key = self.dice.below(KEYS as u64) as usize;
+        let key = match self.is_apart {
+            true => at,
+            false => self.dice.below(KEYS as u64) as usize,
+        };
         if self.dice.one_in(3) || self.writer.is_some_and(|writer| writer != at) {
             return self.begin_read(at, key);
         }

@@ -290,6 +290,11 @@ impl World {
         self.strike(Fault::CutOff(at), u64::from(u32::MAX));
     }
 
+    /// Stops etcd for `time`.
+    pub(in super::super) fn stop_etcd(&mut self, time: Duration) {
+        self.strike(Fault::EtcdAway, time.as_micros() as u64);
+    }
+
     /// Stops etcd, which comes back without its data.
     pub(in super::super) fn lose_etcd(&mut self) {
         let time = (20 + self.dice.below(6000)) * MS;
