@@ -446,7 +446,7 @@ fn what_no_other_computer_changes_is_not_lost_while_etcd_is_away() {
         world.heal();
         world.run(Duration::from_secs(15));
         // With `interval`, a former leader also sends what it had answered to other computers' nodes, and those may have
-        // written anew since; see decision 42.
+        // written again since; see decision 42.
         let all = plan(seed).commit == Commit::Always;
         let lost = world.counts.reported;
         assert!(lost == 0 || !all, "seed {seed}: {lost} writes are lost");
