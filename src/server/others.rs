@@ -1,28 +1,23 @@
 //! Calls in a robot with several computers: answered here, or forwarded to the leader.
 
 use std::{
-    collections::VecDeque,
     net::{IpAddr, Ipv4Addr, SocketAddr},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::Arc,
     time::Duration,
 };
 
 use bytes::Bytes;
 use hyper::header::HeaderValue;
-use rescue_core::{
-    cluster::{
-        journal::RECORD_BYTES_MAX,
-        sharing::Source,
-        standing::{AnsweredCalls, JournalPosition, Standing},
-    },
-    order::ANSWER_LIMIT,
+use rescue_core::cluster::{
+    journal::RECORD_BYTES_MAX,
+    sharing::Source,
+    standing::{AnsweredCalls, JournalPosition, Standing},
 };
 use ros1_master::{
     master::{Kind, Request},
     xmlrpc::Reply,
 };
 use tokio::{
-    runtime::Handle,
     sync::{mpsc, oneshot, watch},
     time::Instant,
 };
@@ -30,10 +25,16 @@ use tokio::{
 mod control;
 mod forwarded;
 mod members;
+mod passed_on;
+mod shown;
 
-use self::control::Control;
-pub(crate) use self::control::HANDOVER;
-pub(crate) use self::{forwarded::Forwarded, members::MemberAddresses};
+use self::{
+    control::Control,
+    passed_on::{ConfirmOnDrop, ForwardedAnswers},
+};
+pub(crate) use self::{
+    control::HANDOVER, forwarded::Forwarded, members::MemberAddresses, shown::Shown,
+};
 use super::{
     calls::{Calls, Closed, Incoming, NOT_IN_TIME, Unanswered},
     hold::Hold,
@@ -80,99 +81,6 @@ pub(crate) struct Others {
     pub(crate) shown: Arc<Shown>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
-}
-
-/// The furthest position in the journal that an answer on this computer has shown. The mirror must not answer before it has
-/// reached that position.
-#[derive(Debug)]
-pub(crate) struct Shown(Mutex<JournalPosition>);
-
-impl Shown {
-    pub(crate) fn new() -> Self {
-        Self(Mutex::new(JournalPosition::at_start()))
-    }
-
-    fn get(&self) -> JournalPosition {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    pub(crate) fn raise(&self, position: JournalPosition) {
-        let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        *shown = shown.max(position);
-    }
-}
-
-/// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
-/// the answer, because some notifications must wait for that.
-#[derive(Default)]
-pub(crate) struct ForwardedAnswers(Mutex<Inner>);
-
-#[derive(Default)]
-struct Inner {
-    last: u64,
-    /// The answers by number, oldest first.
-    held: VecDeque<(Instant, u64, UntilWritten)>,
-}
-
-impl std::fmt::Debug for ForwardedAnswers {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("ForwardedAnswers")
-    }
-}
-
-impl ForwardedAnswers {
-    fn lock(&self) -> MutexGuard<'_, Inner> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Keeps `held`, which must not be dropped before the caller has the answer. Returns the answer's number, for
-    /// [`Self::release`]. Drops values that are older than [`ANSWER_LIMIT`], because their followers may have died.
-    fn add(&self, now: Instant, held: UntilWritten) -> u64 {
-        let mut old = Vec::new();
-        let mut passing = self.lock();
-        let Inner { last, held: kept } = &mut *passing;
-        while let Some((since, ..)) = kept.front()
-            && now.duration_since(*since) > ANSWER_LIMIT
-        {
-            old.extend(kept.pop_front());
-        }
-        *last += 1;
-        kept.push_back((now, *last, held));
-        *last
-    }
-
-    /// Notes that the answer with this number has been written to its caller, or never will be.
-    fn release(&self, number: u64) {
-        let mut passing = self.lock();
-        let at = passing.held.iter().position(|(_, of, _)| *of == number);
-        let held = at.and_then(|at| passing.held.remove(at));
-        drop(passing);
-        drop(held);
-    }
-}
-
-/// On drop, tells the leader that its answer has been passed on.
-struct ConfirmOnDrop {
-    leader: Arc<Peer>,
-    term: u64,
-    number: String,
-}
-
-impl Drop for ConfirmOnDrop {
-    fn drop(&mut self) {
-        // Without a runtime, rosrescue is stopping.
-        let Ok(runtime) = Handle::try_current() else {
-            return;
-        };
-        let (leader, term) = (self.leader.clone(), self.term);
-        let call = Control::answer_passed_on(&self.number);
-        let body = Bytes::from(call.encode());
-        runtime.spawn(async move {
-            if let Err(error) = leader.forward(term, &Head::default(), &body).await {
-                tracing::debug!(%error, "could not tell the leader that an answer was passed on");
-            }
-        });
-    }
 }
 
 /// A call that is being answered.

@@ -349,33 +349,6 @@ async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
     assert_eq!(answer[1], "the leader does not answer".into());
 }
 
-/// Sends a report when it is dropped.
-struct SendOnDrop(mpsc::Sender<u64>, u64);
-
-impl Drop for SendOnDrop {
-    fn drop(&mut self) {
-        let _ = self.0.try_send(self.1);
-    }
-}
-
-#[test]
-fn an_answer_is_held_until_its_follower_has_passed_it_on_or_says_nothing() {
-    let (tell, mut told) = mpsc::channel(8);
-    let passing = ForwardedAnswers::default();
-    let now = Instant::now();
-    let keep = |at, number| passing.add(at, UntilWritten::new(SendOnDrop(tell.clone(), number)));
-    let first = keep(now, 1);
-    let second = keep(now, 2);
-    assert!(told.try_recv().is_err());
-    passing.release(second);
-    passing.release(second);
-    assert_eq!(told.try_recv(), Ok(2));
-    assert_ne!(first, second);
-    keep(now + 2 * ANSWER_LIMIT, 3);
-    assert_eq!(told.try_recv(), Ok(1));
-    assert!(told.try_recv().is_err());
-}
-
 /// A follower passes on to its caller what a leader answers, and tells the leader when the caller
 /// has it.
 #[tokio::test]
