@@ -1,0 +1,147 @@
+//! ROS's programs: finds them, and prepares the commands that run them.
+
+use std::{
+    ffi::OsStr,
+    path::{Path, PathBuf},
+    process::Stdio,
+    time::Duration,
+};
+
+use tokio::process::Command;
+
+use crate::guardian::handover;
+
+/// The PATH that systemd gives to services.
+pub(crate) const SERVICE_PATH: &str =
+    "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin";
+
+/// Where ROS installs programs that are not on the PATH.
+const ROS_PREFIXES: &str = "/opt/ros";
+
+/// The interpreter and its arguments in the first line of `program`, if it is a Python script.
+pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
+    let text = std::fs::read(program).ok()?;
+    let line = text.split(|byte| *byte == b'\n').next()?;
+    let words = std::str::from_utf8(line).ok()?.strip_prefix("#!")?;
+    let words: Vec<_> = words.split_whitespace().map(str::to_owned).collect();
+    let is_python = |word: &String| word.rsplit('/').next()?.strip_prefix("python").map(drop);
+    words.last().and_then(is_python).map(|()| words)
+}
+
+/// A command that runs `python` without output, with the paths of the ROS installation that
+/// contains `program`.
+pub(crate) fn python(python: &Path, program: &Path) -> Command {
+    let mut command = command(python);
+    add_ros_paths(&mut command, program, 2);
+    command.stdin(Stdio::null()).kill_on_drop(true);
+    command
+}
+
+/// A command that runs `program` without the variables that are meant for rosrescue alone.
+pub(super) fn command(program: &Path) -> Command {
+    let mut command = Command::new(program);
+    handover::keep_from(command.as_std_mut());
+    command
+}
+
+/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these paths to
+/// find modules and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders
+/// between the installation and the program.
+pub(super) fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
+    let Some(prefix) = program
+        .ancestors()
+        .nth(depth)
+        .filter(|p| p.starts_with(ROS_PREFIXES))
+    else {
+        return;
+    };
+    for (variable, folder) in [
+        ("PYTHONPATH", "lib/python3/dist-packages"),
+        ("LD_LIBRARY_PATH", "lib"),
+    ] {
+        let own = std::env::var_os(variable).unwrap_or_default();
+        let paths = [prefix.join(folder)]
+            .into_iter()
+            .chain(std::env::split_paths(&own));
+        let paths = paths.filter(|path| !path.as_os_str().is_empty());
+        if let Ok(joined) = std::env::join_paths(paths) {
+            command.env(variable, joined);
+        }
+    }
+}
+
+/// The output of `program`, if it ends within `limit`, in the form that roslaunch's `command=` would use.
+pub(crate) async fn output_of(
+    program: &str,
+    arguments: &[&str],
+    limit: Duration,
+) -> Option<String> {
+    let mut command = command(&find_program(program, &["bin"])?);
+    command
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .kill_on_drop(true);
+    let output = tokio::time::timeout(limit, command.output())
+        .await
+        .ok()?
+        .ok()?;
+    output
+        .status
+        .success()
+        .then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// Finds a program on the PATH, or else in one of `folders` of a ROS installation.
+pub(crate) fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    find_program_on(&path, name, folders)
+}
+
+pub(super) fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf> {
+    let on_path = std::env::split_paths(path)
+        .map(|folder| folder.join(name))
+        .find(|p| is_program(p));
+    on_path.or_else(|| {
+        let mut distributions: Vec<_> = std::fs::read_dir(ROS_PREFIXES)
+            .ok()?
+            .flatten()
+            .map(|entry| entry.path())
+            .collect();
+        // Newer distributions have later names (kinetic, melodic, noetic), so the last name is tried first.
+        distributions.sort();
+        let candidates = distributions.iter().rev();
+        let mut programs =
+            candidates.flat_map(|prefix| folders.iter().map(|f| prefix.join(f).join(name)));
+        programs.find(|path| is_program(path))
+    })
+}
+
+pub(super) fn is_program(path: &Path) -> bool {
+    use std::os::unix::fs::PermissionsExt;
+    path.metadata()
+        .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ros_in_opt_gets_its_own_paths() {
+        let paths = |program: &str, depth| {
+            let mut command = Command::new(program);
+            add_ros_paths(&mut command, Path::new(program), depth);
+            let set = command.as_std().get_envs();
+            let set = set.filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
+            set.collect::<std::collections::HashMap<_, _>>()
+        };
+        let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
+        let python = std::env::split_paths(&set[OsStr::new("PYTHONPATH")]).next();
+        assert_eq!(
+            python.unwrap(),
+            Path::new("/opt/ros/noetic/lib/python3/dist-packages")
+        );
+        assert!(paths("/usr/bin/rosmaster", 2).is_empty());
+    }
+}
