@@ -3,40 +3,39 @@
 //! The units are static: the Debian package has them, and `install` writes them where the package is missing. What
 //! differs from robot to robot is in a drop-in for each unit.
 
+mod caller;
+mod service;
+mod system_changes;
+mod unit_paths;
 mod units;
 
 use std::{
     collections::BTreeMap,
-    ffi::OsString,
-    fmt, fs,
-    io::{self, IsTerminal},
+    fs, io,
     net::{SocketAddr, TcpListener},
     path::{Path, PathBuf},
-    process::{self as system, Stdio},
     time::Duration,
 };
 
-use clap::{CommandFactory, FromArgMatches};
-use serde::Serialize;
-
-use self::units::{MARK, UnitSettings};
+use self::{
+    caller::{account, caller_environment, named_user},
+    service::{Service, read_service},
+    system_changes::{Change, SystemChanges, carry_out},
+    unit_paths::{UNITS, UnitPaths},
+    units::{MARK, UnitSettings},
+};
 use super::{
-    CommandFailure, Exit, agrees,
+    CommandFailure, Exit,
     check::units::{self as others, UnitKind},
-    eprint_line, print,
 };
 use crate::{
-    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs, config_file},
-    config::Config,
-    printable::{Lines, Page, display_lines, line},
+    cli::{InstallArgs, ScopeArgs, UninstallArgs},
     process, resolver,
     ros_env::MasterUri,
-    server::listener,
 };
 
 /// Longest time for the lookup of the host in `ROS_MASTER_URI`.
 const LOOKUP: Duration = Duration::from_secs(6);
-const UNITS: [&str; 2] = ["rosrescue.service", "rosrescue.socket"];
 /// ROS's variables that concern the master.
 const SETTINGS: [&str; 5] = [
     "ROS_MASTER_URI",
@@ -47,24 +46,6 @@ const SETTINGS: [&str; 5] = [
 ];
 /// Further variables that a ROS in an unusual place needs. Its `setup.bash` sets them.
 const PATHS: [&str; 4] = ["PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ROS_PACKAGE_PATH"];
-
-/// One change to the computer.
-#[derive(Debug, Serialize)]
-#[serde(tag = "change", rename_all = "snake_case")]
-enum Change {
-    Write { path: PathBuf, text: String },
-    Remove { path: PathBuf },
-    Run { command: Vec<String> },
-}
-
-/// All changes in order, and notes for the operator.
-#[derive(Debug, Default, Serialize)]
-struct SystemChanges {
-    changes: Vec<Change>,
-    notes: Vec<String>,
-    /// Reasons not to make the changes.
-    obstacles: Vec<String>,
-}
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let place = UnitPaths::new(&args.scope)?;
@@ -88,83 +69,6 @@ fn needs_root(place: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure>
         "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
         words.join(" ")
     )))
-}
-
-/// Where the unit files go, and which systemd runs the service.
-struct UnitPaths {
-    /// Whether the service is a user's own, and not the system's.
-    user: bool,
-    units: PathBuf,
-}
-
-impl UnitPaths {
-    fn new(args: &ScopeArgs) -> Result<Self, CommandFailure> {
-        let (user, units) = (args.user, PathBuf::from("/etc/systemd/system"));
-        if !user {
-            return Ok(Self { user, units });
-        }
-        if rustix::process::geteuid().is_root() && std::env::var_os("SUDO_USER").is_some() {
-            let text = "--user: run it as yourself, without sudo";
-            return Err(CommandFailure::Usage(text.to_owned()));
-        }
-        let folder = |name: &str| {
-            let folder = std::env::var_os(name).map(PathBuf::from);
-            folder.filter(|folder| folder.is_absolute())
-        };
-        let config = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
-        let config =
-            config.ok_or_else(|| CommandFailure::Usage("--user: HOME is not set".to_owned()))?;
-        let units = config.join("systemd/user");
-        Ok(Self { user, units })
-    }
-
-    /// Whether the Debian package provides the units: only for the system's systemd, and only if `program` is the
-    /// package's.
-    fn is_packaged(&self, program: &Path) -> bool {
-        let unit = Path::new("/usr/lib/systemd/system").join(UNITS[0]);
-        !self.user && program == Path::new("/usr/bin/rosrescue") && unit.exists()
-    }
-
-    /// The two units and their drop-ins.
-    fn files(&self) -> [PathBuf; 4] {
-        let [service, socket] = UNITS.map(|unit| self.units.join(unit));
-        let dropins = UNITS.map(|unit| self.units.join(format!("{unit}.d/install.conf")));
-        let [service_dropin, socket_dropin] = dropins;
-        [service, socket, service_dropin, socket_dropin]
-    }
-
-    fn systemctl(&self, words: &[&str]) -> Vec<String> {
-        let manager: &[&str] = match self.user {
-            true => &["systemctl", "--user"],
-            false => &["systemctl"],
-        };
-        let words = manager.iter().chain(words);
-        words.map(|&word| word.to_owned()).collect()
-    }
-
-    /// Whether systemctl confirms `question`, such as `is-active`, for `unit`.
-    fn systemctl_confirms(&self, question: &str, unit: &str) -> bool {
-        let command = self.systemctl(&[question, "--quiet", unit]);
-        run_command(&command, Stdio::null()).is_ok_and(|status| status.success())
-    }
-
-    /// Whether systemd runs and can start the service.
-    fn systemd_runs(&self) -> bool {
-        let run = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
-        Path::new("/run/systemd/system").exists()
-            && (!self.user || run.is_some_and(|run| run.join("systemd/private").exists()))
-    }
-
-    /// The systemctl option that starts or stops a unit at once, if systemd runs.
-    fn now_option(&self) -> &'static [&'static str] {
-        if self.systemd_runs() { &["--now"] } else { &[] }
-    }
-
-    fn other_units(&self) -> Vec<others::Unit> {
-        let user = [self.units.clone(), "/etc/systemd/user".into()];
-        let folders = if self.user { &user[..] } else { &[] };
-        others::in_folders(folders, !self.user)
-    }
 }
 
 async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges, CommandFailure> {
@@ -328,38 +232,7 @@ fn uninstall(place: &UnitPaths) -> SystemChanges {
     plan
 }
 
-/// Shows the plan, asks, and makes the changes.
-fn carry_out(plan: &SystemChanges, args: &ScopeArgs) -> Result<Exit, CommandFailure> {
-    if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
-        print(plan, &args.output)?;
-        return Ok(if plan.obstacles.is_empty() {
-            Exit::Good
-        } else {
-            Exit::Bad
-        });
-    }
-    if args.yes {
-        print(plan, &args.output)?;
-    } else if args.output.json || !io::stdin().is_terminal() {
-        let text = "cannot ask here: look at the changes with --dry-run, then make them with --yes";
-        return Err(CommandFailure::Usage(text.to_owned()));
-    } else {
-        plan.to_string().lines().for_each(eprint_line);
-        if !agrees("Make these changes?").unwrap_or(false) {
-            return Err(CommandFailure::Failed("changed nothing".to_owned()));
-        }
-    }
-    for change in &plan.changes {
-        change.apply()?;
-    }
-    Ok(Exit::Good)
-}
-
 impl SystemChanges {
-    fn run(&mut self, command: Vec<String>) {
-        self.changes.push(Change::Run { command });
-    }
-
     /// Handles other units that start a master or roslaunch. Returns those to disable, and those to start after
     /// rosrescue.
     fn plan_other_units(
@@ -424,154 +297,6 @@ impl SystemChanges {
     }
 }
 
-impl Change {
-    fn apply(&self) -> Result<(), CommandFailure> {
-        match self {
-            Self::Write { path, text } => {
-                let folder = path.parent().unwrap_or(path);
-                let written = fs::create_dir_all(folder).and_then(|()| fs::write(path, text));
-                written.map_err(|error| {
-                    CommandFailure::Failed(format!("cannot write {}: {error}", path.display()))
-                })
-            }
-            Self::Remove { path } => {
-                let removed = fs::remove_file(path);
-                // The folder may hold drop-ins of others.
-                if let Some(folder) = path
-                    .parent()
-                    .filter(|it| it.extension().is_some_and(|end| end == "d"))
-                {
-                    let _ = fs::remove_dir(folder);
-                }
-                removed.map_err(|error| {
-                    CommandFailure::Failed(format!("cannot remove {}: {error}", path.display()))
-                })
-            }
-            Self::Run { command } => {
-                let said = command.join(" ");
-                match run_command(command, Stdio::inherit()) {
-                    Ok(status) if status.success() => Ok(()),
-                    Ok(status) => Err(CommandFailure::Failed(format!(
-                        "`{said}` failed ({status}): see above, or `journalctl -u rosrescue`. `rosrescue uninstall` \
-                         undoes what was done"
-                    ))),
-                    Err(error) => Err(CommandFailure::Failed(format!("`{said}`: {error}"))),
-                }
-            }
-        }
-    }
-}
-
-impl Lines for SystemChanges {
-    fn lines(&self, f: &mut Page) -> fmt::Result {
-        if self.changes.is_empty() {
-            line!(f, "nothing to change")?;
-        }
-        for change in &self.changes {
-            match change {
-                Change::Write { path, text } => {
-                    line!(f, "write   {}", path.display())?;
-                    for line in text.lines() {
-                        line!(f, "        {line}")?;
-                    }
-                }
-                Change::Remove { path } => line!(f, "remove  {}", path.display())?,
-                Change::Run { command } => line!(f, "run     {}", command.join(" "))?,
-            }
-        }
-        for note in &self.notes {
-            line!(f, "note    {note}")?;
-        }
-        for obstacle in &self.obstacles {
-            line!(f, "cannot  {obstacle}")?;
-        }
-        Ok(())
-    }
-}
-
-display_lines!(SystemChanges);
-
-fn run_command(words: &[String], errors: Stdio) -> io::Result<system::ExitStatus> {
-    let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
-    let mut command = system::Command::new(program);
-    let command = command.args(arguments).stdin(Stdio::null());
-    command.stdout(Stdio::null()).stderr(errors).status()
-}
-
-/// The environment of the user who called sudo. sudo clears it, but sudo's own process still has it.
-fn caller_environment() -> BTreeMap<String, String> {
-    let own = std::env::vars_os()
-        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
-    let own: BTreeMap<_, _> = own.collect();
-    let parent = rustix::process::getppid().filter(|_| own.contains_key("SUDO_USER"));
-    let of_sudo = parent.and_then(|parent| {
-        let parent = PathBuf::from(format!("/proc/{}", parent.as_raw_pid()));
-        let name = fs::read_to_string(parent.join("comm")).ok()?;
-        (name.trim() == "sudo").then(|| fs::read(parent.join("environ")).ok())?
-    });
-    let Some(environ) = of_sudo else { return own };
-    let pairs = environ.split(|byte| *byte == 0).filter_map(|pair| {
-        let (name, value) = std::str::from_utf8(pair).ok()?.split_once('=')?;
-        Some((name.to_owned(), value.to_owned()))
-    });
-    // Only this process's environment has sudo's variables about the caller.
-    let of_caller = own.iter().filter(|(name, _)| name.starts_with("SUDO_"));
-    pairs
-        .chain(of_caller.map(|(name, value)| (name.clone(), value.clone())))
-        .collect()
-}
-
-/// The user that runs the service, if an option or sudo names it.
-fn named_user(args: &InstallArgs, caller: &BTreeMap<String, String>) -> Option<String> {
-    let of_caller = || caller.get("SUDO_USER").cloned();
-    args.run_as.clone().or_else(of_caller)
-}
-
-/// The name of the user who runs this process.
-fn own_name() -> Result<String, CommandFailure> {
-    let output = system::Command::new("id").arg("-un").output();
-    let name = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
-    let name = name.map_err(|error| CommandFailure::Failed(format!("id: {error}")))?;
-    Some(name)
-        .filter(|name| !name.is_empty())
-        .ok_or_else(|| CommandFailure::Failed("this user has no name: use --run-as".to_owned()))
-}
-
-/// The user that runs the service. `None` for a user's own service. A dry run needs no sudo.
-fn account(
-    args: &InstallArgs,
-    place: &UnitPaths,
-    caller: &BTreeMap<String, String>,
-) -> Result<Option<String>, CommandFailure> {
-    if place.user {
-        return Ok(None);
-    }
-    let Some(user) = named_user(args, caller) else {
-        return match args.scope.dry_run {
-            true => own_name().map(Some),
-            false => Err(CommandFailure::Usage(
-                "name the user that runs the service, as in --run-as robot: without sudo, install cannot know it"
-                    .to_owned(),
-            )),
-        };
-    };
-    let nobody = || {
-        CommandFailure::Usage(format!(
-            "--run-as: there is no user `{user}` on this computer"
-        ))
-    };
-    if user.starts_with('-') {
-        return Err(nobody());
-    }
-    let getent = ["getent", "passwd", &user].map(str::to_owned);
-    let status = run_command(&getent, Stdio::null());
-    let status = status.map_err(|error| CommandFailure::Failed(format!("getent: {error}")))?;
-    status
-        .success()
-        .then_some(Some(user.clone()))
-        .ok_or_else(nobody)
-}
-
 /// Why root's service must not run the program at this path: its owner could replace it.
 fn misplaced(program: &Path) -> Option<String> {
     let folders = ["/usr", "/opt", "/bin"];
@@ -594,78 +319,4 @@ async fn other_master(settings: &BTreeMap<String, String>, served: &MasterUri) -
         "ROS_MASTER_URI={given} {why}: nodes started with it would not use this service. Run `export \
          ROS_MASTER_URI={served}`"
     ))
-}
-
-/// A parsed service command.
-struct Service {
-    listen: Vec<SocketAddr>,
-    /// The address where nodes find the service.
-    advertised: MasterUri,
-    /// Whether the command is `core`, which starts the master itself.
-    runs_rosmaster: bool,
-    /// Whether the service must find rosmaster on the PATH.
-    searches_rosmaster: bool,
-}
-
-/// Parses a service's command. The service gets none of the caller's ROSRESCUE_ variables.
-fn read_service(
-    words: &[String],
-    settings: &BTreeMap<String, String>,
-) -> Result<Service, CommandFailure> {
-    let usage = |why: String| CommandFailure::Usage(format!("`{}`: {why}", words.join(" ")));
-    let command = Cli::command()
-        .mut_args(|option| option.env(None::<&str>))
-        .mut_subcommands(|command| command.mut_args(|option| option.env(None::<&str>)));
-    let mut all = vec![OsString::from("rosrescue")];
-    all.extend(words.iter().map(OsString::from));
-    config_file::insert(&command, &mut all).map_err(usage)?;
-    let matches = command.try_get_matches_from(all).map_err(|error| {
-        let text = error.to_string();
-        let lines = text.lines().take_while(|line| !line.is_empty());
-        let said = lines.map(str::trim).collect::<Vec<_>>().join(" ");
-        usage(said.trim_start_matches("error: ").to_owned())
-    })?;
-    let cli = Cli::from_arg_matches(&matches).map_err(|error| usage(error.to_string()))?;
-    let env = |name: &str| settings.get(name).cloned();
-    let hostname = rustix::system::uname()
-        .nodename()
-        .to_string_lossy()
-        .into_owned();
-    let local = listener::local_address();
-    let core = match &cli.command {
-        Some(Command::Core(args)) => args,
-        None => &cli.core,
-        Some(Command::Proxy(_)) => &cli.core,
-        Some(Command::Tool(_)) => return Err(usage("a service runs `core` or `proxy`".to_owned())),
-    };
-    let (config, common, rosmaster) = match &cli.command {
-        Some(Command::Proxy(args)) => (
-            Config::proxy(args, &env, &hostname, local),
-            &args.common,
-            None,
-        ),
-        _ => (
-            Config::core(core, &env, &hostname, local),
-            &core.common,
-            Some(&core.rosmaster),
-        ),
-    };
-    let files = [
-        common.config.as_ref(),
-        common.checkpoint.as_ref(),
-        rosmaster.and_then(Option::as_ref),
-    ];
-    if let Some(file) = files.into_iter().flatten().find(|file| file.is_relative()) {
-        let file = file.display();
-        return Err(usage(format!(
-            "write the full path of {file}: a service starts in /"
-        )));
-    }
-    let config = config.map_err(|error| usage(error.to_string()))?;
-    Ok(Service {
-        listen: config.listen,
-        advertised: config.advertised,
-        runs_rosmaster: rosmaster.is_some(),
-        searches_rosmaster: rosmaster.is_some_and(Option::is_none),
-    })
 }
