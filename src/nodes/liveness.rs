@@ -198,7 +198,7 @@ fn check_nodes(nodes: &Arc<Nodes>) {
         |port| listens.get(port).copied(),
         Instant::now(),
     );
-    local::bury(nodes, &names);
+    local::unregister_dead(nodes, &names);
     let listening = Arc::new(listening);
     for port in due {
         crate::task::spawn(probe_port(nodes.clone(), port, listening.clone()));

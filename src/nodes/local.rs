@@ -1,33 +1,33 @@
-//! The nodes of this computer, as the kernel shows them: who listens at their ports, and whose process has ended. Also
-//! recognises calls that would make the master shut down an innocent node.
+//! The nodes of this computer, as the kernel shows them: who listens at their ports, and whose process has ended.
+
+mod moves;
+mod unregister_dead;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
     net::{IpAddr, SocketAddr},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Mutex, MutexGuard, PoisonError},
     time::Instant,
 };
 
 use rescue_core::{
     health::{
-        AddressChanges, Death, Eviction, Evidence, Feud, Feuds, LocalName, Moving, NodeAddresses,
-        Reach, Reap, Registrants, port_of,
+        AddressChanges, Evidence, Feuds, LocalName, Moving, NodeAddresses, Reach, Reap,
+        Registrants, port_of,
     },
     replay::Token,
 };
-use ros1_master::master::{Master, Request};
 use tokio::sync::Notify;
 
-use super::{Nodes, health_check, liveness, origin::log_misaddressed};
+pub(super) use self::unregister_dead::unregister_dead;
+use super::{liveness, origin::log_misaddressed};
 use crate::{
     clock,
-    ledger::{Ledger, activity::LastCalls},
-    limit::rarely,
+    ledger::Ledger,
     process::listeners,
     resolver,
     status::{stats::Stats, summary::Misaddressed},
     upstream::sockets,
-    write_queue::MoveJudge,
 };
 
 /// The listening sockets of this computer, by address.
@@ -274,37 +274,6 @@ impl LocalNodes {
             .registrants
             .evidence(node, port, &sockets, ended, Instant::now())
     }
-
-    /// The feuds of this moment.
-    pub(crate) fn feuds(&self) -> Vec<Feud> {
-        let mut feuds = self.feuds.lock().unwrap_or_else(PoisonError::into_inner);
-        feuds.list(Instant::now())
-    }
-
-    fn note_feud(&self, moving: &Moving, evidence: Evidence) {
-        let lived = match evidence {
-            Evidence::Listens => Some(true),
-            Evidence::Ended(_) | Evidence::Replaced => Some(false),
-            Evidence::Unknown => None,
-        };
-        let addresses = (moving.from.as_str(), moving.to.as_str());
-        let mut feuds = self.feuds.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(feud) = feuds.displaced(&moving.node, addresses, lived, Instant::now()) {
-            let Feud {
-                node,
-                from,
-                to,
-                times,
-            } = feud;
-            tracing::warn!(
-                node,
-                from,
-                to,
-                times,
-                "two programs take a node name from each other, and the master shuts one down each time; stop one of them or give it another name (__name:=)"
-            );
-        }
-    }
 }
 
 impl KernelFacts {
@@ -334,68 +303,6 @@ impl KernelFacts {
     }
 }
 
-impl MoveJudge for LocalNodes {
-    fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
-        calls
-            .iter()
-            .position(|call| Moving::moves_any(mirror, call))
-    }
-
-    fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
-        let moving = ledger.with_mirror(|mirror| Moving::caused_by(mirror, call));
-        if moving.is_empty() {
-            return None;
-        }
-        let mut gone = BTreeSet::new();
-        for moving in moving {
-            let evidence = self.evidence_now(&moving);
-            self.note_feud(&moving, evidence);
-            let hits_another = moving.hits_another(evidence);
-            if moving.is_unregistered_first(self.reap, evidence) {
-                if hits_another {
-                    self.stats.shutdowns_prevented.count();
-                    log_prevented_shutdown(&moving);
-                }
-                gone.insert(moving.node);
-            } else if hits_another {
-                self.stats.shutdowns_misdirected.count();
-                log_misdirected_shutdown(&moving);
-            }
-        }
-        Some(ledger.with_mirror(|mirror| Eviction::for_nodes(mirror, gone)))
-    }
-
-    fn registered(&self) {
-        self.registered.notify_one();
-    }
-}
-
-fn log_prevented_shutdown(moving: &Moving) {
-    let Moving {
-        node, from, others, ..
-    } = moving;
-    rarely!(
-        info,
-        node,
-        from,
-        ?others,
-        "a node has moved, and another node uses its old port: unregistered the old node first, so that the master does not shut down the other one"
-    );
-}
-
-fn log_misdirected_shutdown(moving: &Moving) {
-    let Moving {
-        node, from, others, ..
-    } = moving;
-    rarely!(
-        warn,
-        node,
-        from,
-        ?others,
-        "the master shuts down the wrong node: a node has moved, and another one uses its old port. `--reap local` prevents this"
-    );
-}
-
 impl Named {
     fn local(&self) -> LocalName<'_> {
         LocalName {
@@ -414,68 +321,4 @@ fn accepting(listening: &Listening, addresses: &[SocketAddr]) -> Vec<u64> {
         .flat_map(|address| sockets::accepting(listening, *address))
         .collect();
     sockets.into_iter().collect()
-}
-
-/// Reports or unregisters the nodes of `names` that are proved dead. Does nothing while the mirror answers in the
-/// master's place: the health check afterwards deals with dead nodes.
-pub(super) fn bury(nodes: &Arc<Nodes>, names: &[Named]) {
-    if !nodes.gate.is_open() {
-        return;
-    }
-    for name in names {
-        let Evidence::Ended(death) = nodes.local.evidence(&name.node) else {
-            continue;
-        };
-        let others: Vec<_> = names
-            .iter()
-            .filter(|other| other.port == name.port && other.node != name.node)
-            .map(|other| other.node.as_str())
-            .collect();
-        if !death.is_certain(!others.is_empty()) {
-            continue;
-        }
-        let mut known = nodes.local.lock();
-        if known.handled.get(&name.node) == Some(&death.registered) {
-            continue;
-        }
-        known.handled.insert(name.node.clone(), death.registered);
-        drop(known);
-        let node = &name.node;
-        let how = how(&death, &others);
-        if nodes.local.reap == Reap::Report {
-            rarely!(info, "would have unregistered {node}: {how} (--reap local)");
-            continue;
-        }
-        crate::task::spawn(unregister(
-            nodes.clone(),
-            name.node.clone(),
-            name.api.clone(),
-            death,
-            how,
-        ));
-    }
-}
-
-async fn unregister(nodes: Arc<Nodes>, node: String, api: String, death: Death, how: String) {
-    let same = |calls: LastCalls| calls.registered == death.registered && nodes.gate.is_open();
-    if health_check::remove(&nodes, &node, &api, same).await {
-        nodes.stats.dead_nodes_reaped.count();
-        rarely!(info, "unregistered {node}: {how}");
-    } else {
-        // The next look tries again, if the node is still registered.
-        nodes.local.lock().handled.remove(&node);
-    }
-}
-
-/// How a node has ended, as in `its process 7 ended at 14:03:01, nobody listens at its port`. `others` are the other names
-/// at its port.
-fn how(death: &Death, others: &[&str]) -> String {
-    let at = clock::wall_text(clock::wall_time_of(death.since));
-    let time = at.get(11..19).unwrap_or(&at);
-    let process = death.process.pid;
-    let port = match death.taken {
-        false => "nobody listens at its port".to_owned(),
-        true => format!("{} uses its port now", others.join(", ")),
-    };
-    format!("its process {process} ended at {time}, {port}")
 }

@@ -177,6 +177,7 @@ fn only_the_clock_reads_the_wall_clock() {
         "commands/check/facts.rs",
         "nodes/addresses.rs",
         "nodes/liveness.rs",
+        "nodes/local/unregister_dead.rs",
         "nodes/local.rs",
         "recovery/reporting.rs",
         "server/clients.rs",
