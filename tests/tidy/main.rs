@@ -174,7 +174,7 @@ fn only_the_clock_reads_the_wall_clock() {
     let expected = [
         "app/startup.rs",
         "clock.rs",
-        "commands/check/facts.rs",
+        "commands/check/facts/clock.rs",
         "nodes/addresses.rs",
         "nodes/liveness.rs",
         "nodes/local/unregister_dead.rs",

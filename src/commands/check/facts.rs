@@ -1,21 +1,30 @@
 //! Gathers facts about this computer.
 
+mod clock;
+mod disk;
+mod host;
+mod lease;
+mod processes;
+
 use std::{
-    collections::{BTreeMap, BTreeSet},
-    fs, io,
+    collections::BTreeSet,
+    fs,
     net::IpAddr,
     path::{Path, PathBuf},
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
-use checkpoint_store::LockHolder;
-use rustix::{
-    fs::{Access, StatVfsMountFlags},
-    process::{Resource, getrlimit},
-};
-use tokio::{task::JoinSet, time::timeout};
+use rustix::process::{Resource, getrlimit};
+use tokio::time::timeout;
 
+pub(super) use self::{
+    clock::Clock, disk::CheckpointDisk, host::Host, lease::Lease, processes::Process,
+};
+use self::{
+    host::hosts_of,
+    processes::{masters, strays},
+};
 use super::{
     computers::{Cluster, Unusable},
     launch::{self, Launches},
@@ -26,32 +35,20 @@ use super::{
 };
 use crate::{
     cli::CheckArgs,
-    clock, config,
+    config,
     process::{
-        self, Rosout,
+        Rosout,
         bypass::{Bypass, MasterAddresses},
         listeners,
     },
-    resolver,
     ros_env::{self, MasterUri, UriError},
     server::listener::{self, ListenError},
 };
 
 /// Longest time for one name lookup. A dead name server takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
-/// Maximum number of nodes that are named for each host.
-const NAMED: usize = 3;
 /// Maximum number of addresses in launch files that are looked up.
 const LOOKUPS_MOST: usize = 4;
-/// Names of services that set the clock.
-const CLOCKS: [&str; 6] = [
-    "systemd-timesyn",
-    "chronyd",
-    "ntpd",
-    "openntpd",
-    "ptp4l",
-    "phc2sys",
-];
 
 /// All facts that `rosrescue check` judges.
 #[derive(Clone, Debug)]
@@ -120,42 +117,6 @@ pub(super) struct Environment {
     pub(super) hostname: Option<String>,
 }
 
-/// A name or an address, with the addresses that it resolves to.
-#[derive(Clone, Debug)]
-pub(super) struct Host {
-    pub(super) name: String,
-    pub(super) addresses: Result<Vec<IpAddr>, String>,
-    /// Whether one of the addresses belongs to this computer.
-    pub(super) is_here: bool,
-    pub(super) took: Duration,
-}
-
-impl Host {
-    async fn find(name: &str) -> Self {
-        let start = Instant::now();
-        let found = match timeout(LOOKUP_LIMIT, resolver::addresses(name, 0)).await {
-            Ok(found) => found.map_err(|error| error.to_string()),
-            Err(_) => Err(format!(
-                "no name server answered in {} s",
-                LOOKUP_LIMIT.as_secs()
-            )),
-        };
-        let addresses = found.map(|found| found.iter().map(|at| at.ip()).collect::<Vec<_>>());
-        let mut all = addresses.iter().flatten();
-        Self {
-            name: name.to_owned(),
-            is_here: all.any(|address| resolver::is_own(*address)),
-            addresses,
-            took: start.elapsed(),
-        }
-    }
-
-    pub(super) fn is_loopback(&self) -> bool {
-        let addresses = self.addresses.as_deref().unwrap_or_default();
-        !addresses.is_empty() && addresses.iter().all(IpAddr::is_loopback)
-    }
-}
-
 #[derive(Clone, Debug)]
 pub(super) struct Port {
     pub(super) number: u16,
@@ -169,55 +130,6 @@ pub(super) struct Port {
 pub(super) struct PortInUse {
     pub(super) by: Vec<Process>,
     pub(super) server: ros::Responder,
-}
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Process {
-    pub(super) pid: u32,
-    /// The program's name.
-    pub(super) name: String,
-    pub(super) ports: Vec<u16>,
-}
-
-impl Process {
-    fn read(pid: u32) -> Self {
-        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        Self {
-            pid,
-            name: name.trim_end().to_owned(),
-            ports: listeners::ports(pid),
-        }
-    }
-}
-
-/// The file system of the checkpoint.
-#[derive(Clone, Debug)]
-pub(super) struct CheckpointDisk {
-    pub(super) checkpoint: PathBuf,
-    /// The checkpoint's folder, or its nearest parent that exists.
-    pub(super) folder: PathBuf,
-    /// Free bytes, and whether the file system is mounted read-only. An error says why both are unknown.
-    pub(super) space: Result<(u64, bool), String>,
-    /// How many more files can be created. `None` if the file system has no limit.
-    pub(super) inodes: Option<u64>,
-    /// Why rosrescue cannot write into the folder. `None` if it can.
-    pub(super) refused: Option<String>,
-    /// Type and source of the file system, such as `ext4` and `/dev/sda1`.
-    pub(super) mount: Option<(String, String)>,
-    /// Another rosrescue that uses the checkpoint.
-    pub(super) holder: Option<LockHolder>,
-    /// Whether the checkpoint's path is a folder.
-    pub(super) is_folder: bool,
-}
-
-#[derive(Clone, Debug)]
-pub(super) struct Clock {
-    /// The clock's time, in seconds since 1970.
-    pub(super) now: f64,
-    /// When the newest known file was changed, in seconds since 1970.
-    pub(super) newest: f64,
-    /// The service that sets the clock.
-    pub(super) service: Option<String>,
 }
 
 impl SetupFacts {
@@ -373,24 +285,6 @@ impl SetupFacts {
     }
 }
 
-/// Hosts of `nodes`, each with some of its nodes.
-async fn hosts_of(nodes: &[(String, MasterUri)]) -> Vec<(Host, Vec<String>)> {
-    let mut hosts = BTreeMap::<_, Vec<String>>::new();
-    for (name, address) in nodes {
-        let nodes = hosts.entry(address.host.clone()).or_default();
-        if nodes.len() < NAMED {
-            nodes.push(name.clone());
-        }
-    }
-    let mut lookups = JoinSet::new();
-    for (host, nodes) in hosts {
-        lookups.spawn(async move { (Host::find(&host).await, nodes) });
-    }
-    let mut hosts = lookups.join_all().await;
-    hosts.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
-    hosts
-}
-
 impl Port {
     async fn inspect(number: u16) -> Self {
         let env = |name: &str| std::env::var(name).ok();
@@ -458,116 +352,6 @@ impl UpstreamMaster {
     }
 }
 
-impl CheckpointDisk {
-    fn inspect(checkpoint: PathBuf) -> Self {
-        let whole = std::path::absolute(&checkpoint).unwrap_or_else(|_| checkpoint.clone());
-        let mut above = whole.ancestors().skip(1);
-        let folder = above.find(|folder| folder.is_dir());
-        let folder = folder.unwrap_or_else(|| Path::new("/")).to_owned();
-        let folder = folder.canonicalize().unwrap_or(folder);
-        let space = rustix::fs::statvfs(&folder).map_err(|error| error.to_string());
-        let inodes = space.as_ref().ok().filter(|space| space.f_files > 0);
-        let inodes = inodes.map(|space| space.f_favail);
-        let space = space.map(|space| {
-            let is_read_only = space.f_flag.contains(StatVfsMountFlags::RDONLY);
-            (space.f_bavail.saturating_mul(space.f_frsize), is_read_only)
-        });
-        let may_write = |path: &Path| rustix::fs::access(path, Access::WRITE_OK);
-        let is_missing = |error: &rustix::io::Errno| *error == rustix::io::Errno::NOENT;
-        let refused = rustix::fs::access(&folder, Access::WRITE_OK | Access::EXEC_OK).err();
-        let refused =
-            refused.or_else(|| may_write(&whole).err().filter(|error| !is_missing(error)));
-        Self {
-            mount: mount_of(&folder),
-            holder: checkpoint_store::holder_of(&whole),
-            is_folder: whole.is_dir(),
-            checkpoint: whole,
-            folder,
-            space,
-            inodes,
-            refused: refused.map(|error| io::Error::from(error).to_string()),
-        }
-    }
-}
-
-/// Type and source of the file system that holds `folder`, read from the mount table.
-fn mount_of(folder: &Path) -> Option<(String, String)> {
-    let table = fs::read_to_string("/proc/self/mountinfo").ok()?;
-    let mounts = table.lines().filter_map(|line| {
-        let (before, after) = line.split_once(" - ")?;
-        let point = before.split(' ').nth(4)?.replace("\\040", " ");
-        let mut after = after.split(' ');
-        let found = (after.next()?.to_owned(), after.next()?.to_owned());
-        folder.starts_with(&point).then_some((point.len(), found))
-    });
-    // A later mount hides an earlier one at the same place.
-    mounts
-        .max_by_key(|(length, _)| *length)
-        .map(|(_, found)| found)
-}
-
-impl Clock {
-    fn read(checkpoint: &Path) -> Self {
-        let own = std::env::current_exe().unwrap_or_default();
-        let changed = [
-            checkpoint,
-            &own,
-            Path::new("/var/log/syslog"),
-            Path::new("/etc/passwd"),
-        ]
-        .into_iter()
-        .filter_map(|path| rustix::fs::stat(path).ok())
-        .map(|stat| stat.st_mtime as f64);
-        let synchronized = Path::new("/run/systemd/timesync/synchronized").exists();
-        let service = process::all_pids()
-            .map(Process::of_name)
-            .find(|name| CLOCKS.contains(&&**name));
-        Self {
-            now: clock::wall_time(),
-            newest: changed.fold(0.0, f64::max),
-            service: match (synchronized, service) {
-                (true, _) => Some("systemd-timesyncd".to_owned()),
-                (false, service) => service,
-            },
-        }
-    }
-}
-
-impl Process {
-    fn of_name(pid: u32) -> String {
-        process::name_of(pid)
-    }
-}
-
-/// Masters in this network namespace that were not started by rosrescue.
-fn masters() -> Vec<Process> {
-    process::all_pids()
-        .filter(|pid| ["rosmaster", "roscore"].contains(&&*Process::of_name(*pid)))
-        .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
-        .map(Process::read)
-        .collect()
-}
-
-/// Listening processes in this network namespace that were started with another `ROS_MASTER_URI` than `own`. Only root
-/// sees the processes of other users.
-fn strays(own: &str) -> Vec<(Process, String)> {
-    const NAME: &[u8] = b"ROS_MASTER_URI=";
-    let strays = process::all_pids().filter_map(|pid| {
-        let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
-        let mut variables = environment.split(|byte| *byte == 0);
-        let uri = variables.find_map(|variable| variable.strip_prefix(NAME))?;
-        let uri = String::from_utf8_lossy(uri).into_owned();
-        let is_stray = !uri.is_empty() && uri.trim_end_matches('/') != own.trim_end_matches('/');
-        if !is_stray || !process::is_in_our_network(pid) || process::is_of_any(pid) {
-            return None;
-        }
-        let process = Process::read(pid);
-        // Shells have the variable too, but they do not listen.
-        (!process.ports.is_empty() && process.name != "rosrescue").then_some((process, uri))
-    });
-    strays.collect()
-}
-
 /// Whether `uri` leads to the robot's master: to `far`, or to `port` of this computer.
 async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bool {
     let Ok(uri) = MasterUri::parse(uri) else {
@@ -582,63 +366,6 @@ async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bo
     }
 }
 
-/// How this computer got its address.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Lease {
-    pub(super) address: String,
-    pub(super) interface: String,
-    /// Whether DHCP gave the address, and for a limited time.
-    pub(super) is_leased: bool,
-    pub(super) is_wireless: bool,
-}
-
-impl Lease {
-    /// The lease of an address of `host`, if one of them is leased or wireless.
-    async fn find_for_host(host: &Host) -> Option<Self> {
-        for address in host
-            .addresses
-            .iter()
-            .flatten()
-            .filter(|at| !at.is_loopback())
-        {
-            let found = Self::find(&address.to_string()).await;
-            if found.is_some() {
-                return found;
-            }
-        }
-        None
-    }
-
-    /// Asks `ip`, a program of iproute2. `None` if it is not installed.
-    async fn find(address: &str) -> Option<Self> {
-        let mut ip = tokio::process::Command::new("ip");
-        let ip = ip.args(["-o", "addr", "show"]).kill_on_drop(true).output();
-        let output = timeout(LOOKUP_LIMIT, ip).await.ok()?.ok()?;
-        let (interface, is_leased) =
-            interface_of(&String::from_utf8_lossy(&output.stdout), address)?;
-        let is_wireless = Path::new("/sys/class/net")
-            .join(&interface)
-            .join("phy80211")
-            .exists();
-        (is_leased || is_wireless).then_some(Self {
-            address: address.to_owned(),
-            interface,
-            is_leased,
-            is_wireless,
-        })
-    }
-}
-
-/// Finds the interface with `address` in the output of `ip -o addr show`, and whether DHCP gave the address.
-fn interface_of(output: &str, address: &str) -> Option<(String, bool)> {
-    output.lines().find_map(|line| {
-        let words: Vec<_> = line.split_whitespace().collect();
-        let (own, _) = words.get(3)?.split_once('/')?;
-        let found = ((*words.get(1)?).to_owned(), words.contains(&"dynamic"));
-        (own == address).then_some(found)
-    })
-}
-
 fn free_memory() -> Option<u64> {
     let table = fs::read_to_string("/proc/meminfo").ok()?;
     let line = table
@@ -646,47 +373,4 @@ fn free_memory() -> Option<u64> {
         .find_map(|line| line.strip_prefix("MemAvailable:"))?;
     let kib: u64 = line.split_whitespace().next()?.parse().ok()?;
     Some(kib << 10)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test]
-    async fn hosts_are_told_by_their_addresses() {
-        let local = Host::find("127.0.0.1").await;
-        assert!(local.is_here && local.is_loopback());
-        // This network is reserved for documentation.
-        let far = Host::find("192.0.2.1").await;
-        assert!(!far.is_here && !far.is_loopback());
-        let nobody = Host::find("nobody.invalid").await;
-        assert!(!nobody.is_here && !nobody.is_loopback() && nobody.addresses.is_err());
-    }
-
-    #[test]
-    fn a_leased_address_is_known() {
-        let output = "1: lo    inet 127.0.0.1/8 scope host lo\\       valid_lft forever\n\
-             2: wlan0    inet 10.0.0.7/24 brd 10.0.0.255 scope global dynamic wlan0\\       valid_lft 3600sec\n";
-        assert_eq!(
-            interface_of(output, "127.0.0.1"),
-            Some(("lo".to_owned(), false))
-        );
-        assert_eq!(
-            interface_of(output, "10.0.0.7"),
-            Some(("wlan0".to_owned(), true))
-        );
-        assert_eq!(interface_of(output, "10.0.0.8"), None);
-    }
-
-    #[test]
-    fn the_disk_of_a_checkpoint_that_is_not_there_yet_is_known() {
-        let folder = tempfile::tempdir().unwrap();
-        let disk = CheckpointDisk::inspect(folder.path().join("a/b/checkpoint"));
-        assert_eq!(disk.folder, folder.path().canonicalize().unwrap());
-        assert!(disk.space.unwrap().0 > 0);
-        assert!(disk.mount.is_some() && disk.holder.is_none() && disk.refused.is_none());
-        assert!(CheckpointDisk::inspect(folder.path().to_owned()).is_folder);
-        let (of, source) = mount_of(Path::new("/proc/1")).unwrap();
-        assert_eq!((&*of, &*source), ("proc", "proc"));
-    }
 }
