@@ -1,9 +1,15 @@
 //! Judges the facts: what they mean for the robot, and what to do.
 
+mod bypass;
+mod computers;
+mod names;
 mod network;
+mod port;
 mod system;
 #[cfg(test)]
 mod tests;
+mod todo;
+mod variables;
 
 use super::{
     Finding, Severity,

@@ -8,7 +8,7 @@ use super::{
         units::UnitKind,
     },
     Findings, named,
-    network::delete_logs,
+    todo::delete_logs,
 };
 use crate::{clock, status::software};
 
@@ -30,6 +30,7 @@ const SETTINGS_MOST: usize = 10;
 const EARLIEST: f64 = 1_704_067_200.0;
 /// A clock that is this many seconds behind existing files was set back.
 const BEHIND_FILES: f64 = 120.0;
+
 impl Findings {
     pub(super) fn disk(&mut self, disk: &CheckpointDisk, port: Option<&Port>) {
         const SUBJECT: &str = "checkpoint";

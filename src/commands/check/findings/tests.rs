@@ -1,6 +1,10 @@
+mod bypass;
 mod computers;
+mod names;
 mod network;
+mod port;
 mod system;
+mod variables;
 
 use std::{path::PathBuf, time::Duration};
 
@@ -14,6 +18,7 @@ use super::{
     },
     from_facts,
 };
+
 fn host(name: &str, address: &str, is_here: bool) -> Host {
     Host {
         name: name.to_owned(),
@@ -205,4 +210,12 @@ fn assert_has_a_command(finding: &Finding) {
             "{command}: {shell:?}"
         );
     }
+}
+
+/// The todo of the only finding that `spoil` causes.
+#[track_caller]
+fn todo(spoil: impl FnOnce(&mut SetupFacts)) -> String {
+    let found = said(spoil);
+    assert_eq!(found.len(), 1, "{found:?}");
+    found[0].todo.clone()
 }

@@ -1,0 +1,103 @@
+//! Judges whether rosrescue can listen at its port.
+
+use super::{
+    super::{
+        facts::{Port, Process, SetupFacts},
+        ros::Responder,
+    },
+    Findings, named,
+    todo::delete_logs,
+};
+
+impl Findings {
+    pub(super) fn port(&mut self, facts: &SetupFacts) {
+        let Ok(Port {
+            number,
+            error,
+            taken,
+        }) = &facts.port
+        else {
+            // The finding about ROS_MASTER_URI reports this error.
+            return;
+        };
+        if let Some(error) = error {
+            let todo = "run `rosrescue core -p 11411`, and `export ROS_MASTER_URI=http://localhost:11411` where nodes \
+                        start";
+            return self.bad("port", format!("cannot listen at {number}: {error}"), todo);
+        }
+        let Some(taken) = taken else {
+            return self.ok("port", format!("{number} is free"));
+        };
+        let by = match taken.by.as_slice() {
+            [] => "a process that only root can see".to_owned(),
+            all => all.iter().map(named).collect::<Vec<_>>().join(", "),
+        };
+        match &taken.server {
+            Responder::Rosrescue {
+                version,
+                unprotected,
+                ..
+            } => {
+                self.ok(
+                    "port",
+                    format!("{number}: rosrescue {version} runs here: {by}"),
+                );
+                if version != facts.version {
+                    let own = facts.version;
+                    self.note(
+                        "port",
+                        format!("the running rosrescue is {version}, this program is {own}"),
+                        format!("when the robot is at rest, {}, and start it again", stop(&taken.by)),
+                    );
+                }
+                if let Some(why) = unprotected {
+                    let folder = facts.disk.folder.display();
+                    self.bad(
+                        "checkpoint",
+                        format!("the running one is unprotected: {why}"),
+                        format!(
+                            "`df -h {folder}` shows if the disk is full; {}. Or start rosrescue with another \
+                             --checkpoint",
+                            delete_logs()
+                        ),
+                    );
+                }
+            }
+            Responder::Master(pid) => {
+                let stop = match pid {
+                    Some(pid) => format!("stop it: `kill {pid}`"),
+                    None => stop(&taken.by),
+                };
+                self.bad(
+                    "port",
+                    format!("{number} is in use by a master without rosrescue: {by}"),
+                    format!(
+                        "{stop}, or Ctrl-C where roscore or roslaunch runs. To keep it, start it with `rosmaster \
+                         --core -p 11312`, and `rosrescue proxy --master http://localhost:11312`"
+                    ),
+                );
+            }
+            _ => self.bad(
+                "port",
+                format!("{number} is in use by a program that is not a master: {by}"),
+                format!(
+                    "{}, or run `rosrescue core -p 11411`, and `export ROS_MASTER_URI=http://localhost:11411` where \
+                     nodes start",
+                    stop(&taken.by)
+                ),
+            ),
+        }
+    }
+}
+
+/// How to stop the processes that have a port.
+fn stop(processes: &[Process]) -> String {
+    let pids: Vec<_> = processes
+        .iter()
+        .map(|process| process.pid.to_string())
+        .collect();
+    match pids.as_slice() {
+        [] => "`sudo rosrescue check` names the process".to_owned(),
+        pids => format!("stop it: `kill {}`", pids.join(" ")),
+    }
+}
