@@ -324,7 +324,8 @@ mod tests {
 
     /// Whether a computer that was cut off may set each of these parameters to -1.
     fn judged(ledger: &Ledger, seq: u64, keys: &[&str]) -> Option<Vec<bool>> {
-        let calls: Vec<_> = keys.iter().map(|key| set_of(key, -1)).collect();
+        let set = |key: &&str| Request::new(Method::SetParam, ["/m", key, "-1"]);
+        let calls: Vec<_> = keys.iter().map(set).collect();
         let calls: Vec<_> = calls.iter().collect();
         let verdicts = ledger.merge_verdicts(seq, "mine", &calls)?;
         Some(

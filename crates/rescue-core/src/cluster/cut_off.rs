@@ -8,7 +8,7 @@ use crate::{
     cluster::{
         merge::{self, Changes, WritesToSend},
         mutant::Mutant,
-        sharing::Change,
+        sharing::{Change, Source},
     },
 };
 use ros1_master::master::{Master, Request};
@@ -164,7 +164,7 @@ impl CutOff {
         let mut calls = Vec::new();
         for change in changes {
             // A whole state comes from a master, not from a node.
-            let Change::Call(record, _) = change else {
+            let Change::Call(record, source) = change else {
                 continue;
             };
             let RecordContent::Call { call, .. } = &record.entry else {
@@ -178,6 +178,9 @@ impl CutOff {
             if given && period.expected < EXPECTED_MOST {
                 period.expected += 1;
                 period.changes.expect_record(record.seq, call.clone());
+            }
+            if *source == Source::Forwarded {
+                period.changes.note_forwarded(call);
             }
             period.pending.add(call);
             calls.push(call.clone());
@@ -221,7 +224,6 @@ impl CutOff {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cluster::sharing::Source;
     use ros1_master::{master::Method, xmlrpc::Value};
 
     fn set(key: &str, value: i32) -> Request {

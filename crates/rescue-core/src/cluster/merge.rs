@@ -31,8 +31,8 @@ pub struct Merged {
     /// The writes to send to the leader, in this order.
     pub send: Vec<Request>,
     pub lost: Vec<LostWrite>,
-    /// The parameters that others have set to the same value. They may have set another value since, which nodes on this
-    /// computer heard before this computer's own value.
+    /// The parameters that others have set to the same value, or whose nodes have replaced the value. They may have set
+    /// another value since, which nodes on this computer heard before this computer's own value.
     pub equal: Vec<String>,
 }
 
@@ -51,7 +51,8 @@ pub enum MergeVerdict {
     /// The leader makes the write, because others have not changed the same parameter, node, service or topic
     /// registration.
     Apply,
-    /// The write is unnecessary: others have made the same change, or what it unregisters is no longer registered.
+    /// The write is unnecessary: others have made the same change, what it unregisters is no longer registered, or its
+    /// node has replaced it.
     Redundant,
     Overtaken(LostWrite),
 }
@@ -120,8 +121,10 @@ pub fn merge<'a>(
                 if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
             MergeVerdict::Overtaken(lost) => merged.lost.push(lost),
         }
-        if let Some(path) = path.filter(|_| *call.method() == Method::DeleteParam) {
-            deleted.add(ChangeSubject::Param(path));
+        if *call.method() == Method::DeleteParam {
+            ChangeSubject::of(call)
+                .into_iter()
+                .for_each(|it| deleted.add(it));
         }
     }
     merged.send.reverse();
@@ -135,6 +138,9 @@ pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> MergeVerd
     let Some(why) = conflict(changes, now, call) else {
         return MergeVerdict::Apply;
     };
+    if changes.has_replaced(call) {
+        return MergeVerdict::Redundant;
+    }
     let path = param_of(call).unwrap_or_default();
     let parts: Vec<&str> = names::parts(&path).collect();
     let present = value_at(now.params(), &parts).cloned();

@@ -169,7 +169,9 @@ impl Sharing {
 
     /// Decides what happens to the partition writes `calls` of a computer in the state `mirror`. That computer sends
     /// them under the name `merge`, and has taken the others' changes up to record `seq` into account.
-    /// `None` if the changes after that record are no longer known, or the record is of a journal that etcd has lost.
+    /// `None` if that computer must read the journal again and decide again: the changes after that record are no longer
+    /// known, the record is of a journal that etcd has lost, or the same node has made a change. The leader before may
+    /// have sent that change, and only the computer of the node knows whether it is an earlier write.
     pub fn merge_verdicts(
         &self,
         mirror: &Master,
@@ -186,12 +188,13 @@ impl Sharing {
             match merge::judge_write(&changes, mirror, call) {
                 // It sets the present value again, so that nodes are notified.
                 MergeVerdict::Redundant if call.text(0) == Some(merge::TELLER) => {
-                    MergeVerdict::Apply
+                    Some(MergeVerdict::Apply)
                 }
-                verdict => verdict,
+                MergeVerdict::Overtaken(lost) if changes.are_of_same_node(&lost) => None,
+                verdict => Some(verdict),
             }
         });
-        Some(verdicts.collect())
+        verdicts.collect()
     }
 }
 
@@ -203,6 +206,24 @@ mod tests {
     fn set_of(key: &str, value: i32) -> Request {
         let params = [Value::from("/n"), key.into(), value.into()];
         Request::new(Method::SetParam, params)
+    }
+
+    /// A leader before may have sent what the node's computer had forwarded to it.
+    #[test]
+    fn whether_a_change_by_the_same_node_conflicts_is_left_to_its_computer() {
+        let mut sharing = Sharing::after(3);
+        let by = |node: &str, value: i32| {
+            let params = [Value::from(node), "/a".into(), value.into()];
+            Request::new(Method::SetParam, params)
+        };
+        sharing.record(&by("/n", 1), &Source::Merge("of the leader before".into()));
+        let judge = |call: Request| {
+            let verdicts = sharing.merge_verdicts(&Master::default(), 3, "mine", &[&call])?;
+            let lost = matches!(verdicts.as_slice(), [MergeVerdict::Overtaken(_)]);
+            Some(lost)
+        };
+        assert_eq!(judge(by("/n", 2)), None);
+        assert_eq!(judge(by("/m", 2)), Some(true));
     }
 
     #[test]

@@ -3,11 +3,11 @@
 
 use std::{
     borrow::Cow,
-    collections::{BTreeSet, HashMap, HashSet},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet},
     ops::Bound,
 };
 
-use super::TELLER;
+use super::{Conflict, LostWrite, TELLER};
 use crate::cluster::mutant::Mutant;
 use ros1_master::{
     master::{Effect, Master, Request, Write, names},
@@ -17,8 +17,11 @@ use ros1_master::{
 /// What a call changes. Two calls can conflict if they change the same.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum ChangeSubject {
-    /// A parameter: its resolved name, with a slash at the end.
-    Param(String),
+    /// A parameter: its resolved name, with a slash at the end, and the node that changed it.
+    Param {
+        path: String,
+        node: String,
+    },
     /// A registration by the node with this name.
     Node(String),
     Service(String),
@@ -34,7 +37,8 @@ impl ChangeSubject {
     pub fn size(&self) -> usize {
         size_of::<Self>()
             + match self {
-                Self::Param(name) | Self::Node(name) | Self::Service(name) => name.len(),
+                Self::Node(name) | Self::Service(name) => name.len(),
+                Self::Param { path, node } => path.len() + node.len(),
                 Self::Topic { topic, node, .. } => topic.len() + node.len(),
             }
     }
@@ -54,7 +58,8 @@ impl ChangeSubject {
         };
         match effect {
             Effect::SetParam { key, .. } | Effect::DeleteParam { key } => {
-                vec![Self::Param(param_path(&key))]
+                let (path, node) = (param_path(&key), caller.to_owned());
+                vec![Self::Param { path, node }]
             }
             Effect::RegisterPublisher { topic: name, .. } => vec![topic(true, name), node],
             Effect::RegisterSubscriber { topic: name, .. } => vec![topic(false, name), node],
@@ -94,9 +99,11 @@ pub(super) fn param_of(call: &Request) -> Option<String> {
 /// The changes that others than the cut-off computer have made since some point of the journal.
 #[derive(Clone, Debug, Default)]
 pub struct Changes {
-    params: BTreeSet<String>,
+    /// The paths of changed parameters, and the nodes that changed each, as far as they are known.
+    params: BTreeMap<String, BTreeSet<String>>,
     rest: HashSet<ChangeSubject>,
     expected: ExpectedCalls,
+    forwarded: ExpectedCalls,
 }
 
 impl Changes {
@@ -111,6 +118,36 @@ impl Changes {
     /// Notes that this computer sent `call` to the journal as record `seq`, and the journal may contain it.
     pub fn expect_record(&mut self, seq: u64, call: Request) {
         self.expected.records.insert(seq, call);
+    }
+
+    /// Notes that `call` is a write of another computer's node, which this computer has answered as the leader. A later
+    /// write of that node replaces it.
+    pub fn note_forwarded(&mut self, call: &Request) {
+        for call in call.calls() {
+            self.forwarded.add(call.clone());
+        }
+    }
+
+    /// Whether the node that made `call` has replaced it: another computer had forwarded the call.
+    pub(super) fn has_replaced(&self, call: &Request) -> bool {
+        let (Some(path), Some(node)) = (param_of(call), call.caller()) else {
+            return false;
+        };
+        self.forwarded.has(call) && self.above(&path).any(|nodes| nodes.contains(node))
+    }
+
+    /// Whether the node whose write is lost has itself made one of the changes that it is lost to.
+    pub(in crate::cluster) fn are_of_same_node(&self, lost: &LostWrite) -> bool {
+        let node = lost.call.caller().unwrap_or_default();
+        match &lost.why {
+            Conflict::Parameter(key) => {
+                let path = param_path(key);
+                let mut nodes = self.above(&path).chain(self.below(&path));
+                nodes.any(|nodes| nodes.contains(node))
+            }
+            Conflict::Service { node: provider, .. } => provider == node,
+            Conflict::Node { .. } | Conflict::Registration { .. } => true,
+        }
     }
 
     /// Notes what record `seq` of the journal, a `call`, has changed, unless the call was expected.
@@ -134,8 +171,8 @@ impl Changes {
 
     pub fn add(&mut self, subject: ChangeSubject) {
         match subject {
-            ChangeSubject::Param(path) => {
-                self.params.insert(path);
+            ChangeSubject::Param { path, node } => {
+                self.params.entry(path).or_default().insert(node);
             }
             other => {
                 self.rest.insert(other);
@@ -145,7 +182,10 @@ impl Changes {
 
     /// Adds the changes of others that `seen` has.
     pub fn add_all(&mut self, seen: &Self) {
-        self.params.extend(seen.params.iter().cloned());
+        for (path, nodes) in &seen.params {
+            let all = self.params.entry(path.clone()).or_default();
+            all.extend(nodes.iter().cloned());
+        }
         self.rest.extend(seen.rest.iter().cloned());
     }
 
@@ -157,7 +197,7 @@ impl Changes {
         for path in paths {
             let parts: Vec<&str> = names::parts(&path).collect();
             if !self.expected.explains(&path, value_at(is.params(), &parts)) {
-                self.add(ChangeSubject::Param(path));
+                self.params.entry(path).or_default();
             }
         }
         for (node, api) in is.nodes() {
@@ -193,21 +233,26 @@ impl Changes {
 
     /// Whether the parameter at this path or one above it was changed.
     pub(super) fn has_above(&self, path: &str) -> bool {
-        let mut above = path.match_indices('/');
-        above.any(|(end, _)| {
-            path.get(..=end)
-                .is_some_and(|above| self.params.contains(above))
-        })
+        self.above(path).next().is_some()
     }
 
     /// Whether the parameter at this path, one above it or one below it was changed.
     pub(super) fn has_param(&self, path: &str) -> bool {
-        self.has_above(path)
-            || self
-                .params
-                .range::<str, _>((Bound::Included(path), Bound::Unbounded))
-                .next()
-                .is_some_and(|below| below.starts_with(path))
+        self.has_above(path) || self.below(path).next().is_some()
+    }
+
+    /// The nodes that changed the parameter at this path, and those that changed one above it.
+    fn above(&self, path: &str) -> impl Iterator<Item = &BTreeSet<String>> {
+        let above = path.match_indices('/');
+        above.filter_map(|(end, _)| self.params.get(path.get(..=end)?))
+    }
+
+    /// The nodes that changed the parameter at this path, and those that changed one below it.
+    fn below(&self, path: &str) -> impl Iterator<Item = &BTreeSet<String>> {
+        let from = (Bound::Included(path), Bound::Unbounded);
+        let below = self.params.range::<str, _>(from);
+        let below = below.take_while(move |(of, _)| of.starts_with(path));
+        below.map(|(_, nodes)| nodes)
     }
 
     pub(super) fn has(&self, subject: &ChangeSubject) -> bool {

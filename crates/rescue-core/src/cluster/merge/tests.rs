@@ -123,6 +123,31 @@ fn a_call_of_this_computer_that_had_reached_the_others_is_no_change_of_theirs() 
 }
 
 #[test]
+fn a_later_write_of_the_same_node_replaces_what_its_computer_had_forwarded() {
+    let by = |node, key, value| call(Method::SetParam, &[node, key, value]);
+    let forwarded = by("/there", "/a/b", "1");
+    let judge = |there: &[Request], here: &Request| {
+        let mut changes = Changes::default();
+        changes.note_forwarded(&forwarded);
+        let now = changed(&Master::default(), there, &mut changes);
+        let merged = merge(&changes, &now, [here]);
+        (merged.send.len(), merged.lost.len())
+    };
+    for later in [by("/there", "/a/b", "2"), by("/there", "/a", "2")] {
+        assert_eq!(judge(std::slice::from_ref(&later), &forwarded), (0, 0));
+        // It stays replaced, whatever others write before or after.
+        assert_eq!(judge(&[by("/m", "/a", "3"), later], &forwarded), (0, 0));
+    }
+    // A write below replaces a part. A write of another node replaces nothing.
+    let part = [by("/there", "/a/b/c", "2")];
+    assert_eq!(judge(&part, &forwarded), (0, 1));
+    assert_eq!(judge(&[by("/m", "/a/b", "2")], &forwarded), (0, 1));
+    // A node of this computer with the same name, such as `/roslaunch`, is another one.
+    let own = by("/there", "/a/b", "5");
+    assert_eq!(judge(&[by("/there", "/a/b", "2")], &own), (0, 1));
+}
+
+#[test]
 fn where_only_states_are_known_what_differs_was_changed() {
     let base = state(
         &Master::default(),

@@ -84,8 +84,8 @@ impl From<&LostWrite> for WriteOutcome {
 /// The leader's answer to an [`Ask`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum MergeAnswer {
-    /// The leader no longer knows all changes after the record [`Ask::seq`], so the sender must decide again which
-    /// writes to send.
+    /// The sender must read the journal again and decide again which writes to send: the leader no longer knows all
+    /// changes after the record [`Ask::seq`], or the node of one of the writes has made a change that conflicts with it.
     Again,
     /// The outcome of each write.
     Done(Vec<WriteOutcome>),
@@ -117,7 +117,7 @@ impl MergeAnswer {
             Self::Done(outcomes) => (1, outcomes.iter().map(value).collect()),
         };
         let text = match self {
-            Self::Again => "what was changed since is not known any more",
+            Self::Again => "read the journal again",
             Self::Done(_) => "merged",
         };
         Reply::Value(vec![code.into(), text.into(), Value::Array(outcomes)].into())
