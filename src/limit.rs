@@ -73,7 +73,7 @@ impl Bucket {
 
 /// A rate limit for an alarm and its all-clear. Both are logged, or neither is.
 #[derive(Debug)]
-pub(crate) struct Pair(Mutex<Episode>);
+pub(crate) struct AlarmLimit(Mutex<Episode>);
 
 #[derive(Debug)]
 struct Episode {
@@ -82,7 +82,7 @@ struct Episode {
     alarm_logged: Option<bool>,
 }
 
-impl Pair {
+impl AlarmLimit {
     pub(crate) const fn new() -> Self {
         Self(Mutex::new(Episode {
             bucket: Bucket::FULL,
@@ -132,10 +132,10 @@ macro_rules! rarely {
 }
 pub(crate) use rarely;
 
-/// Logs the alarm of a [`Pair`] like [`rarely!`], if [`Pair::alarm`] permits.
+/// Logs the alarm of an [`AlarmLimit`] like [`rarely!`], if [`AlarmLimit::alarm`] permits.
 macro_rules! alarm {
-    ($level:ident, $pair:path, $($line:tt)+) => {
-        match $pair.alarm(std::time::Instant::now()) {
+    ($level:ident, $limit:path, $($line:tt)+) => {
+        match $limit.alarm(std::time::Instant::now()) {
             Some(pass) => tracing::$level!(left_out = pass.left_out, $($line)+),
             None => tracing::debug!($($line)+),
         }
@@ -143,10 +143,10 @@ macro_rules! alarm {
 }
 pub(crate) use alarm;
 
-/// Logs the all-clear of a [`Pair`] like [`rarely!`], if [`Pair::all_clear`] permits.
+/// Logs the all-clear of an [`AlarmLimit`] like [`rarely!`], if [`AlarmLimit::all_clear`] permits.
 macro_rules! all_clear {
-    ($level:ident, $pair:path, $($line:tt)+) => {
-        match $pair.all_clear(std::time::Instant::now()) {
+    ($level:ident, $limit:path, $($line:tt)+) => {
+        match $limit.all_clear(std::time::Instant::now()) {
             Some(pass) => tracing::$level!(left_out = pass.left_out, $($line)+),
             None => tracing::debug!($($line)+),
         }
@@ -191,32 +191,32 @@ mod tests {
 
     #[test]
     fn an_all_clear_is_logged_with_its_alarm_or_left_out_with_it() {
-        let pair = Pair::new();
+        let limit = AlarmLimit::new();
         let now = Instant::now();
         for _ in 0..BURST {
-            assert_eq!(pair.alarm(now), passed(None));
-            assert_eq!(pair.all_clear(now), passed(None));
+            assert_eq!(limit.alarm(now), passed(None));
+            assert_eq!(limit.all_clear(now), passed(None));
         }
         for _ in 0..5 {
-            assert_eq!((pair.alarm(now), pair.all_clear(now)), (None, None));
+            assert_eq!((limit.alarm(now), limit.all_clear(now)), (None, None));
         }
         let later = now + REFILL;
-        assert_eq!(pair.alarm(later), passed(Some(5)), "so many were left out");
+        assert_eq!(limit.alarm(later), passed(Some(5)), "so many were left out");
         // The same trouble continues and is not logged again.
-        assert_eq!(pair.alarm(later), None);
-        assert_eq!(pair.all_clear(later), passed(None));
+        assert_eq!(limit.alarm(later), None);
+        assert_eq!(limit.all_clear(later), passed(None));
     }
 
     #[test]
     fn an_all_clear_follows_any_line_that_reported_the_trouble() {
-        let pair = Pair::new();
+        let limit = AlarmLimit::new();
         let now = Instant::now();
         // Without an alarm, as at the start, the all-clear is an ordinary line.
-        let alone = (0..20).filter(|_| pair.all_clear(now).is_some()).count();
+        let alone = (0..20).filter(|_| limit.all_clear(now).is_some()).count();
         assert_eq!(alone, 10);
-        assert_eq!(pair.alarm(now), None);
-        pair.note_reported();
-        assert_eq!(pair.alarm(now), None);
-        assert_eq!(pair.all_clear(now), passed(None));
+        assert_eq!(limit.alarm(now), None);
+        limit.note_reported();
+        assert_eq!(limit.alarm(now), None);
+        assert_eq!(limit.all_clear(now), passed(None));
     }
 }

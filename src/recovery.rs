@@ -31,7 +31,7 @@ use self::{
 use crate::{
     gate::State,
     ledger::history::Rescues,
-    limit::{Pair, alarm, all_clear, rarely},
+    limit::{AlarmLimit, alarm, all_clear, rarely},
     nodes::{self, Nodes},
     process::{self, ProcessError, effort, listeners::PortHolder},
     status::{
@@ -52,7 +52,7 @@ use crate::{
 const RUN_ID_PAUSE: Duration = Duration::from_millis(100);
 
 /// Limits the log lines about the beginning and the end of a crash loop.
-static CRASH_LOOP: Pair = Pair::new();
+static CRASH_LOOP: AlarmLimit = AlarmLimit::new();
 
 /// The result of a step of the recovery, such as connecting to the master or examining it. At most one step runs at a
 /// time.

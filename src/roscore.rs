@@ -21,7 +21,7 @@ use crate::nodes::client::{self, Reaction};
 use crate::{
     gate,
     ledger::Ledger,
-    limit::{Pair, alarm, all_clear},
+    limit::{AlarmLimit, alarm, all_clear},
     process::{self, Rosout},
     write_queue::WriteQueue,
 };
@@ -124,7 +124,7 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
 }
 
 /// Limits the log lines about the end and the start of rosout.
-static ENDED: Pair = Pair::new();
+static ENDED: AlarmLimit = AlarmLimit::new();
 
 /// Keeps one rosout running: that of this rosrescue, or one that exists already.
 async fn keep_rosout(roscore: &Roscore) {

@@ -15,7 +15,7 @@ use super::context::Context;
 use crate::{
     gate::State,
     guardian::handover::{self, Guard},
-    limit::{Pair, alarm, all_clear},
+    limit::{AlarmLimit, alarm, all_clear},
     process::{self, Stat},
     status::{
         Guarded,
@@ -33,7 +33,7 @@ const JOINING: Duration = Duration::from_millis(20);
 const LOOK: Duration = Duration::from_secs(1);
 
 /// Limits the log lines about a stopped guardian, and about a guardian that runs again.
-static STOPPED: Pair = Pair::new();
+static STOPPED: AlarmLimit = AlarmLimit::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends once it has reported `stop`.
 pub(super) fn start(

@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     cli::SyncPolicy,
-    limit::{Pair, alarm, all_clear, rarely},
+    limit::{AlarmLimit, alarm, all_clear, rarely},
     status::Board,
 };
 
@@ -32,7 +32,7 @@ const QUIET: Duration = Duration::from_secs(2);
 const BETWEEN: Duration = Duration::from_secs(10);
 
 /// Limits the log lines about a failure to record the state, and about its end.
-static UNPROTECTED: Pair = Pair::new();
+static UNPROTECTED: AlarmLimit = AlarmLimit::new();
 
 pub(crate) struct Checkpointer {
     ledger: Arc<Ledger>,

@@ -5,14 +5,14 @@ use tokio::sync::mpsc;
 
 use crate::{
     ledger::Ledger,
-    limit::{Pair, alarm, all_clear, rarely},
+    limit::{AlarmLimit, alarm, all_clear, rarely},
     process::{self, Orphan, ProcessError, Rosmaster, Stat},
     ros_env::MasterUri,
     upstream::Upstream,
 };
 
 /// Limits the log lines about the end of a master, and about the start of a new one.
-static ENDED: Pair = Pair::new();
+static ENDED: AlarmLimit = AlarmLimit::new();
 
 /// Process id of a child, and how it ended.
 type End = (u32, String);

@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::clock;
 use crate::{
-    limit::{Pair, all_clear, rarely},
+    limit::{AlarmLimit, all_clear, rarely},
     printable::{Lines, Page, display_lines, line},
 };
 
 /// Limits the log lines about the beginning and the end of an outage.
-pub(crate) static AWAY: Pair = Pair::new();
+pub(crate) static AWAY: AlarmLimit = AlarmLimit::new();
 
 /// Cause of a recovery at an ordinary start of rosrescue.
 pub(crate) const STARTED: &str = "rosrescue started";

@@ -14,12 +14,12 @@ use ros1_master::{master::Request, xmlrpc::Value};
 
 use super::ClusterDriver;
 use crate::{
-    limit::{Pair, alarm, all_clear, rarely},
+    limit::{AlarmLimit, alarm, all_clear, rarely},
     status::report::{CUT_OFF, STARTED, TAKEN_OVER},
 };
 
 /// Limits the log lines that this computer is cut off, and that it is no longer.
-static ALONE: Pair = Pair::new();
+static ALONE: AlarmLimit = AlarmLimit::new();
 
 impl ClusterDriver {
     /// Logs an event.

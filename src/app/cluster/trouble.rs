@@ -7,7 +7,7 @@ use std::{
 
 use crate::{
     cluster::replica::ReplicaError,
-    limit::{Pair, alarm, all_clear},
+    limit::{AlarmLimit, alarm, all_clear},
 };
 
 /// The last failure of etcd, and when it last answered.
@@ -15,7 +15,7 @@ use crate::{
 pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
 
 /// Limits the log lines that etcd does not answer, and that it answers again.
-static TROUBLE: Pair = Pair::new();
+static TROUBLE: AlarmLimit = AlarmLimit::new();
 
 impl Default for Trouble {
     fn default() -> Self {
