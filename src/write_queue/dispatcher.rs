@@ -379,7 +379,7 @@ impl Dispatcher {
             && item.answerable().is_some_and(|call| {
                 let judge = &self.judge;
                 self.ledger
-                    .with_mirror(|mirror| judge.first_apart(mirror, &[call]).is_none())
+                    .with_mirror(|mirror| judge.first_move(mirror, &[call]).is_none())
             })
     }
 
@@ -404,7 +404,7 @@ impl Dispatcher {
             return;
         };
         if registers {
-            self.judge.registered();
+            self.judge.note_registration();
         }
         item.patience = None;
         item.first = Some(First {
@@ -781,7 +781,7 @@ impl Dispatcher {
         let mut length = 1;
         if first.raw.is_some() && !first.way_made && !first.is_answered_first() {
             if let Some(call) = first.call.as_deref()
-                && let Some(eviction) = self.judge.judge(&ledger, call)
+                && let Some(eviction) = self.judge.judge_move(&ledger, call)
             {
                 first.way_made = true;
                 if let Some(eviction) = eviction {
@@ -793,7 +793,7 @@ impl Dispatcher {
                 let calls = items.iter().map_while(|item| item.call.as_deref());
                 let calls: Vec<_> = calls.collect();
                 let judge = &self.judge;
-                let apart = ledger.with_mirror(|mirror| judge.first_apart(mirror, &calls));
+                let apart = ledger.with_mirror(|mirror| judge.first_move(mirror, &calls));
                 length = apart.unwrap_or(items.len()).max(1);
             }
         }
@@ -845,7 +845,7 @@ impl Dispatcher {
             return self.superseded(items);
         };
         if registered {
-            self.judge.registered();
+            self.judge.note_registration();
         }
         // A multicall that is answered with a fault may have changed something before.
         opaque |= recorded.doubtful && matches!(replies.as_slice(), [Reply::Fault { .. }]);

@@ -16,18 +16,18 @@ use crate::ledger::Ledger;
 /// Judges calls that could make the master shut down an innocent node. By default, it objects to none.
 pub(crate) trait MoveJudge: Send + Sync {
     /// The index of the first of `calls` that must be judged and sent alone.
-    fn first_apart(&self, _mirror: &Master, _calls: &[&Request]) -> Option<usize> {
+    fn first_move(&self, _mirror: &Master, _calls: &[&Request]) -> Option<usize> {
         None
     }
 
     /// Judges a call. `None` if it moves no name. Otherwise the eviction that must precede the call,
     /// if there is one.
-    fn judge(&self, _ledger: &Ledger, _call: &Request) -> Option<Option<Eviction>> {
+    fn judge_move(&self, _ledger: &Ledger, _call: &Request) -> Option<Option<Eviction>> {
         None
     }
 
     /// Notes that a node has registered something.
-    fn registered(&self) {}
+    fn note_registration(&self) {}
 }
 
 /// Objects to no call.

@@ -9,13 +9,13 @@ use super::LocalNodes;
 use crate::{ledger::Ledger, limit::rarely, write_queue::MoveJudge};
 
 impl MoveJudge for LocalNodes {
-    fn first_apart(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
+    fn first_move(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
         calls
             .iter()
             .position(|call| Moving::moves_any(mirror, call))
     }
 
-    fn judge(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
+    fn judge_move(&self, ledger: &Ledger, call: &Request) -> Option<Option<Eviction>> {
         let moving = ledger.with_mirror(|mirror| Moving::caused_by(mirror, call));
         if moving.is_empty() {
             return None;
@@ -39,7 +39,7 @@ impl MoveJudge for LocalNodes {
         Some(ledger.with_mirror(|mirror| Eviction::for_nodes(mirror, gone)))
     }
 
-    fn registered(&self) {
+    fn note_registration(&self) {
         self.registered.notify_one();
     }
 }
