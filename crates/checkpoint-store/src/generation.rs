@@ -41,12 +41,12 @@ impl Ticket {
 /// [`Store::begin_compaction`](super::Store::begin_compaction).
 #[must_use = "the journal keeps growing until the job has run and has been finished"]
 pub struct CompactionJob<S: Storage> {
-    plan: Plan<S>,
+    plan: CompactionPlan<S>,
     checkpoint: Checkpoint,
 }
 
 /// Everything that a job needs to write a new generation.
-struct Plan<S: Storage> {
+struct CompactionPlan<S: Storage> {
     storage: S,
     names: Names,
     generation: u64,
@@ -88,7 +88,7 @@ impl<S: Storage> CompactionJob<S> {
     }
 }
 
-impl<S: Storage> Plan<S> {
+impl<S: Storage> CompactionPlan<S> {
     fn run(mut self, checkpoint: &Checkpoint) -> Compacted<S> {
         let settled = self.settle.take().map(SyncJob::run);
         Compacted {
@@ -219,7 +219,7 @@ impl<S: Storage> Store<S> {
         Ok(CompactionJob { plan, checkpoint })
     }
 
-    fn plan(&mut self, checkpoint: &Checkpoint) -> Result<Plan<S>, StoreError> {
+    fn plan(&mut self, checkpoint: &Checkpoint) -> Result<CompactionPlan<S>, StoreError> {
         let seq = checkpoint.seq;
         if seq < self.seq {
             return Err(StoreError::Stale {
@@ -245,7 +245,7 @@ impl<S: Storage> Store<S> {
             ticket: Arc::downgrade(&ticket),
         });
         let unsettled = self.active.as_ref().is_some_and(|active| !active.named);
-        Ok(Plan {
+        Ok(CompactionPlan {
             storage: self.place.storage.clone(),
             names: self.place.names.clone(),
             generation,
