@@ -144,13 +144,13 @@ struct Queue {
 }
 
 impl Member {
-    /// Creates a member that waits for [`Input::Begin`]. `left` holds the partition writes of an earlier process.
+    /// Creates a member that waits for [`Input::Begin`]. `cut_off` holds the partition writes of an earlier process.
     /// `id` is the unique name under which partition writes are sent to a leader.
     pub fn new(
         settings: Settings,
         keys: Keys,
         own: LocalCheckpoint,
-        left: CutOff,
+        mut cut_off: CutOff,
         id: String,
     ) -> Self {
         let known = own.restored;
@@ -158,7 +158,6 @@ impl Member {
             term: own.term,
             seq: own.seq,
         };
-        let mut cut_off = left;
         cut_off.note_seen(&own.state);
         Self {
             keys,

@@ -81,9 +81,9 @@ impl JournalPosition {
         }
     }
 
-    /// Whether a mirror at this position may answer reads after earlier answers have shown the position `told`. On one
+    /// Whether a mirror at this position may answer reads after earlier answers have shown the position `shown`. On one
     /// computer, no read goes back in time.
-    pub fn shows(self, told: Self) -> bool {
-        self >= told || Mutant::StaleReads.lives()
+    pub fn shows(self, shown: Self) -> bool {
+        self >= shown || Mutant::StaleReads.lives()
     }
 }

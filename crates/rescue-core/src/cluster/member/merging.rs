@@ -54,7 +54,7 @@ pub(super) struct Merging {
     /// The number of the last request to the leader. Answers to earlier ones are ignored.
     asked: u64,
     /// The writes still to be sent. `None` until it is decided which of them conflict with others' changes.
-    left: Option<Vec<Request>>,
+    unsent: Option<Vec<Request>>,
     /// Parameters of which nodes here heard a value that was lost. These nodes must hear the present value.
     untold: BTreeSet<String>,
     /// Whether the present request to the leader sets the parameters in [`Self::untold`] again, instead of sending
@@ -65,10 +65,10 @@ pub(super) struct Merging {
     /// Whether the leader has answered a request since this computer last read the journal. The mirror then lacks the
     /// writes of that request.
     unread: bool,
-    /// The writes in `left` conflict with no change up to this record of the journal.
-    judged: u64,
+    /// The writes in `unsent` conflict with no change up to this record of the journal.
+    judged_up_to: u64,
     sent: u64,
-    lost: u64,
+    lost_count: u64,
 }
 
 impl Merging {
@@ -78,14 +78,14 @@ impl Merging {
             periods: 0,
             step: Step::Idle,
             asked: 0,
-            left: None,
+            unsent: None,
             untold: BTreeSet::new(),
             telling: false,
             rounds: 0,
             unread: false,
-            judged: 0,
+            judged_up_to: 0,
             sent: 0,
-            lost: 0,
+            lost_count: 0,
         }
     }
 
@@ -165,7 +165,7 @@ impl Member {
             self.merging.step = Step::Idle;
             return;
         };
-        let left = self.merging.left.take();
+        let left = self.merging.unsent.take();
         let left = left.unwrap_or_else(|| period.pending.calls().cloned().collect());
         if Mutant::MergesByState.lives() {
             period.changes = Changes::default();
@@ -179,11 +179,11 @@ impl Member {
         self.merging.untold.extend(parameters.chain(merged.equal));
         let lost = merged.lost.iter();
         let lost = lost.map(|lost| (lost.call.clone(), lost.into())).collect();
-        self.merging.judged = self.journal.progress.seq;
+        self.merging.judged_up_to = self.journal.progress.seq;
         self.merging.unread = false;
         self.report(lost);
         self.keep_only(&merged.send);
-        self.merging.left = Some(merged.send);
+        self.merging.unsent = Some(merged.send);
         self.next_portion(now);
     }
 
@@ -203,7 +203,7 @@ impl Member {
 
     fn next_portion(&mut self, now: Instant) {
         let untold = set_again(&self.journal.state, &self.merging.untold);
-        let left = self.merging.left.as_deref().unwrap_or_default();
+        let left = self.merging.unsent.as_deref().unwrap_or_default();
         self.merging.telling = left.is_empty();
         let left = if self.merging.telling { &untold } else { left };
         let calls: Vec<_> = left.iter().take(portion(left)).cloned().collect();
@@ -216,7 +216,7 @@ impl Member {
         }
         let ask = Ask {
             id: self.merging.id(),
-            seq: self.merging.judged,
+            seq: self.merging.judged_up_to,
             calls,
         };
         self.ask(now, ask);
@@ -259,7 +259,7 @@ impl Member {
                 if self.merging.telling {
                     return self.parameters_set_again(now, &ask, &outcomes);
                 }
-                if let Some(left) = &mut self.merging.left {
+                if let Some(left) = &mut self.merging.unsent {
                     left.drain(..ask.calls.len().min(left.len()));
                 }
                 let lost_there = ask.calls.iter().zip(&outcomes);
@@ -296,7 +296,7 @@ impl Member {
     fn report(&mut self, outcomes: Vec<(Request, WriteOutcome)>) {
         for (call, outcome) in &outcomes {
             self.merging.sent += u64::from(*outcome == WriteOutcome::Holds);
-            self.merging.lost += u64::from(outcome.is_loss_of(call));
+            self.merging.lost_count += u64::from(outcome.is_loss_of(call));
         }
         if !outcomes.is_empty() {
             self.act(Action::Report(outcomes));
@@ -305,7 +305,7 @@ impl Member {
 
     /// Finishes the oldest period of being cut off: all its writes have been sent.
     pub(super) fn merged(&mut self, now: Instant) {
-        let (sent, lost) = (self.merging.sent, self.merging.lost);
+        let (sent, lost) = (self.merging.sent, self.merging.lost_count);
         self.report_news(News::Merged { sent, lost });
         self.merging = Merging {
             periods: self.merging.periods + 1,
