@@ -60,7 +60,7 @@ pub struct MemberFacts {
     pub seq: u64,
     /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
     /// started.
-    pub heard: Option<Instant>,
+    pub last_heard: Option<Instant>,
 }
 
 impl MemberFacts {
@@ -68,7 +68,7 @@ impl MemberFacts {
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
 
     pub(crate) fn is_away(&self) -> bool {
-        self.heard
+        self.last_heard
             .is_none_or(|heard| heard.elapsed() > Self::AWAY_AFTER)
     }
 }
@@ -97,7 +97,7 @@ impl ClusterFacts {
             version: "0.2.0".to_owned(),
             role,
             seq,
-            heard,
+            last_heard: heard,
         };
         Self {
             name: "pc-2".to_owned(),

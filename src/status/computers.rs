@@ -151,7 +151,10 @@ impl Computer {
                 true => facts.behind,
                 false => facts.seq.saturating_sub(member.seq),
             },
-            heard: member.heard.filter(|_| !is_this).map(clock::wall_time_of),
+            heard: member
+                .last_heard
+                .filter(|_| !is_this)
+                .map(clock::wall_time_of),
             away: !is_this && member.is_away(),
         }
     }
@@ -344,7 +347,7 @@ mod tests {
         });
         facts.lost_writes = 1;
         for member in &mut facts.members {
-            member.heard = None;
+            member.last_heard = None;
         }
         assert_eq!(
             lines(&facts),

@@ -88,7 +88,7 @@ impl ComputerFacts {
             version: entry.version.clone(),
             role: role.unwrap_or(Role::Joining),
             seq: entry.seq,
-            heard: Some(Instant::now()),
+            last_heard: Some(Instant::now()),
         };
         self.members.insert(change.name.clone(), member);
     }
@@ -101,7 +101,7 @@ impl ComputerFacts {
             .values()
             .filter(|of| of.name != self.settings.name);
         let there = others.filter(|of| {
-            of.heard
+            of.last_heard
                 .is_some_and(|at| at.elapsed() < MemberFacts::AWAY_AFTER)
         });
         let names: Vec<&str> = there.map(|of| of.name.as_str()).collect();
@@ -174,7 +174,7 @@ impl ClusterDriver {
             version: own.version,
             role: self.member.machine().role(),
             seq: own.seq,
-            heard: Some(Instant::now()),
+            last_heard: Some(Instant::now()),
         };
         let others = facts.members.values().filter(|of| of.name != own.name);
         let mut members: Vec<_> = others.cloned().collect();
