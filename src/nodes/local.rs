@@ -38,7 +38,7 @@ pub(super) type Listening = HashMap<SocketAddr, Vec<u64>>;
 pub(crate) struct LocalNodes {
     reap: Reap,
     stats: &'static Stats,
-    known: Mutex<KernelFacts>,
+    facts: Mutex<KernelFacts>,
     feuds: Mutex<Feuds>,
     /// Wakes the task that reads the socket table, because a node has registered.
     pub(super) registered: Notify,
@@ -67,7 +67,7 @@ pub(super) struct Named {
     pub(super) port: String,
     registered: u64,
     /// The process id that the node has answered since its last registration.
-    said: Option<i32>,
+    answered_pid: Option<i32>,
     /// The computer from which the node has registered; `None` for this one.
     from: Option<IpAddr>,
 }
@@ -82,7 +82,7 @@ pub(super) fn names(ledger: &Ledger) -> Vec<Named> {
             port: port_of(api).to_owned(),
             registered: activity.last_calls(node).registered,
             from: mirror.registered_from(node),
-            said: match activity.pid_of(node, api) {
+            answered_pid: match activity.pid_of(node, api) {
                 Some((pid, false)) => Some(pid),
                 // An answer from before the last registration may be another process's.
                 Some((_, true)) | None => None,
@@ -97,7 +97,7 @@ impl LocalNodes {
         Self {
             reap,
             stats,
-            known: Mutex::default(),
+            facts: Mutex::default(),
             feuds: Mutex::default(),
             registered: Notify::new(),
         }
@@ -109,7 +109,7 @@ impl LocalNodes {
     }
 
     fn lock(&self) -> MutexGuard<'_, KernelFacts> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+        self.facts.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Notes the addresses to which `port` leads.
@@ -309,7 +309,7 @@ impl Named {
             node: &self.node,
             port: &self.port,
             registered: self.registered,
-            said: self.said,
+            answered_pid: self.answered_pid,
         }
     }
 }

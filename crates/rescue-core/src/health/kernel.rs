@@ -40,7 +40,7 @@ pub struct LocalName<'a> {
     /// The number of the name's latest registration, which grows with each registration of any node.
     pub registered: u64,
     /// The process id that the node has answered to `getPid` since its latest registration.
-    pub said: Option<i32>,
+    pub answered_pid: Option<i32>,
 }
 
 /// What the kernel shows about a node.
@@ -86,7 +86,7 @@ struct Registrant {
     /// Whether other names have registered with the same socket.
     shared: bool,
     /// The process id that the node has answered while this socket listened.
-    said: Option<i32>,
+    answered_pid: Option<i32>,
     ended: Option<Instant>,
 }
 
@@ -117,7 +117,7 @@ impl Registrants {
             match known.filter(|known| known.port == name.port) {
                 Some(known) if known.is_among(sockets) => {
                     known.registered = name.registered;
-                    known.said = name.said.or(known.said);
+                    known.answered_pid = name.answered_pid.or(known.answered_pid);
                 }
                 // The name has not registered since, so another socket is not the node's. What that one answers does
                 // not count: its process id may be that of a process that has ended.
@@ -141,7 +141,7 @@ impl Registrants {
             sockets: sockets.to_vec(),
             registered: name.registered,
             shared,
-            said: name.said,
+            answered_pid: name.answered_pid,
             ended: None,
         };
         self.of.insert(name.node.to_owned(), registrant);
@@ -165,7 +165,7 @@ impl Registrants {
         let known = self.of.get(node).filter(|known| known.port == port);
         let known = known.filter(|known| !known.shared)?;
         let owner = (*self.owners.get(&known.socket()?)?)?;
-        (known.said == Some(owner.own_pid)).then_some(owner.process)
+        (known.answered_pid == Some(owner.own_pid)).then_some(owner.process)
     }
 
     /// What the kernel shows about the node `node` at `port`, where `sockets` listen. `has_ended` says whether a process
@@ -196,8 +196,9 @@ impl Registrants {
         }
         let owner = known.socket().and_then(|socket| *self.owners.get(&socket)?);
         let confirmed = owner.filter(|owner| {
-            let said = known.said == Some(owner.own_pid) || WrongRule::TrustsForwarders.lives();
-            said && !shared
+            let answered =
+                known.answered_pid == Some(owner.own_pid) || WrongRule::TrustsForwarders.lives();
+            answered && !shared
         });
         match confirmed {
             Some(owner) if has_ended(owner.process) || WrongRule::ClosedPortIsDeath.lives() => {
@@ -234,12 +235,12 @@ mod tests {
 
     const PORT: &str = "http://h:1";
 
-    fn name(node: &str, registered: u64, said: Option<i32>) -> LocalName<'_> {
+    fn name(node: &str, registered: u64, answered_pid: Option<i32>) -> LocalName<'_> {
         LocalName {
             node,
             port: PORT,
             registered,
-            said,
+            answered_pid,
         }
     }
 
@@ -257,10 +258,10 @@ mod tests {
         known.evidence("/a", PORT, sockets, has_ended, Instant::now())
     }
 
-    /// `/a`, which listens with socket 7 of process 1 and has answered `said`.
-    fn registered(said: Option<i32>, owner: Option<Owner>) -> Registrants {
+    /// `/a`, which listens with socket 7 of process 1 and has answered `answered_pid`.
+    fn registered(answered_pid: Option<i32>, owner: Option<Owner>) -> Registrants {
         let mut known = Registrants::default();
-        known.update(&[name("/a", 1, said)], |_| Some(&[7]));
+        known.update(&[name("/a", 1, answered_pid)], |_| Some(&[7]));
         assert_eq!(known.unowned(), BTreeSet::from([7]));
         known.set_owner(7, owner);
         assert!(known.unowned().is_empty());
@@ -294,8 +295,8 @@ mod tests {
     #[test]
     fn a_process_that_the_node_has_not_confirmed_proves_nothing() {
         // A container's port is forwarded by process 1, and the node calls itself process 12.
-        for said in [None, Some(12)] {
-            let mut known = registered(said, owner(1, 1));
+        for answered_pid in [None, Some(12)] {
+            let mut known = registered(answered_pid, owner(1, 1));
             assert_eq!(known.process("/a", PORT), None);
             assert_eq!(of_a(&mut known, &[], &[1]), Evidence::Unknown);
             assert_eq!(of_a(&mut known, &[8], &[1]), Evidence::Replaced);

@@ -504,7 +504,7 @@ impl World {
                 node: name,
                 port: ports[index],
                 registered: registered[name],
-                said: said
+                answered_pid: said
                     .get(name)
                     .filter(|said| said.0 == registered[name])
                     .map(|said| said.1),
