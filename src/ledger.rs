@@ -9,7 +9,7 @@ pub(crate) mod activity;
 mod answers;
 pub(crate) mod checkpointer;
 pub(crate) mod delivery;
-mod durability;
+pub(crate) mod durability;
 pub(crate) mod first;
 pub(crate) mod history;
 mod inner;
@@ -28,7 +28,7 @@ use std::{
 
 use checkpoint_store::Store;
 use rescue_core::{
-    checkpoint::format::{Label, Origin, Record, RecordContent, Session},
+    checkpoint::format::{Announced, Label, Origin, PendingWrite, Record, RecordContent, Session},
     cluster::{
         merge::MergeVerdict,
         sharing::{Change, Sharing, Source},
@@ -112,7 +112,7 @@ impl Ledger {
     pub fn new(
         mirror: Master,
         session: Session,
-        pending: Vec<Request>,
+        pending: Vec<PendingWrite>,
         store: Option<Store>,
         sync: SyncPolicy,
         stats: &'static Stats,
@@ -539,30 +539,43 @@ impl Ledger {
     /// The mirror's version and state, and the [`Token`] for the next master.
     pub fn next(&self) -> (u64, Master, Token) {
         let inner = self.lock();
-        let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
+        let token = Token::new(&inner.session.mark, inner.next_incarnation());
         (inner.version, inner.mirror.clone(), token)
     }
 
-    /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. So a master has run the
-    /// checkpoint's pending writes.
+    /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. A master has run the
+    /// checkpoint's pending writes, unless an earlier process announced that it gives the master the state before them.
     pub fn catch_up(&self, number: u64) {
         let mut inner = self.lock();
-        inner.pending.forget_restored();
+        let announced = inner.session.announced.take();
+        let ran = match announced.filter(|announced| number <= announced.incarnation) {
+            Some(Announced { incarnation, at }) if number == incarnation => {
+                inner.pending.acknowledge(at);
+                at
+            }
+            // An earlier injection to this master was announced, too. What it held is unknown.
+            Some(_) => 0,
+            None => inner.pending.forget_restored(),
+        };
+        inner.session.delivered = inner.session.delivered.max(ran);
         inner.session.incarnation = number;
         inner.session_unwritten = true;
     }
 
-    /// Starts the next incarnation (see [`Token`]), so that replies of the previous one no longer count. Returns the
-    /// new token.
+    /// Begins the next incarnation (see [`Token`]), whose master is about to get the mirror's state, so that replies of
+    /// the previous one no longer count. Returns the new token, and the record that must be on the disk before the
+    /// master gets anything.
     ///
-    /// The journal records the new token's number once the master has it. A rosrescue that starts before that finds
-    /// either a master with a higher number than the recorded one, or a master without the pending writes.
-    pub fn succeed(&self) -> Token {
+    /// That record announces the injection. The new token's number is recorded once the master has it.
+    pub fn succeed(&self) -> (Token, Mark) {
         let mut inner = self.lock();
-        inner.raise_incarnation();
+        let announced = inner.announce();
         // The injection makes both sides equal, so no doubt remains.
         (inner.doubted, inner.abandoned) = (false, false);
-        inner.token()
+        let token = inner.token();
+        drop(inner);
+        self.write();
+        (token, announced)
     }
 
     /// Notes that the present master holds the mirror's state, so no write is pending.
@@ -681,17 +694,21 @@ impl Ledger {
         let told = once(&behind, &writes)?;
         inner.injecting = true;
         let before = inner.token();
-        inner.raise_incarnation();
+        let announced = inner.announce();
         for (subject, nodes) in told {
             inner.order.master_notifies(now, &subject, nodes);
         }
-        Some(CatchUp::Run(Box::new(Missed {
+        let missed = Missed {
             behind: behind.state,
             writes,
             mirror: inner.mirror.clone(),
             before,
             token: inner.token(),
-        })))
+            announced,
+        };
+        drop(inner);
+        self.write();
+        Some(CatchUp::Run(Box::new(missed)))
     }
 
     /// Runs `work` on the [`Order`] and the mirror.

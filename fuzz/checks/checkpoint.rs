@@ -131,7 +131,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
                 origin: Origin::Rosrescue,
             },
         },
-        RecordContent::Session(expected.session.clone()),
+        RecordContent::Session(expected.session.clone().into()),
     ];
     store.append(&entries).expect("cannot append records to it");
     drop(store);

@@ -7,10 +7,10 @@ use std::{
 
 use checkpoint_store::{OpenError, Store, folder, history};
 use rescue_core::checkpoint::{
-    format::Session,
+    format::{PendingWrite, Session},
     session::{self, Decision, Rebuilt, SessionEvidence},
 };
-use ros1_master::master::{Displaced, Master, Request};
+use ros1_master::master::{Displaced, Master};
 
 use super::{RunError, life};
 use crate::{clock, config::Config, guardian::handover, wait};
@@ -23,7 +23,7 @@ pub(super) struct Beginning {
     pub(super) mirror: Master,
     pub(super) session: Session,
     /// Recorded writes that the session's last master may not have run.
-    pub(super) pending: Vec<Request>,
+    pub(super) pending: Vec<PendingWrite>,
     /// Replaced nodes that may still need a `shutdown`.
     pub(super) displaced: Vec<Displaced>,
     /// The store, to which no checkpoint has been written yet.

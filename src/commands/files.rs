@@ -188,7 +188,11 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
         journal,
         session: rebuilt.session.unwrap_or_default(),
         state: rebuilt.mirror,
-        pending: rebuilt.pending,
+        pending: rebuilt
+            .pending
+            .into_iter()
+            .map(|write| write.call)
+            .collect(),
         exact,
         torn: loaded.torn,
         damage,
@@ -256,7 +260,11 @@ fn opened_at(past: PastState, args: &ReadArgs) -> Result<Opened, CommandFailure>
         journal: moment.journal,
         session: rebuilt.session.unwrap_or_default(),
         state: rebuilt.mirror,
-        pending: rebuilt.pending,
+        pending: rebuilt
+            .pending
+            .into_iter()
+            .map(|write| write.call)
+            .collect(),
         exact: damage.is_empty(),
         torn: None,
         damage,

@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Instant};
 
 use rescue_core::{
-    checkpoint::format::{Checkpoint, Label, RecordContent, Session},
+    checkpoint::format::{Announced, Checkpoint, Label, PendingWrite, RecordContent, Session},
     cluster::sharing::Source,
     health::port_of,
     order::Order,
@@ -20,7 +20,8 @@ use super::{
     durability::{Mark, Whole},
     journal::Journal,
     late::LateState,
-    pending::PendingWrites,
+    mutant::Mutant,
+    pending::{PendingWrites, TooMany},
     shared::Shared,
     summary::Divergences,
 };
@@ -77,7 +78,12 @@ pub(super) enum Notifier {
 
 impl Inner {
     /// See [`Ledger::new`](super::Ledger::new).
-    pub(super) fn new(mirror: Master, session: Session, pending: Vec<Request>) -> Self {
+    pub(super) fn new(mirror: Master, session: Session, pending: Vec<PendingWrite>) -> Self {
+        // A master gets the whole state if there are too many.
+        let (pending, too_many) = match PendingWrites::restored(pending) {
+            Ok(pending) => (pending, false),
+            Err(TooMany) => (PendingWrites::default(), true),
+        };
         let mut inner = Self {
             mirror,
             identity: (-1, String::new()),
@@ -87,7 +93,7 @@ impl Inner {
             version: 0,
             whole: Whole::default(),
             ahead: None,
-            pending: PendingWrites::default(),
+            pending,
             acknowledged: 0,
             activity: Activity::default(),
             order: Order::default(),
@@ -100,8 +106,9 @@ impl Inner {
             unconfirmed: false,
             session_unwritten: false,
         };
-        inner.add_pending(pending);
-        inner.pending.are_restored();
+        if too_many {
+            inner.raise_incarnation();
+        }
         inner
     }
 
@@ -198,11 +205,42 @@ impl Inner {
         is_new
     }
 
+    /// The number of the next incarnation. A master may have each one that was announced.
+    pub(super) fn next_incarnation(&self) -> u64 {
+        let announced = self.session.announced.map_or(0, |it| it.incarnation);
+        self.session.incarnation.max(announced) + 1
+    }
+
+    /// Begins the next incarnation, whose master is about to get the state of this moment. The injection must wait until
+    /// the returned record is on the disk.
+    ///
+    /// Otherwise this process could die in between, the next one answer writes and die before it has examined that
+    /// master, and the one after it could not tell which pending writes the master has run.
+    pub(super) fn announce(&mut self) -> Mark {
+        self.note_acknowledged();
+        let announced = Announced {
+            incarnation: self.next_incarnation(),
+            at: self.seq(),
+        };
+        let session = Session {
+            announced: Some(announced),
+            at: clock::wall_millis(),
+            ..self.session.clone()
+        };
+        if !Mutant::AnnouncesNothing.lives() {
+            self.append(vec![RecordContent::Session(session.into())]);
+        }
+        let disk = self.last_seq();
+        self.raise_incarnation();
+        Mark { disk, shared: None }
+    }
+
     pub(super) fn raise_incarnation(&mut self) {
         self.behind = None;
         self.pending.clear();
         self.acknowledged = 0;
-        self.session.incarnation += 1;
+        self.session.incarnation = self.next_incarnation();
+        self.session.announced = None;
         self.session.delivered = self.seq();
         self.session_unwritten = true;
     }
@@ -221,7 +259,7 @@ impl Inner {
                 false => self.cluster_seq(),
             };
             self.session.at = clock::wall_millis();
-            let entry = RecordContent::Session(self.session.clone());
+            let entry = RecordContent::Session(self.session.clone().into());
             self.append(vec![entry]);
         }
     }
@@ -349,7 +387,7 @@ impl Inner {
                 at: clock::wall_millis(),
                 ..self.session.clone()
             },
-            pending: self.pending.calls().to_vec(),
+            pending: self.pending.numbered(),
             snapshot: Snapshot::default(),
             displaced: self.activity.displaced_lately(Instant::now()),
             follows: !self.whole.is_due(),

@@ -9,6 +9,8 @@ use ros1_master::{
     xmlrpc::Value,
 };
 
+use super::durability::Mark;
+
 /// The state of a late master once it has answered its outstanding calls.
 pub(super) struct LateState {
     pub(super) state: Master,
@@ -41,6 +43,8 @@ pub(crate) struct Missed {
     pub(crate) mirror: Master,
     pub(crate) before: Token,
     pub(crate) token: Token,
+    /// The record that must be on the disk before the master gets anything.
+    pub(crate) announced: Mark,
 }
 
 /// The topics and parameters of which the master notifies nodes when it runs `writes`, each with the number of these

@@ -22,6 +22,8 @@ pub(crate) enum Mutant {
     Overtakes,
     /// Writes that the mirror has answered first go to the next master, too, which has got the state.
     KeepsAnswered,
+    /// An injection is not announced in the journal.
+    AnnouncesNothing,
     /// The master is read although it has not run all writes that the mirror has answered first.
     ReadsTooEarly,
 }

@@ -1,5 +1,6 @@
 //! Writes that the mirror has answered and that the present master may not have run.
 
+use rescue_core::checkpoint::format::PendingWrite;
 use ros1_master::{master::Request, xmlrpc::Value};
 
 /// Maximum number of pending writes.
@@ -42,21 +43,41 @@ impl PendingWrites {
         let added = self.calls.len() - before;
         let first = (last + 1).saturating_sub(added as u64);
         self.seqs.extend((first..).take(added));
-        if self.calls.len() > COUNT_MAX || self.bytes > BYTES_MAX {
+        if !self.is_bounded() {
             self.clear();
             return Err(TooMany);
         }
         Ok(())
     }
 
-    /// Marks the present pending writes as coming from a checkpoint.
-    pub(super) fn are_restored(&mut self) {
-        self.restored = self.calls.len();
+    /// The pending writes of a checkpoint.
+    ///
+    /// # Errors
+    ///
+    /// If there are too many of them.
+    pub(super) fn restored(writes: Vec<PendingWrite>) -> Result<Self, TooMany> {
+        let mut pending = Self {
+            restored: writes.len(),
+            ..Self::default()
+        };
+        for PendingWrite { seq, call } in writes {
+            pending.bytes += size(&call);
+            pending.calls.push(call);
+            pending.seqs.push(seq);
+        }
+        pending.is_bounded().then_some(pending).ok_or(TooMany)
     }
 
-    /// Drops the pending writes that come from a checkpoint.
-    pub(super) fn forget_restored(&mut self) {
+    fn is_bounded(&self) -> bool {
+        self.calls.len() <= COUNT_MAX && self.bytes <= BYTES_MAX
+    }
+
+    /// Drops the pending writes that come from a checkpoint. Returns the number of the last one's record, or 0.
+    pub(super) fn forget_restored(&mut self) -> u64 {
+        let last = self.seqs.get(..self.restored).and_then(<[u64]>::last);
+        let last = last.copied().unwrap_or_default();
         self.drop_first(self.restored);
+        last
     }
 
     /// Drops the writes up to record `seq`, which the master has run.
@@ -82,6 +103,16 @@ impl PendingWrites {
         added.contains(call)
     }
 
+    /// The pending writes with the numbers of their records, for a checkpoint.
+    pub(super) fn numbered(&self) -> Vec<PendingWrite> {
+        let numbered = self.seqs.iter().zip(&self.calls);
+        let numbered = numbered.map(|(seq, call)| PendingWrite {
+            seq: *seq,
+            call: call.clone(),
+        });
+        numbered.collect()
+    }
+
     pub(super) fn calls(&self) -> &[Request] {
         &self.calls
     }
@@ -104,13 +135,12 @@ mod tests {
     #[test]
     fn a_write_that_a_checkpoint_has_too_outlives_it() {
         let write = || Request::new(Method::SetParam, ["/n", "/k", "v"]);
-        let mut pending = PendingWrites::default();
-        pending.extend([write()], 0).unwrap();
-        pending.are_restored();
+        let (seq, call) = (3, write());
+        let mut pending = PendingWrites::restored(vec![PendingWrite { seq, call }]).unwrap();
         assert!(!pending.contains(&write()));
-        pending.extend([write()], 0).unwrap();
+        pending.extend([write()], 5).unwrap();
         assert!(pending.contains(&write()));
-        pending.forget_restored();
+        assert_eq!(pending.forget_restored(), 3);
         assert_eq!(pending.calls(), [write()]);
     }
 

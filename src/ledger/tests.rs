@@ -2,7 +2,7 @@ use std::{sync::Arc, time::Duration};
 
 use checkpoint_store::StoreError;
 use rescue_core::{
-    checkpoint::format,
+    checkpoint::format::{self, PendingWrite},
     order::{Concern, NextNotification},
 };
 use ros1_master::xmlrpc::Value;
@@ -111,14 +111,18 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     answer(&call("deleteParam", &["/n", "/b"]));
     answer(&call("setParam", &["/n", "/"]));
     assert_eq!(pending(&ledger), [set(1), set(2)]);
-    assert_eq!(ledger.checkpoint().pending, [set(1), set(2)]);
+    let kept = ledger.checkpoint().pending.into_iter();
+    assert_eq!(
+        kept.map(|write| write.call).collect::<Vec<_>>(),
+        [set(1), set(2)]
+    );
     ledger.delivered();
     assert_eq!(pending(&ledger), []);
     let multicall = Request::multicall([set(3), call("getPid", &["/n"]), set(3), set(4)]);
     answer(&multicall);
     assert_eq!(pending(&ledger), [set(3), set(3), set(4)]);
     let before = ledger.token();
-    assert_ne!(ledger.succeed(), before);
+    assert_ne!(ledger.succeed().0, before);
     assert_eq!(pending(&ledger), []);
 }
 
@@ -152,6 +156,39 @@ fn too_many_pending_writes_make_another_incarnation_of_their_master() {
     assert!(ledger.stand_in(Instant::now(), &many).is_some());
     assert_eq!(pending(&ledger), []);
     assert_ne!(ledger.token(), before);
+}
+
+/// A process died while a master got the state as of record 5, and the next one before it had examined that master.
+#[test]
+fn a_start_knows_which_pending_writes_a_master_that_was_announced_lacks() {
+    let pending_at = |number| {
+        let write = |seq: u64| PendingWrite {
+            seq,
+            call: publish(&format!("/t{seq}")),
+        };
+        let (incarnation, at) = (4, 5);
+        let session = Session {
+            incarnation: 2,
+            announced: Some(Announced { incarnation, at }),
+            ..Session::default()
+        };
+        let (stats, sync) = (Box::leak(Box::default()), SyncPolicy::Interval);
+        let pending = vec![write(3), write(5), write(8)];
+        let ledger = Ledger::new(Master::default(), session, pending, None, sync, stats);
+        ledger.catch_up(number);
+        // A second process that dies learns the same.
+        let session = ledger.session();
+        assert_eq!((session.incarnation, session.announced), (number, None));
+        let later = ledger.lock().pending.numbered().into_iter();
+        let later: Vec<_> = later.map(|write| write.seq).collect();
+        assert!(later.iter().all(|seq| *seq > session.delivered));
+        later
+    };
+    assert_eq!(pending_at(4), [8]);
+    // An injection before that was announced, too, and may have reached this master.
+    assert_eq!(pending_at(3), [3, 5, 8]);
+    // The checkpoint is an old copy.
+    assert_eq!(pending_at(5), [0; 0]);
 }
 
 #[test]

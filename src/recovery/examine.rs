@@ -23,7 +23,7 @@ use tokio::task::JoinHandle;
 
 use crate::{
     gate::{State, Tx},
-    ledger::{Basis, Ledger, late::CatchUp},
+    ledger::{Basis, Ledger, durability::Mark, late::CatchUp},
     limit::rarely,
     status::{report::RecoveryOutcome, stats::Stats},
     upstream::{CallError, ConnectError, RawReply, inspect::InspectError},
@@ -146,6 +146,9 @@ pub(crate) trait Contact: Send {
         &mut self,
         plan: &Plan,
     ) -> impl Future<Output = Result<RawReply, ExamineError>> + Send;
+
+    /// Waits until the disk has this record. Does not wait for a disk that fails or hangs.
+    fn wait_for_disk(&mut self, ledger: &Ledger, record: Mark) -> impl Future<Output = ()> + Send;
 
     /// Whether no process listens at the local `port` of a node.
     fn is_dead(&mut self, port: &str) -> impl Future<Output = bool> + Send;
@@ -298,6 +301,7 @@ impl Examiner {
             Some(CatchUp::Run(missed)) => *missed,
         };
         let (count, mirror) = (missed.writes.len(), &missed.mirror);
+        master.wait_for_disk(&self.ledger, missed.announced).await;
         let plan = tokio::task::block_in_place(|| {
             Plan::run(&missed.behind, missed.writes, &missed.before, &missed.token)
         });
@@ -416,7 +420,8 @@ impl Examiner {
             // master that was only late finishes its own.
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
-        let token = self.ledger.succeed();
+        let (token, announced) = self.ledger.succeed();
+        master.wait_for_disk(&self.ledger, announced).await;
         let target = Target {
             state,
             found,

@@ -18,7 +18,7 @@ use tokio::task::JoinHandle;
 
 use super::examine::{Contact, ExamineError, Prepared};
 use crate::{
-    ledger::Ledger,
+    ledger::{Ledger, durability::Mark},
     limit::rarely,
     nodes::client::{self, Reaction},
     process::{self, listeners},
@@ -187,6 +187,10 @@ impl Contact for LiveMaster {
             true => within(CATCH_UP_LIMIT, reply).await,
             false => self.reach.while_alive(reply).await,
         }
+    }
+
+    async fn wait_for_disk(&mut self, ledger: &Ledger, record: Mark) {
+        ledger.durable(record).await;
     }
 
     async fn is_dead(&mut self, port: &str) -> bool {

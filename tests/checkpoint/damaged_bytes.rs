@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use rescue_core::checkpoint::format::{
-    Checkpoint, Decoded, FormatError, Label, Origin, Record, RecordContent, Session, SnapshotError,
-    Stamp, decode, encode_checkpoint, encode_record,
+    Announced, Checkpoint, Decoded, FormatError, Label, Origin, PendingWrite, Record,
+    RecordContent, Session, SnapshotError, Stamp, decode, encode_checkpoint, encode_record,
 };
 use ros1_master::{
     master::{Method, OrderedMap, Request, Snapshot, SnapshotNode},
@@ -235,11 +235,17 @@ fn file_with_pending_writes() -> Vec<u8> {
     let mut checkpoint = checkpoint(7);
     checkpoint.session.incarnation = 2;
     checkpoint.session.delivered = 5;
+    let (incarnation, at) = (3, 6);
+    checkpoint.session.announced = Some(Announced { incarnation, at });
     let pending = |seq| match record(seq).entry {
         RecordContent::Call { call, .. } => call,
         RecordContent::Session(_) => unreachable!(),
     };
-    checkpoint.pending = vec![pending(6), pending(7)];
+    let write = |seq| PendingWrite {
+        seq,
+        call: pending(seq),
+    };
+    checkpoint.pending = vec![write(6), write(7)];
     let encoded = encode_checkpoint(&checkpoint, 1).unwrap();
     let mut session = checkpoint.session;
     session.delivered = 8;
@@ -250,7 +256,7 @@ fn file_with_pending_writes() -> Vec<u8> {
             pending: true,
             label: label(Origin::At([10, 0, 0, 5].into())),
         },
-        RecordContent::Session(session),
+        RecordContent::Session(session.into()),
         RecordContent::labelled(pending(10), label(Origin::Rosrescue)),
         RecordContent::labelled(pending(11), label(Origin::At([127, 0, 0, 1].into()))),
         RecordContent::labelled(pending(12), label(Origin::Unknown)),

@@ -7,8 +7,8 @@ mod python;
 use self::catalogue::{catalogue, values};
 use proptest::prelude::*;
 use rescue_core::checkpoint::format::{
-    Checkpoint, DEPTH_MAX, EncodeError, Label, Origin, Record, RecordContent, Session, decode,
-    encode_checkpoint, encode_record,
+    Announced, Checkpoint, DEPTH_MAX, EncodeError, Label, Origin, PendingWrite, Record,
+    RecordContent, Session, decode, encode_checkpoint, encode_record,
 };
 use ros1_master::{
     master::{Displaced, Method, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode},
@@ -35,8 +35,12 @@ fn in_struct(value: Value) -> Value {
 /// A state that has `value` as a parameter, set by a pending write.
 fn with_value(value: &Value) -> Checkpoint {
     let delete = Request::new(Method::DeleteParam, [Value::Nil; 0]);
+    let calls = [set_param(value), delete].into_iter();
+    let pending = (4_999_999_999..).zip(calls);
     Checkpoint {
-        pending: vec![set_param(value), delete],
+        pending: pending
+            .map(|(seq, call)| PendingWrite { seq, call })
+            .collect(),
         ..with_params(Struct::from([("p".to_owned(), value.clone())]))
     }
 }
@@ -59,6 +63,10 @@ fn with_params(params: Struct) -> Checkpoint {
             started: "2024-01-31 12:00:00".to_owned(),
             incarnation: 3,
             delivered: 4_999_999_999,
+            announced: Some(Announced {
+                incarnation: 5,
+                at: 4_999_999_998,
+            }),
             term: 1_800_000,
             cluster_seq: 1_700_000,
             port: 11_312,
@@ -203,7 +211,7 @@ fn a_session_record_is_read_back_unchanged() {
     };
     let record = Record {
         seq: 1,
-        entry: RecordContent::Session(session),
+        entry: RecordContent::Session(session.into()),
     };
     let mut file = encoded.bytes;
     file.extend(encode_record(&record, encoded.stamp).unwrap());

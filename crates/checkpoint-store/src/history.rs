@@ -95,8 +95,8 @@ pub fn last_rescue(path: &Path) -> u64 {
 /// If the file cannot be written. Then no part of it remains.
 pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
     checkpoint.snapshot.remove_named(DRILLS);
-    checkpoint.pending.retain(|call| {
-        let caller = call.caller();
+    checkpoint.pending.retain(|write| {
+        let caller = write.call.caller();
         caller.is_none_or(|caller| !caller.starts_with(DRILLS))
     });
     let names = names_of(path);
@@ -156,6 +156,7 @@ fn names_of(path: &Path) -> Names {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rescue_core::checkpoint::format::PendingWrite;
     use ros1_master::{
         master::{Method, Request, SnapshotNode},
         xmlrpc::Value,
@@ -251,7 +252,8 @@ mod tests {
                 .subscribers
                 .insert("/scan".to_owned(), list(&["/n"]));
             snapshot.params.insert("speed".to_owned(), 3.into());
-            checkpoint.pending = vec![set("/n", "/speed", 3)];
+            let (seq, call) = (1, set("/n", "/speed", 3));
+            checkpoint.pending = vec![PendingWrite { seq, call }];
             checkpoint
         };
         let mut with_drill = robot();
@@ -278,7 +280,8 @@ mod tests {
         snapshot
             .params
             .insert("rosrescue_drill_7".to_owned(), 1.into());
-        with_drill.pending.push(set(&drill, &drill, 1));
+        let (seq, call) = (2, set(&drill, &drill, 1));
+        with_drill.pending.push(PendingWrite { seq, call });
         let kept = keep_rescue(&path, 1, with_drill).unwrap();
         let loaded = super::super::read(&kept).unwrap().unwrap();
         assert_eq!(loaded.checkpoint, Some(robot()));

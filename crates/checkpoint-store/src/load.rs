@@ -34,7 +34,7 @@ impl Loaded {
             .iter()
             .rev()
             .find_map(|record| match &record.entry {
-                RecordContent::Session(session) => Some(session),
+                RecordContent::Session(session) => Some(&**session),
                 RecordContent::Call { .. } => None,
             });
         later.or_else(|| Some(&self.checkpoint.as_ref()?.session))

@@ -14,7 +14,7 @@ use ros1_master::xmlrpc::Python;
 
 use super::*;
 use crate::{
-    ledger::owed::Telling,
+    ledger::{durability::Mark, owed::Telling},
     recovery::examine::{Contact, Examination, ExamineError, Examiner, Manner},
     status::report::RecoveryOutcome,
 };
@@ -65,6 +65,8 @@ enum Question {
     Settle,
     /// The answer to a call.
     Call(Request),
+    /// That the disk has this record.
+    Disk(Mark),
 }
 
 /// The connection between an examination and the simulated master.
@@ -121,6 +123,13 @@ impl Contact for SimulatedMaster {
         Ok(raw(&reply))
     }
 
+    async fn wait_for_disk(&mut self, ledger: &Ledger, record: Mark) {
+        if ledger.to_await(record).is_some() {
+            let question = Question::Disk(record);
+            self.ask(question).await.unwrap();
+        }
+    }
+
     async fn is_dead(&mut self, _: &str) -> bool {
         false
     }
@@ -168,6 +177,8 @@ pub(super) struct Recovery {
     line: Arc<Mutex<Line>>,
     /// Number of the last question of an examination.
     questions: u64,
+    /// The record that an examination waits for, with the numbers of its step and question.
+    awaits_disk: Option<(Mark, u64, u64)>,
     /// How long the examination waits for an answer, in microseconds.
     silent_most: u64,
     /// Whether the master has just been started by rosrescue, and has not been called yet.
@@ -197,6 +208,7 @@ impl Recovery {
             examination: None,
             line: Arc::default(),
             questions: 0,
+            awaits_disk: None,
             silent_most: SILENT_MOST,
             is_unused: false,
             connected: None,
@@ -389,6 +401,10 @@ impl World {
         let step = self.recovery.step;
         match question {
             Some(Question::Settle) => self.settles(step),
+            Some(Question::Disk(record)) => {
+                self.recovery.questions += 1;
+                self.recovery.awaits_disk = Some((record, step, self.recovery.questions));
+            }
             Some(Question::Call(call)) => {
                 self.recovery.questions += 1;
                 let number = self.recovery.questions;
@@ -415,6 +431,18 @@ impl World {
                 let nothing = Reply::Value(Value::Bool(true));
                 self.answer_examination(step, self.recovery.questions, Ok(nothing));
             }
+        }
+    }
+
+    /// Lets an examination go on that has waited for the disk.
+    pub(super) fn disk_has_written(&mut self) {
+        let waits = self.recovery.awaits_disk;
+        if let Some((record, step, number)) = waits
+            && self.ledger.to_await(record).is_none()
+        {
+            self.recovery.awaits_disk = None;
+            let nothing = Reply::Value(Value::Bool(true));
+            self.answer_examination(step, number, Ok(nothing));
         }
     }
 

@@ -218,6 +218,7 @@ impl World {
         disk.is_writing = false;
         self.poll_checkpoint();
         self.give_safe();
+        self.disk_has_written();
     }
 
     pub(super) fn disk_fails(&mut self) {

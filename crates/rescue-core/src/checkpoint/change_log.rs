@@ -214,7 +214,7 @@ impl LogReader {
             }
             RecordContent::Session(next) => {
                 self.session(next.at, &session, &next);
-                (state, next)
+                (state, *next)
             }
         });
     }

@@ -50,9 +50,10 @@ pub struct Session {
     pub started: String,
     /// The number of the present master process, as in its [`Token`](crate::replay::Token).
     pub incarnation: u64,
-    /// Number of the record up to which all pending writes have reached the master. Pending writes in a snapshot count
-    /// as if they had the number of the snapshot's last record.
+    /// Number of the record up to which all pending writes have reached the master.
     pub delivered: u64,
+    /// The injection that has been begun last, if it is not known to have ended.
+    pub announced: Option<Announced>,
     /// The port that nodes use.
     pub port: u16,
     /// With several computers: the last term in which this computer led. 0 if it never led.
@@ -62,6 +63,24 @@ pub struct Session {
     pub cluster_seq: u64,
     /// Wall clock time at which this was written, in milliseconds since 1970. It is a label, like [`Label::at`].
     pub at: u64,
+}
+
+/// An injection that has been begun: a master with the token of `incarnation` holds the state as of record `at`. Other
+/// masters lack what they lacked before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Announced {
+    /// The number in the [`Token`](crate::replay::Token) that this master gets.
+    pub incarnation: u64,
+    /// The number of a record.
+    pub at: u64,
+}
+
+/// A write that the mirror has answered and that no master is known to have run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PendingWrite {
+    /// The number of its record.
+    pub seq: u64,
+    pub call: Request,
 }
 
 /// When a record was made, and who made the call. For people only: the order of records is that of their numbers, and
@@ -117,7 +136,7 @@ pub enum RecordContent {
         label: Label,
     },
     /// New facts about the session, which replace the previous ones.
-    Session(Session),
+    Session(Box<Session>),
 }
 
 impl RecordContent {
@@ -152,7 +171,7 @@ pub struct Checkpoint {
     pub session: Session,
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
-    pub pending: Vec<Request>,
+    pub pending: Vec<PendingWrite>,
     /// Nodes that must shut down because another node has taken their name. Some of them may not have been told yet.
     pub displaced: Vec<Displaced>,
     /// Whether the state is exactly what the records before it give. False after a change without a record. Not written
@@ -244,7 +263,7 @@ pub struct Decoded {
 /// use rescue_core::checkpoint::format::{self, Checkpoint, Record, RecordContent, Session};
 ///
 /// let fresh = format::encode_checkpoint(&Checkpoint::default(), 1)?;
-/// let entry = RecordContent::Session(Session::default());
+/// let entry = RecordContent::Session(Box::default());
 /// let record = Record { seq: 1, entry };
 /// let line = format::encode_record(&record, fresh.stamp)?;
 ///

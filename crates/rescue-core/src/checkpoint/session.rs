@@ -5,8 +5,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::checkpoint::format::{Checkpoint, Record, RecordContent, Session};
-use ros1_master::master::{Displaced, Master, Request};
+use crate::checkpoint::format::{Checkpoint, PendingWrite, Record, RecordContent, Session};
+use ros1_master::master::{Displaced, Master};
 
 /// When to restore a checkpoint at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -93,7 +93,7 @@ pub struct Rebuilt {
     pub mirror: Master,
     pub session: Option<Session>,
     /// Writes that have not reached the master yet, in order.
-    pub pending: Vec<Request>,
+    pub pending: Vec<PendingWrite>,
     /// Nodes whose names were taken in the records or shortly before the snapshot, ordered by address. It is unknown
     /// which of them were told to shut down.
     pub displaced: Vec<Displaced>,
@@ -103,12 +103,9 @@ pub struct Rebuilt {
 
 pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
     let mut rebuilt = Rebuilt::default();
-    // Each write with the number of its record, or of the snapshot's last record.
-    let mut pending: Vec<(u64, Request)> = Vec::new();
     let mut displaced = BTreeMap::new();
     if let Some(checkpoint) = checkpoint {
-        let writes = checkpoint.pending.into_iter();
-        pending.extend(writes.map(|call| (checkpoint.seq, call)));
+        rebuilt.pending = checkpoint.pending;
         rebuilt.session = Some(checkpoint.session);
         let owed = checkpoint.displaced.into_iter();
         displaced.extend(owed.map(|it| (it.api.clone(), it)));
@@ -117,7 +114,6 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
             Err(error) => rebuilt.trouble = Some(error.to_string()),
         }
     }
-    let delivered = |session: &Option<Session>| session.as_ref().map_or(0, |it| it.delivered);
     for Record { seq, entry } in records {
         match entry {
             RecordContent::Call {
@@ -134,18 +130,17 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                     session.cluster_seq += 1;
                 }
                 if waits {
-                    pending.push((seq, call));
+                    rebuilt.pending.push(PendingWrite { seq, call });
                 }
             }
             RecordContent::Session(session) => {
-                if session.delivered > delivered(&rebuilt.session) {
-                    pending.retain(|(seq, _)| *seq > session.delivered);
-                }
-                rebuilt.session = Some(session);
+                rebuilt
+                    .pending
+                    .retain(|write| write.seq > session.delivered);
+                rebuilt.session = Some(*session);
             }
         }
     }
-    rebuilt.pending = pending.into_iter().map(|(_, call)| call).collect();
     rebuilt.displaced = displaced.into_values().collect();
     rebuilt
 }
@@ -154,7 +149,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
 mod tests {
     use super::*;
     use crate::checkpoint::format::Label;
-    use ros1_master::master::Method;
+    use ros1_master::master::{Method, Request};
     use ros1_master::xmlrpc::Value;
 
     fn write(seq: u64, pending: bool) -> Record {
@@ -169,26 +164,27 @@ mod tests {
     }
 
     fn delivered(seq: u64, delivered: u64) -> Record {
-        let entry = RecordContent::Session(Session {
+        let session = Session {
             delivered,
             ..Session::default()
-        });
+        };
+        let entry = RecordContent::Session(session.into());
         Record { seq, entry }
     }
 
-    /// The pending writes: those in a snapshot taken at record 5, and those in `records`.
+    /// The pending writes: number 4 in a snapshot taken at record 5, and those in `records`.
     fn waiting(records: &[Record]) -> Vec<String> {
         let RecordContent::Call { call, .. } = write(4, true).entry else {
             unreachable!()
         };
         let mut checkpoint = Checkpoint {
             seq: 5,
-            pending: vec![call],
+            pending: vec![PendingWrite { seq: 4, call }],
             ..Checkpoint::default()
         };
         checkpoint.session.delivered = 3;
         let rebuilt = rebuild(Some(checkpoint), records.to_vec());
-        let name = |call: &Request| call.params()[1].as_str().unwrap().to_owned();
+        let name = |write: &PendingWrite| write.call.params()[1].as_str().unwrap().to_owned();
         rebuilt.pending.iter().map(name).collect()
     }
 
@@ -199,9 +195,8 @@ mod tests {
         // A session record written for another reason changes nothing.
         records.push(delivered(9, 3));
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
-        // The pending writes in the snapshot have the number of its last record.
         records.push(delivered(10, 4));
-        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        assert_eq!(waiting(&records), ["/p7", "/p8"]);
         records.push(delivered(11, 7));
         assert_eq!(waiting(&records), ["/p8"]);
         records.extend([write(12, true), delivered(13, 12)]);
@@ -223,10 +218,11 @@ mod tests {
     #[test]
     fn each_call_after_a_session_record_counts_as_one_more_in_the_etcd_journal() {
         let session = |seq, cluster_seq| {
-            let entry = RecordContent::Session(Session {
+            let session = Session {
                 cluster_seq,
                 ..Session::default()
-            });
+            };
+            let entry = RecordContent::Session(session.into());
             Record { seq, entry }
         };
         assert_eq!(cluster_seq(Vec::new()), 7);

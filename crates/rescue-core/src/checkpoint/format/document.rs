@@ -3,7 +3,10 @@
 use std::net::IpAddr;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
-use super::{Checkpoint, EncodeError, Label, Origin, RecordContent, Session, frame, yaml};
+use super::{
+    Announced, Checkpoint, EncodeError, Label, Origin, PendingWrite, RecordContent, Session, frame,
+    yaml,
+};
 use ros1_master::master::{Displaced, OrderedMap, Request, ServiceEntry, Snapshot, SnapshotNode};
 use ros1_master::xmlrpc::{Call, Struct, Value};
 
@@ -69,8 +72,10 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
     );
     if !pending.is_empty() {
         out.extend_from_slice(b"pending:\n");
-        for call in pending {
-            out.extend_from_slice(b"- {");
+        for PendingWrite { seq, call } in pending {
+            out.extend_from_slice(b"- {seq: ");
+            decimal(out, *seq);
+            out.push(b',');
             write_call(out, call)?;
             out.extend_from_slice(b"}\n");
         }
@@ -222,9 +227,12 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ),
         ("started", session.started.as_str().into()),
     ];
+    let announced = session.announced;
     let counts = [
         ("incarnation", session.incarnation),
         ("delivered", session.delivered),
+        ("announced", announced.map_or(0, |it| it.incarnation)),
+        ("announced_at", announced.map_or(0, |it| it.at)),
         ("term", session.term),
         ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
@@ -316,7 +324,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         None => Vec::new(),
         Some(Value::Array(calls)) => calls
             .into_iter()
-            .map(|call| read_call(structure(call).ok_or("`pending` has a malformed entry")?))
+            .map(read_pending)
             .collect::<Result<_, _>>()?,
         Some(_) => return Err("`pending` is not a list".to_owned()),
     };
@@ -376,7 +384,8 @@ pub(super) fn read_record(line: &str) -> Result<RecordContent, String> {
         return Err("it is not a record".to_owned());
     };
     if entry.contains_key("session") {
-        return read_session(members(&mut entry, "session")?).map(RecordContent::Session);
+        return read_session(members(&mut entry, "session")?)
+            .map(|session| RecordContent::Session(session.into()));
     }
     let pending = entry.get("pending") == Some(&Value::Bool(true));
     let label = read_label(&entry);
@@ -403,6 +412,14 @@ fn read_call(mut entry: Struct) -> Result<Request, String> {
     call.ok_or_else(|| "it has no call".to_owned())
 }
 
+fn read_pending(write: Value) -> Result<PendingWrite, String> {
+    let write = structure(write).ok_or("`pending` has a malformed entry")?;
+    Ok(PendingWrite {
+        seq: count(&write, "seq")?.ok_or("`seq` of a pending write is missing")?,
+        call: read_call(write)?,
+    })
+}
+
 fn read_session(mut session: Struct) -> Result<Session, String> {
     let session = &mut session;
     Ok(Session {
@@ -414,6 +431,13 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         started: text(session, "started")?,
         incarnation: count(session, "incarnation")?.unwrap_or(0),
         delivered: count(session, "delivered")?.unwrap_or(0),
+        announced: match count(session, "announced")? {
+            None => None,
+            Some(incarnation) => Some(Announced {
+                incarnation,
+                at: count(session, "announced_at")?.unwrap_or(0),
+            }),
+        },
         term: count(session, "term")?.unwrap_or(0),
         cluster_seq: count(session, "cluster_seq")?.unwrap_or(0),
         port: count(session, "port")?

@@ -96,7 +96,7 @@ fn numbers_too_high_to_continue_counting_are_damage() {
     assert_eq!(header(u64::MAX, 1), Err(SnapshotError::Header));
     let encoded = encode_checkpoint(&checkpoint(0), 1).unwrap();
     for (seq, whole) in [(most, true), (most + 1, false), (u64::MAX, false)] {
-        let entry = RecordContent::Session(Session::default());
+        let entry = RecordContent::Session(Box::default());
         let line = encode_record(&Record { seq, entry }, encoded.stamp).unwrap();
         let decoded = decode(&[encoded.bytes.as_slice(), &line].concat()).unwrap();
         assert_eq!(

@@ -83,7 +83,7 @@ fn what_is_written_is_read_whatever_its_size() {
     };
     let session = Record {
         seq: 1,
-        entry: RecordContent::Session(session),
+        entry: RecordContent::Session(session.into()),
     };
     assert_eq!(through(std::slice::from_ref(&session)).0, [session]);
 }
