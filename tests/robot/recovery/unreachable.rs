@@ -83,3 +83,38 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
         assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
     }
 }
+
+#[test]
+fn a_dead_node_is_notified_of_nothing_until_it_answers_again() {
+    let mut robot = Robot::start_for_outages(Mode::Proxy);
+    let client = robot.client();
+    let dead = FakeNode::start("/subscriber");
+    let port = dead.port();
+    dead.subscribe(&client, "/topic", "std_msgs/String");
+    robot.take_master_away();
+    drop(dead);
+    let publishers: Vec<_> = (0..10)
+        .map(|number| FakeNode::start(&format!("/publisher{number}")))
+        .collect();
+    let (first, later) = publishers.split_first().unwrap();
+    first.publish(&client, "/topic", "std_msgs/String");
+    eventually("the node does not answer", || {
+        let status = status(&client);
+        ["unreachable", "dead_nodes"]
+            .iter()
+            .any(|list| names(&status[*list]) == ["/subscriber"])
+            && robot.counter("notifications_sent") > 0
+    });
+    let sent = robot.counter("notifications_sent");
+    for publisher in later {
+        publisher.publish(&client, "/topic", "std_msgs/String");
+    }
+    assert!(holds(Duration::from_secs(1), || {
+        robot.counter("notifications_sent") == sent
+    }));
+    let back = FakeNode::start_at("/subscriber", port);
+    let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
+    eventually("the node knows all publishers", || {
+        back.updates("/topic").last() == Some(&all)
+    });
+}
