@@ -1,10 +1,7 @@
 //! Judges `--cluster`: its options, and what etcd says.
 
 use super::{
-    super::{
-        computers::{Cluster, Unusable},
-        facts::SetupFacts,
-    },
+    super::{computers::Cluster, facts::SetupFacts},
     Findings,
 };
 use crate::cluster::survey;
@@ -16,11 +13,7 @@ impl Findings {
         let cluster = match facts.cluster.as_deref() {
             None => return,
             Some(Ok(cluster)) => cluster,
-            Some(Err(Unusable::Options(error))) => {
-                let todo = "with these options, core does not start: `rosrescue core --help` explains them";
-                return self.bad(CLUSTER, error.to_string(), todo);
-            }
-            Some(Err(Unusable::Etcd(error))) => {
+            Some(Err(error)) => {
                 let todo = "with these options, core does not start: `rosrescue core --help` explains them";
                 return self.bad(CLUSTER, error.to_string(), todo);
             }
