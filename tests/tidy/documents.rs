@@ -257,6 +257,33 @@ fn files_and_functions_that_documents_name_exist() {
     assert!(files > 10 && functions > 30, "{files}, {functions}");
 }
 
+/// A function that is moved leaves its old file in the table.
+#[test]
+fn functions_in_the_table_of_decisions_are_in_its_files() {
+    let text = read(root().join("docs/architecture.md"));
+    let (_, table) = text.split_once("## Where it is decided").unwrap();
+    let table = table.split("\n## ").next().unwrap();
+    let mut functions = 0;
+    for row in table.lines().filter(|line| line.starts_with("| ")).skip(1) {
+        let columns: Vec<_> = row.split('|').collect();
+        let files: Vec<_> = quoted(columns[4])
+            .map(|file| read(root().join(file)))
+            .collect();
+        assert!(!files.is_empty(), "no file: {row}");
+        for name in quoted(columns[2]).filter(|name| name.contains("::")) {
+            let item = format!("fn {}", name.rsplit("::").next().unwrap());
+            let is_there = files.iter().any(|file| {
+                ["(", "<"]
+                    .iter()
+                    .any(|end| file.contains(&format!("{item}{end}")))
+            });
+            assert!(is_there, "{name} is in none of the files: {row}");
+            functions += 1;
+        }
+    }
+    assert!(functions > 30, "{functions}");
+}
+
 #[test]
 fn tests_that_the_table_of_decisions_names_exist() {
     let text = read(root().join("docs/architecture.md"));
