@@ -126,12 +126,12 @@ pub(crate) fn runs(pid: u32, name: &str) -> bool {
 }
 
 /// Whether the process `pid` was started by a rosrescue with this checkpoint.
-pub(crate) fn is_of(pid: u32, checkpoint: &Path) -> bool {
+pub(crate) fn belongs_to(pid: u32, checkpoint: &Path) -> bool {
     orphan::bears(pid, &orphan::owner(checkpoint))
 }
 
 /// Whether the process `pid` was started by any rosrescue.
-pub(crate) fn is_of_any(pid: u32) -> bool {
+pub(crate) fn belongs_to_any_rosrescue(pid: u32) -> bool {
     orphan::has_owner(pid) || parent_of(pid).is_some_and(is_rosrescue)
 }
 

@@ -60,8 +60,8 @@ impl Target {
             )));
         }
         let pid = self.master_pid().await.map_err(CommandFailure::Failed)?;
-        let is_master =
-            process::runs(pid, "rosmaster") || process::is_of(pid, Path::new(&status.checkpoint));
+        let is_master = process::runs(pid, "rosmaster")
+            || process::belongs_to(pid, Path::new(&status.checkpoint));
         if is_master && listeners::listens(pid, address.port) {
             return Ok(pid);
         }

@@ -26,7 +26,7 @@ impl Process {
 pub(super) fn masters() -> Vec<Process> {
     process::all_pids()
         .filter(|pid| ["rosmaster", "roscore"].contains(&&*process::name_of(*pid)))
-        .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
+        .filter(|pid| process::is_in_our_network(*pid) && !process::belongs_to_any_rosrescue(*pid))
         .map(Process::read)
         .collect()
 }
@@ -41,7 +41,7 @@ pub(super) fn strays(own: &str) -> Vec<(Process, String)> {
         let uri = variables.find_map(|variable| variable.strip_prefix(NAME))?;
         let uri = String::from_utf8_lossy(uri).into_owned();
         let is_stray = !uri.is_empty() && uri.trim_end_matches('/') != own.trim_end_matches('/');
-        if !is_stray || !process::is_in_our_network(pid) || process::is_of_any(pid) {
+        if !is_stray || !process::is_in_our_network(pid) || process::belongs_to_any_rosrescue(pid) {
             return None;
         }
         let process = Process::read(pid);
