@@ -5,6 +5,7 @@ mod computers;
 mod names;
 mod network;
 mod port;
+mod ros;
 mod system;
 #[cfg(test)]
 mod tests;

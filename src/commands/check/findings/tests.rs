@@ -3,6 +3,7 @@ mod computers;
 mod names;
 mod network;
 mod port;
+mod ros;
 mod system;
 mod variables;
 
