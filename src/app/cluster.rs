@@ -458,7 +458,7 @@ impl ClusterDriver {
             ));
             let seq = keys.seq_of(&change.key);
             if let (Some(kv), Some(seq)) = (change.kv, seq) {
-                entries.push(entry(seq, &kv));
+                entries.push((change.revision, entry(seq, &kv)));
             }
         }
         let view = self.watched.clone();

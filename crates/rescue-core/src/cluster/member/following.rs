@@ -141,18 +141,24 @@ impl Member {
         &mut self,
         now: Instant,
         view: View,
-        entries: Vec<WatchedEntry>,
+        mut entries: Vec<(u64, WatchedEntry)>,
         deleted: Option<u64>,
     ) {
+        let (known, origin) = (self.view().origin, view.origin);
         // What the watch delivers late is older than the answers to requests, and says nothing.
         if view.revision >= self.view().revision && self.doubts(now, &view) {
             // What was added to the lost journal before still counts.
+            let is_other = ![0, known].contains(&origin);
+            entries.retain(|(revision, _)| !is_other || *revision < origin);
             let next = self.journal.progress.seq + 1;
-            if entries.first().is_some_and(|first| first.begins_with(next)) {
+            let first = entries.first();
+            if first.is_some_and(|(_, first)| first.begins_with(next)) {
                 self.take_entries(now, entries);
             }
             return;
         }
+        // The watch may have begun before the journal.
+        entries.retain(|(revision, _)| *revision > origin);
         if self.guards_journal() && deleted.is_some_and(|seq| seq > self.chores.replaced) {
             self.reading.check_all(now);
             self.reading.is_doubtful = true;
@@ -161,7 +167,6 @@ impl Member {
             return;
         }
         // The keys first: if they depose this computer, its writes are kept, and count as older than the entries.
-        let origin = view.origin;
         self.see(now, view);
         if origin != self.view().origin {
             // A new journal has begun since.
@@ -172,11 +177,11 @@ impl Member {
     }
 
     /// Follows the journal with these entries, up to the first that does not continue it.
-    fn take_entries(&mut self, now: Instant, entries: Vec<WatchedEntry>) {
+    fn take_entries(&mut self, now: Instant, entries: Vec<(u64, WatchedEntry)>) {
         let progress = &mut self.journal.progress;
         // All records at once, because each new state may take long.
         let mut records = Vec::new();
-        for entry in entries {
+        for (_, entry) in entries {
             let new = match entry {
                 WatchedEntry::Records { records, bytes } => progress.take(records, bytes).ok(),
                 WatchedEntry::Apart(seq) if seq <= progress.seq => continue,

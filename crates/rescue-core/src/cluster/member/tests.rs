@@ -163,9 +163,9 @@ fn however_many_records_arrive_at_once_they_make_one_new_state() {
     let mut merges = Merges::new();
     assert!(merges.next().is_some());
     let first = merges.journal.seq + 1;
-    let entries = (first..first + 50).map(|seq| WatchedEntry::Records {
-        records: vec![record(seq)],
-        bytes: 1,
+    let entries = (first..first + 50).map(|seq| {
+        let records = vec![record(seq)];
+        (seq + 1, WatchedEntry::Records { records, bytes: 1 })
     });
     let (view, entries, members) = (led(first + 49), entries.collect(), Vec::new());
     let watched = Input::Watched {
@@ -247,12 +247,10 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
         members: Vec::new(),
     }));
     assert_eq!(followed(loaded), None);
+    let (revision, records) = (3, records(2));
     let late = Input::Watched {
         view: own_view(2),
-        entries: vec![WatchedEntry::Records {
-            records: records(2),
-            bytes: 1,
-        }],
+        entries: vec![(revision, WatchedEntry::Records { records, bytes: 1 })],
         deleted: None,
         members: Vec::new(),
     };

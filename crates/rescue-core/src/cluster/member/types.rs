@@ -155,7 +155,8 @@ pub enum Input {
     /// The watch on etcd delivers the keys `origin`, `leader` and `alive`, new journal entries, and changed member entries.
     Watched {
         view: View,
-        entries: Vec<WatchedEntry>,
+        /// With the revision at which each was written.
+        entries: Vec<(u64, WatchedEntry)>,
         /// The highest number of a record that a deleted key held; see [`Keys::record_of`](crate::cluster::journal::Keys::record_of).
         deleted: Option<u64>,
         members: Vec<MemberEntryChange>,

@@ -474,20 +474,23 @@ impl Etcd {
         read
     }
 
-    /// The entries of the journal after revision `after`, up to revision `upto`, as a watch shows them. `None` if a
+    /// The entries of the journal after revision `after`, up to revision `upto`, as a watch shows them with their revisions. `None` if a
     /// snapshot has replaced them.
-    pub(super) fn entries_after(&self, after: u64, upto: u64) -> Option<Vec<WatchedEntry>> {
+    pub(super) fn entries_after(&self, after: u64, upto: u64) -> Option<Vec<(u64, WatchedEntry)>> {
         if after < self.compacted {
             return None;
         }
         let new = self.puts.iter();
         let new = new.filter(|(revision, ..)| (after + 1..=upto).contains(revision));
-        let entries = new.map(|(_, seq, held, bytes)| match held {
-            Held::State(_) => WatchedEntry::Apart(*seq),
-            Held::Records(records) => WatchedEntry::Records {
-                records: records.clone(),
-                bytes: *bytes,
-            },
+        let entries = new.map(|(revision, seq, held, bytes)| {
+            let entry = match held {
+                Held::State(_) => WatchedEntry::Apart(*seq),
+                Held::Records(records) => WatchedEntry::Records {
+                    records: records.clone(),
+                    bytes: *bytes,
+                },
+            };
+            (*revision, entry)
         });
         Some(entries.collect())
     }
