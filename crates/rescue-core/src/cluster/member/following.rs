@@ -309,6 +309,10 @@ impl Member {
             // If another check is due, the watch has shown something since this one began.
             self.reading.is_doubtful &= self.reading.check_due;
         }
+        if self.reading.is_doubtful {
+            self.reading.load_at = Some(now);
+            return;
+        }
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);
         }
