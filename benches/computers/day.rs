@@ -147,7 +147,7 @@ impl Robot<'_> {
         let claim = Op::Claim {
             guard: view.guard(),
             claim: 1,
-            begins: true,
+            begins: Some(1),
             seq: 0,
             settled: true,
         };

@@ -258,7 +258,14 @@ impl ClusterDriver {
                 ledger.with_activity(|_, activity| activity.restore_displaced(nodes));
             }
             Action::NotifyAll => notifications::notify_all(&context.nodes),
-            Action::StoreTerm(term) => ledger.update_session(|session| session.term = term),
+            Action::StoreTerm {
+                term,
+                journal_number,
+            } => {
+                ledger.update_session(|session| {
+                    (session.term, session.cluster_journal) = (term, journal_number);
+                });
+            }
             Action::BeginMaster(cause) => {
                 let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);
                 let cause = report::cause(cause);

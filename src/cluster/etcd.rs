@@ -197,6 +197,15 @@ struct LeaderValue {
     version: String,
 }
 
+/// The value of `origin`.
+#[derive(Debug, Serialize, Deserialize)]
+struct OriginValue {
+    /// For people only.
+    began_by: String,
+    /// See [`View::journal_number`].
+    journal_number: u64,
+}
+
 /// The value of `alive`.
 #[derive(Debug, Serialize, Deserialize)]
 struct AliveValue {
@@ -310,9 +319,13 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
             };
             let alive = alive(0, *seq, &None, *settled);
             let mut changes = vec![leader, alive];
-            if *begins {
-                let began_by = settings.name.clone().into_bytes();
-                let (key, value) = (keys.origin(), began_by);
+            if let Some(journal_number) = *begins {
+                let began_by = settings.name.clone();
+                let value = json(&OriginValue {
+                    began_by,
+                    journal_number,
+                });
+                let key = keys.origin();
                 changes.push(TxnOp::Put { key, value });
                 changes.extend(keys.of_journal().map(TxnOp::Delete));
             }
@@ -367,6 +380,9 @@ fn view<'a>(
 fn absorb_key(view: &mut View, keys: &Keys, key: &str, kv: Option<&Kv>) -> Result<(), EtcdError> {
     if key == keys.origin() {
         view.origin = kv.map_or(0, |kv| kv.revision);
+        // Any other content is that of a journal without a number.
+        let value = kv.and_then(|kv| serde_json::from_slice::<OriginValue>(&kv.value).ok());
+        view.journal_number = value.map_or(0, |value| value.journal_number);
     } else if key == keys.leader() {
         view.leader = match kv {
             None => None,

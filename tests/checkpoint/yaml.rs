@@ -68,6 +68,7 @@ fn with_params(params: Struct) -> Checkpoint {
                 at: 4_999_999_998,
             }),
             term: 1_800_000,
+            cluster_journal: 3,
             cluster_seq: 1_700_000,
             port: 11_312,
             at: 1_764_115_200_000,

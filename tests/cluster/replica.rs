@@ -53,7 +53,7 @@ impl Leader {
         let claim = Op::Claim {
             guard,
             claim: 1,
-            begins: true,
+            begins: Some(1),
             seq,
             settled: true,
         };

@@ -37,7 +37,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     let claim = |claim| Op::Claim {
         guard: RevisionGuard::default(),
         claim,
-        begins: true,
+        begins: Some(1),
         seq: 0,
         settled: false,
     };
@@ -58,6 +58,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     let EtcdAnswer::Is(view) = second else {
         panic!("{second:?}");
     };
+    assert_eq!((view.origin, view.journal_number), (term, 1));
     let leader = view.leader.clone().unwrap();
     assert_eq!(
         (leader.term, leader.name.as_str(), leader.id.as_str()),
@@ -327,7 +328,7 @@ async fn the_robots_in_etcd_are_listed_without_keys_of_other_programs() {
     let claim = Op::Claim {
         guard: RevisionGuard::default(),
         claim: 1,
-        begins: true,
+        begins: Some(1),
         seq: 0,
         settled: true,
     };

@@ -116,6 +116,7 @@ pub(in crate::app) async fn join(
         state: context.ledger.with_mirror(Clone::clone),
         restored: setup.restored,
         term: session.term,
+        journal_number: session.cluster_journal,
         seq: session.cluster_seq,
     };
     let keys = Keys::new(&config.robot);

@@ -58,6 +58,8 @@ pub struct Session {
     pub port: u16,
     /// With several computers: the last term in which this computer led. 0 if it never led.
     pub term: u64,
+    /// With several computers: the number of etcd's journal of `term`. 0 if it is unknown.
+    pub cluster_journal: u64,
     /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
     /// that follows in this file has the next number. Too low if the true number is unknown.
     pub cluster_seq: u64,

@@ -79,6 +79,8 @@ pub struct Machine {
     left: Option<RevisionGuard>,
     /// The origin of a journal that cannot be read from its beginning, or 0. This computer's claim replaces it.
     unreadable: u64,
+    /// The highest [`View::journal_number`] that this computer has heard of.
+    journal_number: u64,
 }
 
 impl Machine {
@@ -106,6 +108,7 @@ impl Machine {
             claim_not_before: None,
             left: None,
             unreadable: 0,
+            journal_number: 0,
         }
     }
 
@@ -214,8 +217,8 @@ impl Machine {
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
-            if let Input::Lost { view, .. } = &input {
-                self.left = Some(view.guard());
+            if let Input::Lost { left, .. } = &input {
+                self.left = *left;
             }
             return actions;
         }
@@ -240,7 +243,10 @@ impl Machine {
                 self.acknowledge_early(now, &mut actions);
             }
             Input::Peer(leads) => self.peer(now, leads, &mut actions),
-            Input::Lost { view, until } => self.start_over(now, view, until, &mut actions),
+            Input::Lost { view, left, until } => {
+                self.left = left;
+                self.start_over(now, view, until, &mut actions);
+            }
             Input::HandOver(to) => {
                 self.releasing = Some(to).filter(|_| self.role == Role::Leading);
             }
@@ -292,7 +298,7 @@ impl Machine {
 
     /// The keys `leader` and `alive` after `op` has succeeded.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
-        let mut origin = self.view.origin;
+        let (mut origin, mut journal_number) = (self.view.origin, self.view.journal_number);
         let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
             Op::Claim {
@@ -302,8 +308,8 @@ impl Machine {
                 begins,
                 ..
             } => {
-                if *begins {
-                    origin = revision;
+                if let Some(begun) = begins {
+                    (origin, journal_number) = (revision, *begun);
                 }
                 let Settings {
                     name,
@@ -345,6 +351,7 @@ impl Machine {
         View {
             revision,
             origin,
+            journal_number,
             leader,
             alive: Some(alive),
         }
@@ -360,7 +367,7 @@ impl Machine {
         (self.peer, self.retry_at) = (None, None);
         self.session = JournalSession::GoesOn;
         self.claim_not_before = Some(until);
-        self.left = Some(view.guard());
+        self.note_journal(view.journal_number);
         self.view = view;
         self.follow_to(0);
         self.stale = false;
@@ -370,6 +377,11 @@ impl Machine {
     /// Makes this computer claim leadership no earlier than `until`.
     pub fn hold_claims(&mut self, until: Instant) {
         self.claim_not_before = self.claim_not_before.max(Some(until));
+    }
+
+    /// Notes that a journal with this number has existed.
+    pub fn note_journal(&mut self, journal_number: u64) {
+        self.journal_number = self.journal_number.max(journal_number);
     }
 
     /// Notes the origin of a journal that cannot be read from its beginning, or 0.
@@ -416,6 +428,7 @@ impl Machine {
             // Nothing is known yet about the next leader's rosrescue.
             self.peer = None;
         }
+        self.note_journal(view.journal_number);
         self.view = view;
         let leader = self.view.leader.as_ref();
         let mine = leader.filter(|leader| leader.id == self.settings.id);

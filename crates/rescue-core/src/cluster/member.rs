@@ -106,8 +106,8 @@ struct LastPublished {
 struct Before {
     leader: Option<(String, Instant)>,
     released: bool,
-    /// The term that the checkpoint was given last.
-    term: u64,
+    /// The term that the checkpoint was given last, and the number of its journal.
+    term: (u64, u64),
 }
 
 /// The state machine of one computer; see the [module](self).
@@ -155,13 +155,16 @@ impl Member {
     ) -> Self {
         let known = own.restored;
         let held = Holds {
+            journal_number: own.journal_number,
             term: own.term,
             seq: own.seq,
         };
+        let mut machine = Machine::new(settings);
+        machine.note_journal(own.journal_number);
         cut_off.note_seen(&own.state);
         Self {
             keys,
-            machine: Machine::new(settings),
+            machine,
             published: LastPublished {
                 role: Role::Joining,
                 standing: Standing::Nobody { known },

@@ -124,6 +124,7 @@ mod tests {
     fn led(name: &str, uri: &str, boot: &str, revision: u64) -> View {
         View {
             origin: 1,
+            journal_number: 1,
             revision,
             leader: Some(Leader {
                 term: 3,

@@ -234,6 +234,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("announced", announced.map_or(0, |it| it.incarnation)),
         ("announced_at", announced.map_or(0, |it| it.at)),
         ("term", session.term),
+        ("cluster_journal", session.cluster_journal),
         ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
         ("at", session.at),
@@ -439,6 +440,7 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
             }),
         },
         term: count(session, "term")?.unwrap_or(0),
+        cluster_journal: count(session, "cluster_journal")?.unwrap_or(0),
         cluster_seq: count(session, "cluster_seq")?.unwrap_or(0),
         port: count(session, "port")?
             .and_then(|port| u16::try_from(port).ok())

@@ -83,8 +83,8 @@ impl Machine {
             None => {
                 self.claims += 1;
                 let claim = self.claims;
-                let begins = self.begins_journal();
-                let seq = if begins { 0 } else { self.view.seq() };
+                let begins = self.begins_journal().then_some(self.journal_number + 1);
+                let seq = if begins.is_some() { 0 } else { self.view.seq() };
                 // The last entry of a journal that is to be replaced may be gone.
                 let guard = RevisionGuard { seq, ..guard };
                 Op::Claim {

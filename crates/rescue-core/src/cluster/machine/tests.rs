@@ -27,6 +27,7 @@ fn led(name: &str, term: u64, revision: u64) -> View {
     View {
         revision,
         origin: 1,
+        journal_number: 1,
         leader: Some(Leader {
             term,
             name: name.to_owned(),
@@ -86,7 +87,7 @@ fn leading(alone: WhenAlone) -> (Machine, Instant) {
     let claim = Op::Claim {
         guard: RevisionGuard::default(),
         claim: 1,
-        begins: true,
+        begins: Some(1),
         seq: 0,
         settled: false,
     };
@@ -117,7 +118,7 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
             seq: 10,
         },
         claim: 1,
-        begins: false,
+        begins: None,
         seq: 10,
         // This computer has seen the previous leader lead.
         settled: true,

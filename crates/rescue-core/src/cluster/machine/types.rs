@@ -87,6 +87,9 @@ pub struct View {
     /// The revision of the key `origin`, which is written once per journal, so it identifies the journal. 0 if the key
     /// is missing.
     pub origin: u64,
+    /// The number of the journal, in the key `origin`: one more than those of all journals that its first leader knew of.
+    /// It tells an older copy of a lost journal from a new journal. 0 without a journal.
+    pub journal_number: u64,
     pub leader: Option<Leader>,
     pub alive: Option<Alive>,
 }
@@ -111,7 +114,8 @@ impl View {
     /// never writes an earlier value, so otherwise keys were deleted, or an older copy of etcd was restored.
     pub fn continues(&self, earlier: &Self) -> bool {
         let (after, before) = (self.guard(), earlier.guard());
-        let same = before.origin == 0 || after.origin == before.origin;
+        let journal = (self.origin, self.journal_number);
+        let same = before.origin == 0 || journal == (earlier.origin, earlier.journal_number);
         // An older copy gives revisions out again.
         let leader = after.leader != before.leader || self.leader == earlier.leader;
         let alive = after.alive != before.alive || self.alive == earlier.alive;
@@ -155,8 +159,8 @@ pub enum Op {
     Claim {
         guard: RevisionGuard,
         claim: u64,
-        /// Whether to begin a new journal: write `origin`, and delete what is left of an earlier journal.
-        begins: bool,
+        /// Begins a new journal with this [`View::journal_number`]: writes `origin`, and deletes what is left of an earlier journal.
+        begins: Option<u64>,
         seq: u64,
         settled: bool,
     },
@@ -178,6 +182,10 @@ pub enum Op {
 
 /// The answer of etcd.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "few exist at a time, and none is stored"
+)]
 pub enum EtcdAnswer {
     /// The transaction succeeded at this revision, and the journal ends with this record.
     Applied { revision: u64, seq: u64 },
@@ -205,8 +213,13 @@ pub enum Input {
     Recorded(u64),
     /// Whether the leader's rosrescue answered a probe, and said that it leads.
     Peer(bool),
-    /// etcd has lost its data and shows `view`. Do not claim before `until`.
-    Lost { view: View, until: Instant },
+    /// etcd has lost its data and shows `view`. Do not claim before `until`. `left` is what is left of the lost journal.
+    /// It is `None` if another journal has begun since.
+    Lost {
+        view: View,
+        left: Option<RevisionGuard>,
+        until: Instant,
+    },
     /// Give up leadership to this computer, or to any if the name is empty.
     HandOver(String),
     /// The deadline of [`Machine::deadline`](super::Machine::deadline) has passed.

@@ -27,8 +27,11 @@ struct Loss {
     since: Instant,
     /// How much of the lost journal this computer holds.
     holds: Holds,
-    /// The keys as etcd showed them when the loss was noticed. A living leader changes them.
-    left: RevisionGuard,
+    /// The origin that etcd showed when the loss was noticed.
+    origin: u64,
+    /// The keys as etcd showed them then. A living leader changes them. `None` if they are of a later journal than the lost
+    /// one.
+    left: Option<RevisionGuard>,
 }
 
 /// What is known of the journal that etcd has lost.
@@ -59,7 +62,7 @@ impl DataLoss {
     /// Whether `view` shows nothing but what is left of the lost journal.
     pub(super) fn is_remainder(&self, view: &View) -> bool {
         let shown = view.guard();
-        let left = self.present.is_some_and(|loss| loss.left == shown);
+        let left = self.present.is_some_and(|loss| loss.left == Some(shown));
         left && !Mutant::BelievesOldCopy.lives()
     }
 
@@ -148,12 +151,19 @@ impl Member {
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
         let is_without_end = self.data_loss.without_end == Some(view.guard());
         if let Some(loss) = self.data_loss.present {
-            let is_lost_again = view.is_torn() && loss.left != view.guard() || is_without_end;
+            let is_torn = view.is_torn() && loss.left != Some(view.guard());
+            // The journal that was lost, or an earlier one.
+            let is_old = view.origin > 0
+                && view.origin != loss.origin
+                && view.journal_number <= loss.holds.journal_number;
+            let is_lost_again = is_torn || is_old || is_without_end;
             // No other computer can repair a journal that this one is to continue.
             let is_unreadable = !is_readable && self.machine.role() == Role::CatchingUp;
             return older || is_lost_again && !trusts() || is_unreadable;
         }
-        let torn = view.is_torn() || view.term() < known || !is_readable || is_without_end;
+        let is_old = !self.reading.loaded && view.journal_number < self.own.journal_number;
+        let is_old = is_old || view.term() < known;
+        let torn = view.is_torn() || is_old || !is_readable || is_without_end;
         let torn = torn && !trusts();
         // A read that began after an earlier loss shows a later one only by what has been seen since.
         let known = self.view();
@@ -177,8 +187,10 @@ impl Member {
         let until = now + wait;
         let view = view.clone();
         self.reading.forget(&view);
-        let left = view.guard();
-        self.drive(now, machine::Input::Lost { view, until });
+        let (origin, is_whole) = (view.origin, !view.is_torn());
+        let is_later = is_whole && view.journal_number > holds.journal_number;
+        let left = (!is_later).then(|| view.guard());
+        self.drive(now, machine::Input::Lost { view, left, until });
         self.machine.hold_claims(until);
         self.data_loss.without_end = None;
         self.data_loss.times += 1;
@@ -196,10 +208,16 @@ impl Member {
                 ..JournalPosition::default()
             };
         }
-        (self.journal.own_wins, self.own.term) = (true, 0);
+        self.journal.own_wins = true;
+        (self.own.term, self.own.journal_number) = (0, 0);
         self.reading.load_by(now);
         let since = now;
-        self.data_loss.present = Some(Loss { since, holds, left });
+        self.data_loss.present = Some(Loss {
+            since,
+            holds,
+            origin,
+            left,
+        });
         self.data_loss.is_second = false;
         self.act(Action::PublishMemberEntry);
     }
@@ -226,10 +244,12 @@ impl Member {
         self.data_loss.is_second &= holds == before;
         let (leads, view) = (self.published.role == Role::Leading, self.view());
         let shown = Holds {
+            journal_number: view.journal_number,
             term: view.term(),
             seq: view.seq(),
         };
         let unreadable = entry.map_or(0, |entry| entry.unreadable);
+        let journal_number = holds.map_or(0, |holds| holds.journal_number);
         if leads && unreadable != 0 && unreadable == view.origin {
             self.reading.check_all(now);
         }
@@ -238,6 +258,7 @@ impl Member {
             let until = now + self.settings().ttl * PATIENCE;
             self.machine.hold_claims(until);
         }
+        self.machine.note_journal(journal_number);
     }
 
     /// Lets a computer that holds more of the lost journal claim leadership first.

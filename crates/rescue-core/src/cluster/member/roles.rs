@@ -52,8 +52,13 @@ impl Member {
 
     /// Has the checkpoint name the present term.
     pub(super) fn keep_term(&mut self, term: u64) {
-        if std::mem::replace(&mut self.before.term, term) != term {
-            self.act(Action::StoreTerm(term));
+        let journal_number = self.view().journal_number;
+        let stored = (term, journal_number);
+        if std::mem::replace(&mut self.before.term, stored) != stored {
+            self.act(Action::StoreTerm {
+                term,
+                journal_number,
+            });
         }
     }
 

@@ -88,6 +88,7 @@ impl Member {
         let whole = self.reading.loaded && seq >= view.seq();
         let leader = view.leader.as_ref().filter(|_| whole);
         let term = leader.map_or(self.position.term, |leader| leader.term);
+        let journal_number = leader.map_or(self.held.journal_number, |_| view.journal_number);
         let epoch = self.data_loss.times;
         // The mirror of a leader has changes that the journal may lack, also while this computer is cut off.
         let own = view
@@ -99,6 +100,10 @@ impl Member {
             false => seq,
         };
         self.position = JournalPosition { epoch, term, seq };
-        self.held = Holds { term, seq };
+        self.held = Holds {
+            journal_number,
+            term,
+            seq,
+        };
     }
 }

@@ -28,6 +28,7 @@ fn led(seq: u64) -> View {
     View {
         revision,
         origin: 1,
+        journal_number: 1,
         leader: Some(Leader {
             term: 1,
             name: "b".to_owned(),
@@ -225,6 +226,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
         state,
         seq: 1,
         term: 1,
+        journal_number: 1,
         restored: true,
     };
     let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());

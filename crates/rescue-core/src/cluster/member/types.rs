@@ -36,6 +36,8 @@ pub struct LocalCheckpoint {
     pub restored: bool,
     /// The last term in which this computer led.
     pub term: u64,
+    /// See [`View::journal_number`]; of the journal of that term.
+    pub journal_number: u64,
     /// The last record of the journal that the state contains.
     pub seq: u64,
 }
@@ -60,9 +62,11 @@ pub struct MemberEntry {
     pub notifies: String,
 }
 
-/// A position in a journal that etcd has lost: its leader's term and a record number.
+/// A position in a journal that etcd has lost: the journal's number, its leader's term and a record number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Holds {
+    #[serde(default)]
+    pub journal_number: u64,
     pub term: u64,
     pub seq: u64,
 }
@@ -316,8 +320,11 @@ pub enum Action {
     ShutDownDisplaced(Vec<Displaced>),
     /// Notify every node of the present state, because it may have heard an older one from another computer since.
     NotifyAll,
-    /// Note in the checkpoint that this computer leads in this term.
-    StoreTerm(u64),
+    /// Note in the checkpoint that it is of this term, and of the journal with this number.
+    StoreTerm {
+        term: u64,
+        journal_number: u64,
+    },
     BeginMaster(Cause),
     /// Kill the master at once.
     EndMaster,

@@ -217,7 +217,7 @@ impl Etcd {
         self.view.revision += 1;
         let revision = self.view.revision;
         if deletes("origin") {
-            self.view.origin = 0;
+            (self.view.origin, self.view.journal_number) = (0, 0);
         }
         if deletes("leader") {
             self.view.leader = None;
@@ -293,8 +293,8 @@ impl Etcd {
                 settled,
                 ..
             } => {
-                if *begins {
-                    self.view.origin = revision;
+                if let Some(journal_number) = *begins {
+                    (self.view.origin, self.view.journal_number) = (revision, journal_number);
                     self.entries.clear();
                     (self.snapshot, self.state) = (None, Master::default());
                     self.values.clear();
@@ -302,7 +302,7 @@ impl Etcd {
                     assert_eq!(*seq, self.seq(), "a claim knows the journal's end");
                 }
                 self.claims.push(sent.from);
-                if std::mem::take(&mut self.is_old) && !*begins {
+                if std::mem::take(&mut self.is_old) && begins.is_none() {
                     self.goes_on(false);
                 }
                 let of = sent.settings.clone();

@@ -639,7 +639,13 @@ impl World {
                 };
                 inputs.push_front(Input::Forwarded { base, writes });
             }
-            Action::StoreTerm(term) => self.computers[at].disk.own.term = term,
+            Action::StoreTerm {
+                term,
+                journal_number,
+            } => {
+                let own = &mut self.computers[at].disk.own;
+                (own.term, own.journal_number) = (term, journal_number);
+            }
             Action::BeginMaster(_) => {
                 self.masters += 1;
                 let master = self.masters;
