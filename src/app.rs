@@ -3,7 +3,6 @@
 use std::{io, sync::Arc, time::Duration};
 
 use checkpoint_store::OpenError;
-use rescue_core::lifecycle::Action;
 use thiserror::Error;
 use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
@@ -16,7 +15,7 @@ use crate::{
     ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
     nodes,
     process::{ProcessError, Rosmaster, bypass},
-    recovery::{Driver, master_process::MasterProcess},
+    recovery::{Driver, course::Step, master_process::MasterProcess},
     ros_env::MasterUri,
     server::{Server, listener, others::Others},
     task::boxed,
@@ -281,8 +280,8 @@ impl Runs {
 
 /// The running driver of the master.
 enum Begun {
-    /// The driver of a single computer, with its first actions.
-    Single(Box<Driver>, Vec<Action>),
+    /// The driver of a single computer, with its first steps.
+    Single(Box<Driver>, Vec<Step>),
     Member(Box<ClusterDriver>),
 }
 

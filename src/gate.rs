@@ -1,7 +1,7 @@
 //! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. The start, the recovery
 //! and, with several computers, `app::cluster` change the gate, through the [`Tx`].
 //!
-//! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], the driver [`State::Late`],
+//! `recovery::course` decides when [`State::StandingIn`] or [`State::Unknown`] is set, the driver sets [`State::Late`],
 //! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets
 //! [`State::Open`]. A start with a checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does
 //! not lead, `app::cluster` sets [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].

@@ -1,5 +1,6 @@
 //! Watches the master and restores it after a failure. Carries out what [`rescue_core::lifecycle`] decides.
 
+pub(crate) mod course;
 pub(crate) mod examine;
 pub(crate) mod live_master;
 pub(crate) mod master_process;
@@ -15,7 +16,7 @@ use std::{
 };
 
 use rescue_core::{
-    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, evidence::Sample},
+    lifecycle::{Action, Cause, Input, Supervision, evidence::Sample},
     replay::RUN_ID_AFTER,
 };
 use tokio::task::JoinHandle;
@@ -23,6 +24,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use self::{
+    course::{Course, Step},
     examine::{Examination, ExamineError, Examiner, Manner, Prepared},
     live_master::Reach,
     master_process::MasterProcess,
@@ -76,18 +78,8 @@ struct Examined {
     verification: Verification,
 }
 
-type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
+type Work = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
-
-/// The notifications that an earlier rosrescue of this session may have owed to nodes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum News {
-    Owed,
-    /// Sent by this rosrescue before any master.
-    SentFirst,
-    /// There were none, or a master has been found since.
-    Sent,
-}
 
 /// Carries out what the [lifecycle](rescue_core::lifecycle) decides: starts and watches the master, gives it its state, and
 /// lets calls pass to it.
@@ -97,13 +89,11 @@ pub(crate) struct Driver {
     write_queue: WriteQueue,
     nodes: Arc<Nodes>,
     board: Arc<Board>,
-    lifecycle: Lifecycle,
+    course: Course,
     process: Option<MasterProcess>,
     rescues: Rescues,
     /// Number of the rescue in which the present master was restored. Set until calls pass to that master.
     restored: Option<u64>,
-    /// Whether nodes lack notifications that an earlier rosrescue of this session may have owed them.
-    news: News,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
@@ -112,7 +102,7 @@ pub(crate) struct Driver {
     /// Completes when a thread of the master ends, which is an early sign of its death. Only the first such end of each
     /// master counts.
     thread_ended: Option<Ended>,
-    step: Option<Step>,
+    work: Option<Work>,
     probe_deadline: Option<tokio::time::Instant>,
     /// Total delay of timers that fired late because this process had to wait for the processor.
     timers_late: Duration,
@@ -137,7 +127,7 @@ impl Driver {
             None => Supervision::Theirs,
         };
         Self {
-            lifecycle: Lifecycle::new(supervision, reach.probing),
+            course: Course::new(supervision, reach.probing),
             outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
             examiner,
             reach,
@@ -147,12 +137,11 @@ impl Driver {
             process,
             rescues,
             restored: None,
-            news: News::Sent,
             spawn_error: None,
             sentinel: None,
             ended: None,
             thread_ended: None,
-            step: None,
+            work: None,
             probe_deadline: None,
             timers_late: Duration::ZERO,
             prepared: None,
@@ -162,62 +151,60 @@ impl Driver {
 
     /// Does what [`Self::start`] does, on a computer that gets the master from another computer. `cause` is the reason,
     /// for the report.
-    pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
+    pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Step> {
         self.outage.cause = cause;
         self.start(true)
     }
 
-    /// Notes that an earlier rosrescue of this session has ended. If there is no master, the nodes get the notifications
-    /// that it may have owed them. Otherwise the health check after the recovery sends these.
+    /// See [`Course::continues_session`].
     pub(crate) fn continues_session(&mut self) {
-        self.news = News::Owed;
+        self.course.continues_session();
     }
 
-    /// Sends the notifications that an earlier rosrescue may have owed. No master is sending older ones.
-    fn send_news(&mut self) {
-        if self.news == News::Owed {
-            self.news = News::SentFirst;
-            nodes::notify_after_restart(&self.nodes);
-        }
-    }
-
-    /// Lets the mirror answer calls if the state is known, and returns the first actions of the recovery. `restored`
+    /// Lets the mirror answer calls if the state is known, and returns the first steps of the recovery. `restored`
     /// says whether the mirror comes from a checkpoint whose session continues.
-    pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
+    pub(crate) fn start(&mut self, restored: bool) -> Vec<Step> {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
-        let actions = self
-            .lifecycle
-            .on(Instant::now(), Input::Start { left, restored });
-        self.keep_shut();
-        actions
+        let gate = self.examiner.gate.state();
+        let input = Input::Start { left, restored };
+        let mut steps = self.course.on(Instant::now(), gate, input);
+        steps.retain(|step| match step {
+            Step::Shut(gate) => {
+                self.shut(*gate);
+                false
+            }
+            _ => true,
+        });
+        steps
     }
 
-    /// Watches the master until `stop`. Begins with the actions that [`Self::start`] returned.
+    /// Watches the master until `stop`. Begins with the steps that [`Self::start`] returned.
     ///
     /// # Errors
     ///
     /// If no master can be started.
     pub(crate) async fn run(
         mut self,
-        mut actions: Vec<Action>,
+        mut steps: Vec<Step>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, ProcessError> {
-        // The first actions follow from no input.
+        // The first steps follow from no input.
         let mut input = None;
         loop {
             let mut next = None;
-            for action in actions {
-                if (input, action) == (Some(Input::Wake), Action::Connect) {
-                    tracing::trace!(?input, ?action, "lifecycle");
+            for step in steps {
+                let connects = matches!(step, Step::Act(Action::Connect));
+                if (input, connects) == (Some(Input::Wake), true) {
+                    tracing::trace!(?input, ?step, "recovery");
                 } else {
-                    tracing::debug!(?input, ?action, "lifecycle");
+                    tracing::debug!(?input, ?step, "recovery");
                 }
-                if action == Action::GiveUp
+                if matches!(step, Step::Act(Action::GiveUp))
                     && let Some(error) = self.spawn_error.take()
                 {
                     return Err(error);
                 }
-                next = self.carry_out(action).await.or(next);
+                next = self.carry_out(step).await.or(next);
             }
             if matches!(input, Some(Input::SpawnFailed { .. }))
                 && let Some(error) = self.spawn_error.take()
@@ -231,17 +218,10 @@ impl Driver {
                 Some(input) => input,
                 None => self.next_input(&stop).await,
             };
-            if matches!(now, Input::Refused | Input::Unreachable) {
-                self.send_news();
-            }
-            self.end_contact(now);
             self.sample_for(now).await;
-            actions = self.lifecycle.on(Instant::now(), now);
-            if now == Input::LateAnswered {
-                let patience = self.lifecycle.patience().clone();
-                self.write_queue.set_patience(patience);
-            }
-            let deaths = self.lifecycle.deaths();
+            let gate = self.examiner.gate.state();
+            steps = self.course.on(Instant::now(), gate, now);
+            let deaths = self.course.lifecycle().deaths();
             self.board.update(|facts| facts.set_deaths(deaths));
             input = Some(now);
         }
@@ -252,49 +232,23 @@ impl Driver {
     async fn sample_for(&mut self, input: Input) {
         let process = self.process.as_ref();
         let pid = process.and_then(MasterProcess::pid);
-        if !self.lifecycle.needs_sample(Instant::now(), input) {
+        let lifecycle = self.course.lifecycle();
+        if !lifecycle.needs_sample(Instant::now(), input) {
             return;
         }
         let look = move || (pid.and_then(effort::measure), effort::own_wait());
         let (master, own_wait) = crate::task::spawn_blocking(look).await.unwrap_or_default();
-        self.lifecycle.observe(Sample {
+        self.course.observe(Sample {
             at: Instant::now(),
             master,
             own_wait: own_wait + self.timers_late,
         });
     }
 
-    /// Drops the connection to the master and the step in progress, if `input` says that the master has ended or cannot
-    /// be used. Before that, if the master died while it was getting its state, tells the lifecycle that it had
-    /// answered.
-    fn end_contact(&mut self, input: Input) {
-        if !matches!(
-            input,
-            Input::ConnectionLost
-                | Input::Exited
-                | Input::Unreachable
-                | Input::NotAMaster
-                | Input::PortTaken
-        ) {
-            return;
-        }
-        if self.examiner.gate.state() == State::Injecting && input != Input::NotAMaster {
-            alarm!(
-                warn,
-                AWAY,
-                "the new master died while its state was being restored; the next master gets the state"
-            );
-            self.lifecycle.on(Instant::now(), Input::Answered);
-        }
-        self.disconnect();
-    }
-
     async fn next_input(&mut self, stop: &CancellationToken) -> Input {
         loop {
-            let wake = self
-                .lifecycle
-                .deadline()
-                .map(tokio::time::Instant::from_std);
+            let wake = self.course.lifecycle().deadline();
+            let wake = wake.map(tokio::time::Instant::from_std);
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
@@ -310,8 +264,8 @@ impl Driver {
                     return Input::ThreadEnded;
                 }
                 () = exited(&mut self.process) => return Input::Exited,
-                done = wait::for_some(self.step.as_mut()) => {
-                    self.step = None;
+                done = wait::for_some(self.work.as_mut()) => {
+                    self.work = None;
                     if let Some(input) = self.done(done) {
                         return input;
                     }
@@ -330,18 +284,33 @@ impl Driver {
         }
     }
 
-    /// Carries out `action`. Returns its result if that is known at once.
-    async fn carry_out(&mut self, action: Action) -> Option<Input> {
+    /// Carries out `step`. Returns its result if that is known at once.
+    async fn carry_out(&mut self, step: Step) -> Option<Input> {
+        match step {
+            Step::Disconnect => self.disconnect(),
+            Step::Shut(gate) => self.shut(gate),
+            Step::NotifyAll => nodes::notify_after_restart(&self.nodes),
+            Step::ReportDeathWhileInjected => alarm!(
+                warn,
+                AWAY,
+                "the new master died while its state was being restored; the next master gets the state"
+            ),
+            Step::SetPatience(patience) => self.write_queue.set_patience(patience),
+            Step::Act(action) => return self.act(action).await,
+        }
+        None
+    }
+
+    async fn act(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
-                self.disconnect();
                 // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| live_master::prepare(ledger.clone()));
                 let upstream = self.reach.upstream.clone();
                 let new = self.process.as_ref().and_then(MasterProcess::new_one);
-                self.step = Some(Box::pin(async move {
+                self.work = Some(Box::pin(async move {
                     let sentinel = match upstream.connect_sentinel().await {
                         Ok(sentinel) => Arc::new(sentinel),
                         Err(error) => return Done::NotConnected(error),
@@ -370,22 +339,22 @@ impl Driver {
                     let examined = sentinel.during(&reach.upstream, examined).await;
                     Done::Examined(sentinel, examined)
                 };
-                self.step = Some(Box::pin(examined.instrument(span)));
+                self.work = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
                 // A late probe continues, and its answer counts when it arrives.
                 self.probe_deadline = Some(tokio::time::Instant::now() + self.reach.probe_timeout);
-                if self.step.is_none()
+                if self.work.is_none()
                     && let Some(sentinel) = self.sentinel.clone()
                 {
                     let (upstream, ledger) =
                         (self.reach.upstream.clone(), self.examiner.ledger.clone());
-                    self.step = Some(Box::pin(async move {
+                    self.work = Some(Box::pin(async move {
                         Done::Probed(verify::probe(&upstream, &ledger.token(), &sentinel).await)
                     }));
                 }
             }
-            Action::ShutGate(cause) => self.shut_gate(cause),
+            Action::ShutGate(cause) => self.begin_outage(cause),
             Action::StandIn => {
                 rarely!(
                     info,
@@ -397,7 +366,7 @@ impl Driver {
                 self.probe_deadline = None;
                 let sentinel = self.sentinel.clone()?;
                 let (examiner, reach) = (self.examiner.clone(), self.reach.clone());
-                self.step = Some(Box::pin(async move {
+                self.work = Some(Box::pin(async move {
                     let caught_up = async {
                         let mut master = reach.to_catch_up(&sentinel).await?;
                         examiner.catch_up(&mut master).await
@@ -412,14 +381,10 @@ impl Driver {
                 "the master does not answer, but is not killed: there is no proof that it hangs"
             ),
             Action::OpenGate => self.open_gate(),
-            Action::Spawn => {
-                self.send_news();
-                return self.spawn().await;
-            }
+            Action::Spawn => return self.spawn().await,
             // The caller handles this action.
             Action::GiveUp => {}
             Action::Kill => {
-                self.disconnect();
                 if let Some(process) = &mut self.process {
                     process.kill();
                 }
@@ -541,34 +506,24 @@ impl Driver {
     }
 
     fn disconnect(&mut self) {
-        // An injection in progress has failed.
-        if !self.examiner.gate.state().is_open() {
-            self.keep_shut();
-        }
         self.reach.upstream.set_verification(None);
         self.sentinel = None;
         self.ended = None;
-        self.step = None;
+        self.work = None;
         self.probe_deadline = None;
     }
 
-    /// Lets no calls pass to the master. The mirror answers them if the state is known; otherwise they wait.
-    fn keep_shut(&self) {
+    /// Ends an injection that is in progress, and sets the gate.
+    fn shut(&self, gate: State) {
         self.examiner.ledger.end_injection();
-        self.examiner.gate.set(match self.lifecycle.may_stand_in() {
-            true => State::StandingIn,
-            false => State::Unknown,
-        });
+        self.examiner.gate.set(gate);
     }
 
-    fn shut_gate(&mut self, cause: Cause) {
-        self.keep_shut();
+    /// Notes that calls have ceased to pass to the master, and reports it.
+    fn begin_outage(&mut self, cause: Cause) {
         self.outage = Outage::begin(Instant::now(), cause.as_str(), self.examiner.stats);
         if cause == Cause::Stopping {
             return;
-        }
-        if cause == Cause::Hung {
-            self.disconnect();
         }
         let starts = matches!(cause, Cause::Exited | Cause::ThreadEnded) && self.process.is_some();
         self.board.update(|facts| facts.starts_master = starts);

@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use rescue_core::lifecycle::{Action, Probing, Supervision};
+use rescue_core::lifecycle::{Probing, Supervision};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 
@@ -15,7 +15,9 @@ use crate::{
     ledger::{Ledger, history::Rescues},
     nodes::{Nodes, served::Served},
     process::{ProcessError, Rosmaster},
-    recovery::{Driver, examine::Examiner, live_master::Reach, master_process::MasterProcess},
+    recovery::{
+        Driver, course::Step, examine::Examiner, live_master::Reach, master_process::MasterProcess,
+    },
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
     upstream::Upstream,
@@ -102,7 +104,7 @@ impl Context {
         rosout: Option<bool>,
         restored: bool,
         ends: (CancellationToken, CancellationToken),
-    ) -> (Driver, Vec<Action>) {
+    ) -> (Driver, Vec<Step>) {
         let process = match rosmaster {
             Some(rosmaster) => {
                 let starter = rosmaster.clone();

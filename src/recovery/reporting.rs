@@ -6,14 +6,13 @@ use rescue_core::lifecycle::Cause;
 use tracing::Instrument;
 
 use super::{
-    Driver, News,
+    Driver,
     examine::Examination,
     master_process::MasterProcess,
     report_file::{self, ReportRecord},
 };
 use crate::{
     clock,
-    ledger::owed::Telling,
     limit::all_clear,
     nodes::health_check,
     status::{
@@ -113,7 +112,8 @@ impl Driver {
     /// Reports what an examination of a master found and did, in the log, the status and the recovery report. The
     /// health check adds its results when it ends.
     pub(super) fn report(&mut self, mut examination: Examination, speaks: String) {
-        if self.lifecycle.is_new_session() && examination.outcome == RecoveryOutcome::Injected {
+        let is_new_session = self.course.lifecycle().is_new_session();
+        if is_new_session && examination.outcome == RecoveryOutcome::Injected {
             // The master holds only the session's initial state.
             examination.outcome = RecoveryOutcome::Begun;
         }
@@ -150,18 +150,14 @@ impl Driver {
         }
         let is_restored = report.outcome == RecoveryOutcome::Injected && report.is_rescue();
         self.restored = is_restored.then_some(report.number);
-        let news = std::mem::replace(&mut self.news, News::Sent);
-        let sent = news == News::SentFirst && report.outcome == RecoveryOutcome::Injected;
-        if !self.lifecycle.has_served() && !sent {
-            // After a restart of rosrescue, the latest changes before the outage are unknown.
+        let news = self.course.examined(report.outcome);
+        if news.all {
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
         }
-        let Report {
-            number, outcome, ..
-        } = report;
-        if let Some(telling) = Telling::after(outcome, news == News::Owed) {
+        let number = report.number;
+        if let Some(telling) = news.telling {
             let (nodes, board) = (self.nodes.clone(), self.board.clone());
             let check = async move {
                 let check = health_check::after_recovery(nodes, since, telling).await;

@@ -7,7 +7,7 @@ use std::{
 };
 
 use rescue_core::{
-    lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision},
+    lifecycle::{Action, Cause, Input, Probing, Supervision},
     replay::{Inspection, Plan, Token},
 };
 use ros1_master::xmlrpc::Python;
@@ -15,8 +15,10 @@ use ros1_master::xmlrpc::Python;
 use super::*;
 use crate::{
     ledger::{durability::Mark, owed::Telling},
-    recovery::examine::{Contact, Examination, ExamineError, Examiner, Manner},
-    status::report::RecoveryOutcome,
+    recovery::{
+        course::{Course, Step},
+        examine::{Contact, Examination, ExamineError, Examiner, Manner},
+    },
 };
 
 /// How long a probe may take, in microseconds.
@@ -155,18 +157,10 @@ enum Outcome {
     CaughtUp(Result<bool, ExamineError>),
 }
 
-/// The notifications that an earlier process may have owed to nodes, as in `recovery::News`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum News {
-    Owed,
-    SentFirst,
-    Sent,
-}
-
 /// The recovery's part of the world.
 pub(super) struct Recovery {
     pub(super) supervision: Supervision,
-    lifecycle: Lifecycle,
+    course: Course,
     examiner: Examiner,
     /// The last step that began. An earlier one has been dropped.
     step: u64,
@@ -190,8 +184,6 @@ pub(super) struct Recovery {
     probes: u64,
     /// When calls last ceased to pass to the master.
     outage: Instant,
-    /// Whether nodes lack notifications of a process of rosrescue that has ended.
-    news: News,
     /// When the mirror's own notifications are due in an outage.
     owed_told: bool,
 }
@@ -199,9 +191,13 @@ pub(super) struct Recovery {
 impl Recovery {
     pub(super) fn new(examiner: Examiner, is_restored: bool) -> Self {
         let supervision = examiner.supervision;
+        let mut course = Course::new(supervision, PROBING);
+        if is_restored {
+            course.continues_session();
+        }
         Self {
             supervision,
-            lifecycle: Lifecycle::new(supervision, PROBING),
+            course,
             examiner,
             step: 0,
             is_busy: false,
@@ -215,10 +211,6 @@ impl Recovery {
             probe: None,
             probes: 0,
             outage: Instant::now(),
-            news: match is_restored {
-                true => News::Owed,
-                false => News::Sent,
-            },
             owed_told: false,
         }
     }
@@ -243,39 +235,27 @@ impl Recovery {
     }
 
     pub(super) fn deadline(&self) -> Option<Instant> {
-        self.lifecycle.deadline()
+        self.course.lifecycle().deadline()
     }
 }
 
 impl World {
-    /// Passes `input` to the lifecycle and carries out what follows.
+    /// Passes `input` to the recovery and carries out what follows.
     pub(super) fn recover(&mut self, input: Input) {
         self.print(|| format!("recovery: {input:?}"));
-        if matches!(input, Input::Refused | Input::Unreachable) {
-            self.send_news();
-        }
-        if matches!(
-            input,
-            Input::ConnectionLost | Input::Exited | Input::Unreachable
-        ) {
-            if self.gate() == State::Injecting {
-                let now = self.instant();
-                self.recovery.lifecycle.on(now, Input::Answered);
-            }
-            self.disconnect();
-        }
         let now = self.instant();
-        let actions = self.recovery.lifecycle.on(now, input);
-        if matches!(input, Input::Start { .. }) {
-            self.keep_shut();
-        }
-        if input == Input::LateAnswered {
-            let patience = self.recovery.lifecycle.patience().clone();
-            self.dispatch(super::Input::Patience(patience));
-        }
-        for action in actions {
-            self.print(|| format!("recovery does {action:?}"));
-            self.carry_out(action);
+        for step in self.recovery.course.on(now, self.gate(), input) {
+            self.print(|| format!("recovery does {step:?}"));
+            match step {
+                Step::Disconnect => self.disconnect(),
+                Step::Shut(gate) => self.shut(gate),
+                Step::NotifyAll => self.notify_all(),
+                Step::ReportDeathWhileInjected => {}
+                Step::SetPatience(patience) => {
+                    self.dispatch(super::Input::Patience(patience));
+                }
+                Step::Act(action) => self.carry_out(action),
+            }
         }
     }
 
@@ -295,7 +275,6 @@ impl World {
     fn carry_out(&mut self, action: Action) {
         match action {
             Action::Connect => {
-                self.disconnect();
                 let time = 20 + self.dice.below(100);
                 self.begin(time, Event::Connects);
             }
@@ -323,12 +302,8 @@ impl World {
                 }
             }
             Action::ShutGate(cause) => {
-                self.keep_shut();
                 self.recovery.outage = self.instant();
-                if cause == Cause::Hung {
-                    self.disconnect();
-                    self.may_go_back = true;
-                }
+                self.may_go_back |= cause == Cause::Hung;
             }
             Action::StandIn => self.set_gate(State::Late),
             Action::CatchUp => {
@@ -344,15 +319,11 @@ impl World {
                 self.recovery.owed_told = false;
             }
             Action::Spawn => {
-                self.send_news();
                 self.start_master();
                 self.recovery.is_unused = true;
                 self.recover(Input::Spawned);
             }
-            Action::Kill => {
-                self.disconnect();
-                self.dies();
-            }
+            Action::Kill => self.dies(),
             Action::Spare(_) | Action::GiveUp | Action::ReportCrashLoop(_) | Action::ReportCalm => {
             }
         }
@@ -473,14 +444,13 @@ impl World {
                     self.broken.push(mistake);
                 }
                 let outcome = examination.outcome;
-                let news = std::mem::replace(&mut self.recovery.news, News::Sent);
-                let sent = news == News::SentFirst && outcome == RecoveryOutcome::Injected;
-                if !self.recovery.lifecycle.has_served() && !sent {
+                let news = self.recovery.course.examined(outcome);
+                if news.all {
                     let now = self.instant();
                     self.ledger
                         .with_activity(|mirror, activity| activity.notice_all(mirror, now));
                 }
-                if let Some(telling) = Telling::after(outcome, news == News::Owed) {
+                if let Some(telling) = news.telling {
                     let time = self.dice.below(20_000);
                     self.then(time, Event::Checks(telling));
                 }
@@ -497,22 +467,16 @@ impl World {
     }
 
     fn disconnect(&mut self) {
-        if !self.gate().is_open() {
-            self.keep_shut();
-        }
         let recovery = &mut self.recovery;
         recovery.step += 1;
         (recovery.is_busy, recovery.connected, recovery.probe) = (false, None, None);
         recovery.examination = None;
     }
 
-    fn keep_shut(&mut self) {
+    fn shut(&mut self, gate: State) {
         self.ledger.end_injection();
-        self.set_gate(match self.recovery.lifecycle.may_stand_in() {
-            true => State::StandingIn,
-            false => State::Unknown,
-        });
-        if self.gate() == State::StandingIn && !self.recovery.owed_told {
+        self.set_gate(gate);
+        if gate == State::StandingIn && !self.recovery.owed_told {
             self.then(OWED_AFTER, Event::OwesInOutage);
         }
     }
@@ -589,14 +553,11 @@ impl World {
         self.master = Some(Process::new(listens));
     }
 
-    /// Sends the notifications that an earlier process may have owed, as `Driver::send_news` does.
-    fn send_news(&mut self) {
-        if self.recovery.news == News::Owed {
-            self.recovery.news = News::SentFirst;
-            let now = self.instant();
-            self.ledger
-                .with_activity(|mirror, activity| activity.notice_all(mirror, now));
-            self.ledger.queue_owed(now, now, Telling::Twice);
-        }
+    /// As `nodes::notify_after_restart`.
+    fn notify_all(&mut self) {
+        let now = self.instant();
+        self.ledger
+            .with_activity(|mirror, activity| activity.notice_all(mirror, now));
+        self.ledger.queue_owed(now, now, Telling::Twice);
     }
 }

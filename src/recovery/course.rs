@@ -1,0 +1,180 @@
+//! Decides what a recovery does around the [lifecycle](rescue_core::lifecycle): when the connection to a master is given
+//! up, what the gate shows while no calls pass, and when nodes get what an earlier process may have owed them.
+//!
+//! Production ([`Driver`](super::Driver)) and the simulation of the write queue carry out the steps.
+
+use std::time::Instant;
+
+use rescue_core::lifecycle::{
+    Action, Cause, Input, Lifecycle, Patience, Probing, Supervision, evidence::Sample,
+};
+
+use crate::{gate::State, ledger::owed::Telling, status::report::RecoveryOutcome};
+
+/// The notifications that an earlier rosrescue of this session may have owed to nodes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum News {
+    Owed,
+    /// Sent by this rosrescue before any master.
+    SentFirst,
+    /// There were none, or a master has been found since.
+    Sent,
+}
+
+/// What the recovery does next.
+#[derive(Debug)]
+pub(crate) enum Step {
+    /// Drop the connection to the master, and what is under way on it.
+    Disconnect,
+    /// End an injection that is in progress, and set the gate.
+    Shut(State),
+    /// Notify all nodes of the present state, because no master is sending them an older one.
+    NotifyAll,
+    /// Report that a master died while it was getting its state.
+    ReportDeathWhileInjected,
+    /// Tell the write queue how long writes wait for the master.
+    SetPatience(Patience),
+    /// Carry out this action of the lifecycle. [`Action::StandIn`] and [`Action::OpenGate`] set the gate, too.
+    Act(Action),
+}
+
+/// What nodes are told after a master was examined.
+#[derive(Debug)]
+pub(crate) struct NewsAfter {
+    /// Whether all that the mirror knows counts as just changed: after a restart of rosrescue, the latest changes before
+    /// the outage are unknown.
+    pub all: bool,
+    /// Whether and how often the health check sends what may be owed.
+    pub telling: Option<Telling>,
+}
+
+/// The course of a recovery; see the [module](self).
+#[derive(Debug)]
+pub(crate) struct Course {
+    lifecycle: Lifecycle,
+    news: News,
+}
+
+impl Course {
+    pub(crate) fn new(supervision: Supervision, probing: Probing) -> Self {
+        Self {
+            lifecycle: Lifecycle::new(supervision, probing),
+            news: News::Sent,
+        }
+    }
+
+    pub(crate) fn lifecycle(&self) -> &Lifecycle {
+        &self.lifecycle
+    }
+
+    /// Notes what the master's process does; see [`Lifecycle::observe`].
+    pub(crate) fn observe(&mut self, sample: Sample) {
+        self.lifecycle.observe(sample);
+    }
+
+    /// Notes that an earlier rosrescue of this session has ended. If there is no master, the nodes get the notifications
+    /// that it may have owed them. Otherwise the health check after the recovery sends these.
+    pub(crate) fn continues_session(&mut self) {
+        self.news = News::Owed;
+    }
+
+    /// Handles `input`, while the gate is in the state `gate`. Returns the steps to carry out, in order.
+    pub(crate) fn on(&mut self, now: Instant, gate: State, input: Input) -> Vec<Step> {
+        let mut steps = Steps {
+            gate,
+            steps: Vec::new(),
+        };
+        if matches!(input, Input::Refused | Input::Unreachable) {
+            self.send_news(&mut steps);
+        }
+        if ends_contact(input) {
+            if gate == State::Injecting && input != Input::NotAMaster {
+                steps.add(Step::ReportDeathWhileInjected);
+                // It had answered before.
+                self.lifecycle.on(now, Input::Answered);
+            }
+            self.disconnect(&mut steps);
+        }
+        let actions = self.lifecycle.on(now, input);
+        if matches!(input, Input::Start { .. }) {
+            self.shut(&mut steps);
+        }
+        if input == Input::LateAnswered {
+            steps.add(Step::SetPatience(self.lifecycle.patience().clone()));
+        }
+        for action in actions {
+            match action {
+                Action::Connect | Action::Kill => self.disconnect(&mut steps),
+                Action::Spawn => self.send_news(&mut steps),
+                Action::ShutGate(_) => self.shut(&mut steps),
+                Action::StandIn => steps.gate = State::Late,
+                _ => {}
+            }
+            steps.add(Step::Act(action));
+            if action == Action::ShutGate(Cause::Hung) {
+                self.disconnect(&mut steps);
+            }
+        }
+        steps.steps
+    }
+
+    /// Notes that a master was examined with this `outcome`. Returns what nodes are told.
+    pub(crate) fn examined(&mut self, outcome: RecoveryOutcome) -> NewsAfter {
+        let news = std::mem::replace(&mut self.news, News::Sent);
+        let sent = news == News::SentFirst && outcome == RecoveryOutcome::Injected;
+        NewsAfter {
+            all: !self.lifecycle.has_served() && !sent,
+            telling: Telling::after(outcome, news == News::Owed),
+        }
+    }
+
+    fn send_news(&mut self, steps: &mut Steps) {
+        if self.news == News::Owed {
+            self.news = News::SentFirst;
+            steps.add(Step::NotifyAll);
+        }
+    }
+
+    fn disconnect(&self, steps: &mut Steps) {
+        // An injection in progress has failed.
+        if !steps.gate.is_open() {
+            self.shut(steps);
+        }
+        steps.add(Step::Disconnect);
+    }
+
+    /// Lets no calls pass to the master. The mirror answers them if the state is known; otherwise they wait.
+    fn shut(&self, steps: &mut Steps) {
+        steps.add(Step::Shut(match self.lifecycle.may_stand_in() {
+            true => State::StandingIn,
+            false => State::Unknown,
+        }));
+    }
+}
+
+/// The steps so far, and the gate after them.
+struct Steps {
+    gate: State,
+    steps: Vec<Step>,
+}
+
+impl Steps {
+    fn add(&mut self, step: Step) {
+        if let Step::Shut(gate) = step {
+            self.gate = gate;
+        }
+        self.steps.push(step);
+    }
+}
+
+/// Whether `input` says that the master has ended or cannot be used.
+fn ends_contact(input: Input) -> bool {
+    matches!(
+        input,
+        Input::ConnectionLost
+            | Input::Exited
+            | Input::Unreachable
+            | Input::NotAMaster
+            | Input::PortTaken
+    )
+}
