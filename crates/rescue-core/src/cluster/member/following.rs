@@ -144,6 +144,10 @@ impl Member {
         mut entries: Vec<(u64, WatchedEntry)>,
         deleted: Option<u64>,
     ) {
+        if self.guards_journal() && deleted.is_some_and(|seq| seq > self.chores.replaced) {
+            self.reading.check_all(now);
+            self.reading.is_doubtful = true;
+        }
         let (known, origin) = (self.view().origin, view.origin);
         // What the watch delivers late is older than the answers to requests, and says nothing.
         if view.revision >= self.view().revision && self.doubts(now, &view) {
@@ -159,10 +163,6 @@ impl Member {
         }
         // The watch may have begun before the journal.
         entries.retain(|(revision, _)| *revision > origin);
-        if self.guards_journal() && deleted.is_some_and(|seq| seq > self.chores.replaced) {
-            self.reading.check_all(now);
-            self.reading.is_doubtful = true;
-        }
         if self.reading.is_doubtful {
             return;
         }
