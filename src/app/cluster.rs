@@ -23,7 +23,9 @@ use rescue_core::{
     cluster::{
         journal::{self, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
-        member::{Action, Input, Member, MemberEntryChange, PROBES, Read, WatchedEntry},
+        member::{
+            Action, Input, Member, MemberEntry, MemberEntryChange, PROBES, Read, WatchedEntry,
+        },
         merge::wire::{self, Ask},
         standing::{JournalPosition, Standing},
     },
@@ -177,7 +179,11 @@ impl ClusterDriver {
                 entry,
                 term,
                 parts,
-            } => self.send(number, op, entry, term, parts),
+                requires,
+            } => {
+                let entry = entry.or_else(|| Some(self.member_put(&requires?)));
+                self.send(number, op, entry, term, parts);
+            }
             Action::Load(known) => {
                 let replica = self.replica.clone();
                 let trouble = self.trouble.clone();
@@ -320,9 +326,7 @@ impl ClusterDriver {
                 });
             }
             Action::PublishMemberEntry => {
-                let key = self.replica.keys.member(&self.member.settings().name);
-                let value = serde_json::to_vec(&self.member.member_entry()).unwrap_or_default();
-                let put = Put { key, value };
+                let put = self.member_put(&self.member.member_entry());
                 self.beside
                     .spawn(publish_member_entry(self.replica.client.clone(), put));
             }
@@ -379,6 +383,14 @@ impl ClusterDriver {
     /// Starts `work`. If it panics, its result is `otherwise`, because the member waits for every result.
     fn spawn(&mut self, otherwise: Input, work: impl Future<Output = Input> + Send + 'static) {
         self.work.spawn(boxed(answered(otherwise, work)));
+    }
+
+    /// This computer's entry among the members, as it is in etcd.
+    fn member_put(&self, entry: &MemberEntry) -> Put {
+        Put {
+            key: self.replica.keys.member(&self.member.settings().name),
+            value: serde_json::to_vec(entry).unwrap_or_default(),
+        }
     }
 
     fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {

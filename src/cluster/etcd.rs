@@ -44,7 +44,8 @@ impl Etcd {
         Client::new(options).map(Self)
     }
 
-    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal.
+    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal, or what a claim requires
+    /// to be in etcd.
     ///
     /// # Errors
     ///
@@ -329,7 +330,13 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
                 changes.push(TxnOp::Put { key, value });
                 changes.extend(keys.of_journal().map(TxnOp::Delete));
             }
-            (txn(unchanged(keys, guard), changes), *seq)
+            let mut compare = unchanged(keys, guard);
+            compare.extend(
+                entry
+                    .cloned()
+                    .map(|Put { key, value }| Compare::Is { key, value }),
+            );
+            (txn(compare, changes), *seq)
         }
         Op::Beat {
             guard,

@@ -183,7 +183,7 @@ impl Replica {
     }
 
     /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal; its parts are
-    /// already written.
+    /// already written. For a claim it is what must be in etcd.
     ///
     /// # Errors
     ///

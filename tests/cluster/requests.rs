@@ -320,6 +320,42 @@ async fn each_endpoint_is_tried_separately_and_a_wrong_one_is_named() {
     }
 }
 
+/// etcd has lost data again since the entry was written, perhaps a journal that this computer has not seen.
+#[tokio::test]
+async fn a_claim_does_not_succeed_without_the_entry_that_it_requires() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let claim = Op::Claim {
+        guard: RevisionGuard::default(),
+        claim: 1,
+        begins: Some(3),
+        seq: 0,
+        settled: true,
+    };
+    let [earlier, entry] = [&b"earlier"[..], b"since the loss"].map(|value| Put {
+        key: keys.member("a"),
+        value: value.to_vec(),
+    });
+    let run = || async {
+        let a = settings("a");
+        client.run(&keys, &a, &claim, Some(&entry), LIMIT).await
+    };
+    for put in [None, Some(&earlier), Some(&entry)] {
+        if let Some(put) = put {
+            let lease = client.grant(Duration::from_secs(60), LIMIT).await.unwrap();
+            client.put_with_lease(put, lease, LIMIT).await.unwrap();
+        }
+        let is_there = put == Some(&entry);
+        match run().await.unwrap() {
+            EtcdAnswer::Applied { seq: 0, .. } => assert!(is_there),
+            EtcdAnswer::Is(view) => assert!(!is_there && view.origin == 0),
+            other => panic!("{other:?}"),
+        }
+    }
+    let view = client.view(&keys, LIMIT).await.unwrap();
+    assert_eq!(view.journal_number, 3);
+}
+
 #[tokio::test]
 async fn the_robots_in_etcd_are_listed_without_keys_of_other_programs() {
     let servers = Servers::new(1).await;

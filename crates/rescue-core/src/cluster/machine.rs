@@ -202,7 +202,14 @@ impl Machine {
             .filter(|flight| flight.number == number)
             .map(|of| &of.op)
         {
-            Some(Op::Claim { guard, .. }) => guard.seq > 0 && view.guard() == *guard,
+            Some(Op::Claim { guard, begins, .. }) => {
+                // A claim that begins a journal does not require the last entry of the one before.
+                let shown = RevisionGuard {
+                    seq: guard.seq,
+                    ..view.guard()
+                };
+                (guard.seq > 0 || begins.is_some()) && shown == *guard
+            }
             Some(Op::Beat { guard, claim, .. }) => {
                 let leader = view.leader.as_ref();
                 let leads =

@@ -355,7 +355,7 @@ impl Member {
         }
         for action in actions {
             match action {
-                machine::Action::Send { number, op } => self.send(number, op),
+                machine::Action::Send { number, op } => self.send(now, number, op),
                 machine::Action::CatchUp(seq) => self.reading.wanted = Some(seq),
                 machine::Action::Become(role) => self.become_role(now, role),
                 machine::Action::Acknowledge(seq) => {

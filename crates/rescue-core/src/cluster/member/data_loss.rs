@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Action, Holds, Member, MemberEntryChange, News};
+use super::{Action, Holds, Member, MemberEntry, MemberEntryChange, News};
 use crate::cluster::{
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
@@ -96,7 +96,8 @@ impl Member {
             EtcdAnswer::Applied { .. } | EtcdAnswer::Silence => return answer,
         };
         if self.machine.expects(number, view) && !trusts() {
-            // The transaction failed although these keys are as it expects, so the journal's last entry is gone.
+            // The transaction failed although these keys are as it expects, so the journal's last entry is gone, or this
+            // computer's member entry.
             self.data_loss.without_end = Some(view.guard());
             self.reading.load_by(now);
             return EtcdAnswer::Silence;
@@ -220,6 +221,15 @@ impl Member {
         });
         self.data_loss.is_second = false;
         self.act(Action::PublishMemberEntry);
+    }
+
+    /// This computer's member entry, which it has written since it noticed a loss. If it is gone when the claim reaches
+    /// etcd, etcd has lost data again, perhaps a journal that this computer has not seen.
+    pub(super) fn evidence(&self, now: Instant) -> Option<MemberEntry> {
+        let loss = self.data_loss.present?;
+        // A leader claims at once.
+        let is_written = loss.since + self.settings().ttl <= now;
+        is_written.then(|| self.member_entry())
     }
 
     /// Notes whether the journal with this `origin` could be read from its beginning.

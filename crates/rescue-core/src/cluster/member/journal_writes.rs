@@ -11,7 +11,7 @@ use crate::cluster::{
 
 impl Member {
     /// Sends a request of the machine to etcd.
-    pub(super) fn send(&mut self, number: u64, op: Op) {
+    pub(super) fn send(&mut self, now: Instant, number: u64, op: Op) {
         let term = self.machine.term().unwrap_or_default();
         let entry = match &op {
             Op::Beat { seq, .. } => self.outgoing.entry(&self.keys, *seq),
@@ -29,12 +29,19 @@ impl Member {
             Some(_) => self.outgoing.missing_parts(&self.keys),
             None => Vec::new(),
         };
+        let requires = match &op {
+            Op::Claim {
+                begins: Some(_), ..
+            } => self.evidence(now),
+            _ => None,
+        };
         self.act(Action::Send {
             number,
             op,
             entry,
             term,
             parts,
+            requires,
         });
     }
 

@@ -264,13 +264,15 @@ pub enum News {
 )]
 pub enum Action {
     /// Write `parts`, if any, provided that this computer still leads in `term`; then carry out `op` and add `entry` to
-    /// the journal. Ends with [`Input::Answer`].
+    /// the journal. If `requires` is set, this succeeds only if this computer's entry among the members is that one. Ends
+    /// with [`Input::Answer`].
     Send {
         number: u64,
         op: Op,
         entry: Option<Put>,
         term: u64,
         parts: Vec<Put>,
+        requires: Option<MemberEntry>,
     },
     /// Read the journal after the last record in this progress.
     Load(Progress),

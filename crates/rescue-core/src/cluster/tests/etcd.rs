@@ -25,6 +25,7 @@ pub(super) struct Sent {
     pub(super) op: Op,
     pub(super) entry: Option<Put>,
     pub(super) parts: Vec<Put>,
+    pub(super) requires: Option<MemberEntry>,
     pub(super) sent_at: u64,
     /// When the sender gives up.
     pub(super) until: u64,
@@ -279,7 +280,10 @@ impl Etcd {
             seq: expected.seq,
             ..self.view.guard()
         };
-        if guard != expected || !has_last || !leads {
+        let member = self.members.get(&sent.settings.name);
+        let member = member.map(|(entry, _)| entry);
+        let has_evidence = sent.requires.is_none() || member == sent.requires.as_ref();
+        if guard != expected || !has_last || !leads || !has_evidence {
             return EtcdAnswer::Is(self.view.clone());
         }
         self.view.revision += 1;

@@ -554,6 +554,7 @@ impl World {
                 op,
                 entry,
                 parts,
+                requires,
                 ..
             } => {
                 let sent = Sent {
@@ -564,6 +565,7 @@ impl World {
                     op,
                     entry,
                     parts,
+                    requires,
                     sent_at: self.now,
                     until: self.now + ANSWER_LIMIT.as_micros() as u64,
                 };
