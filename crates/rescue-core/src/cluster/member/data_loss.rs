@@ -105,7 +105,7 @@ impl Member {
         if view.revision < self.view().revision {
             // Either the answer is late, which is harmless, or etcd has lost its data.
             self.reading.load_by(now);
-            return answer;
+            return EtcdAnswer::Silence;
         }
         match self.doubts(now, view) {
             true => EtcdAnswer::Silence,
