@@ -192,7 +192,7 @@ impl Ledger {
         self.lock().token()
     }
 
-    /// Like [`Self::record`], for calls that were made on this computer.
+    /// Like [`Self::record`], for calls whose source is this computer and whose origin is rosrescue.
     #[cfg(test)]
     pub(crate) fn record_here(
         &self,

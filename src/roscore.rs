@@ -76,8 +76,8 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
     let duties = async {
         // `rosversion` is slow, so it runs while the master starts.
         let versions = tokio::join!(
-            version(&roscore, "/rosversion", "roslaunch"),
-            version(&roscore, "/rosdistro", "-d"),
+            version_call(&roscore, "/rosversion", "roslaunch"),
+            version_call(&roscore, "/rosdistro", "-d"),
             first_opening(&roscore),
         );
         let missing = Some(run_id(&roscore)).filter(|_| !has_param(&roscore, "/run_id"));
@@ -109,8 +109,9 @@ async fn first_opening(roscore: &Roscore) {
     roscore.gate.clone().wait_for(gate::State::is_open).await;
 }
 
-/// The call that sets `key` to the output of `rosversion`, with the line feed that `roscore.xml` keeps.
-async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
+/// The call that sets `key` to the output of `rosversion ARGUMENT`, with its last line feed, as roslaunch does for
+/// `roscore.xml`. `None` if the parameter is set already, or the program does not answer.
+async fn version_call(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
     if has_param(roscore, key) {
         return None;
     }

@@ -196,7 +196,7 @@ impl<'a> Wanted<'a> {
     }
 }
 
-/// A file without unwanted records.
+/// The text of a file of the log without the records that surely are not wanted. Reading only the rest is faster.
 #[derive(Default)]
 struct Thin {
     text: Vec<u8>,
@@ -267,7 +267,7 @@ fn newest(
     }
 }
 
-/// Reads the wanted entries of `files`, which follow each other.
+/// Reads the wanted entries of consecutive files, oldest first.
 fn read_thin(files: &[Thin], wanted: &Wanted<'_>, reader: &mut LogReader) -> Vec<LogEntry> {
     let mut found = Vec::new();
     for (index, file) in files.iter().enumerate() {

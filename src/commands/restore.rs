@@ -62,7 +62,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, CommandFailure> {
         if !(args.yes || agreed(json)?) {
             return Err(CommandFailure::Failed("changed nothing".to_owned()));
         }
-        restored.failed = set(&params, &mut live).await?;
+        restored.failed = apply(&params, &mut live).await?;
         // If the master refused calls, its messages explain what differs.
         if restored.failed.is_empty() {
             let now = live.state(&file.state).await?;
@@ -102,8 +102,8 @@ fn agreed(json: bool) -> Result<bool, CommandFailure> {
         .map_err(|error| CommandFailure::Failed(format!("no answer: {error}")))
 }
 
-/// Sets and deletes parameters. Returns the refused calls with their reasons.
-async fn set(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, CommandFailure> {
+/// Sets and deletes the parameters of a live robot. Returns the refused calls with their reasons.
+async fn apply(params: &ParamChanges, live: &mut Live) -> Result<Vec<String>, CommandFailure> {
     let set = params.set.iter().map(|(name, _, value)| {
         let params = [Value::from(CALLER_ID), name.as_str().into(), value.clone()];
         let call = Request::new(Method::SetParam, params);

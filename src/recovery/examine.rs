@@ -42,12 +42,12 @@ pub(crate) enum ExamineError {
     Connect(#[from] ConnectError),
     /// A call by rosrescue failed, or the server is not a master.
     #[error(transparent)]
-    Look(#[from] InspectError),
+    Inspect(#[from] InspectError),
 }
 
 impl From<CallError> for ExamineError {
     fn from(error: CallError) -> Self {
-        Self::Look(error.into())
+        Self::Inspect(error.into())
     }
 }
 
@@ -59,12 +59,14 @@ impl ExamineError {
             | Self::Connect(ConnectError::NoAddress { .. } | ConnectError::Unreachable { .. }) => {
                 Input::Unreachable
             }
-            Self::Look(InspectError::Call(
+            Self::Inspect(InspectError::Call(
                 CallError::NotSent(error) | CallError::MaybeSent(error),
             )) if !error.is_parse() => Input::ConnectionLost,
             Self::Connect(ConnectError::Refused { .. })
-            | Self::Look(InspectError::Call(CallError::NotConnected(_))) => Input::ConnectionLost,
-            Self::Look(_) => Input::NotAMaster,
+            | Self::Inspect(InspectError::Call(CallError::NotConnected(_))) => {
+                Input::ConnectionLost
+            }
+            Self::Inspect(_) => Input::NotAMaster,
         }
     }
 }

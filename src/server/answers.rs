@@ -103,21 +103,21 @@ pub struct AnswerMemory {
 #[derive(Debug)]
 pub(crate) struct AnswerRoom(OwnedSemaphorePermit);
 
-/// An answer's bytes, which keep their memory reserved until they have been written.
-struct Counted {
+/// An answer's bytes, which count against the memory limit until they have been written.
+struct ReservedBytes {
     bytes: Bytes,
     number: u64,
     answers: Arc<AnswerMemory>,
     _room: AnswerRoom,
 }
 
-impl AsRef<[u8]> for Counted {
+impl AsRef<[u8]> for ReservedBytes {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }
 }
 
-impl Drop for Counted {
+impl Drop for ReservedBytes {
     fn drop(&mut self) {
         lock(&self.answers.under_way).remove(&self.number);
     }
@@ -237,13 +237,13 @@ impl AnswerMemory {
         *reader.fast_until() = Instant::now() + AHEAD;
         reader.counts.store(true, Ordering::Relaxed);
         lock(&self.under_way).insert(number, reader.clone());
-        let counted = Counted {
+        let reserved = ReservedBytes {
             bytes,
             number,
             answers: self.clone(),
             _room: room,
         };
-        HttpReply::from_parts(head, Bytes::from_owner(counted).into())
+        HttpReply::from_parts(head, Bytes::from_owner(reserved).into())
     }
 }
 

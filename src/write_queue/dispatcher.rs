@@ -215,7 +215,7 @@ pub(super) struct Dispatcher {
     late_at: Option<Instant>,
     /// Whether the last input has shown that a master will not run all calls that the mirror has answered first.
     has_left_out: bool,
-    /// When the journal gets to know which writes the master has run.
+    /// When to note in the journal which writes the master has run. `None` if there is nothing to note.
     acknowledge_at: Option<Instant>,
     actions: Vec<Action>,
 }

@@ -38,7 +38,7 @@ pub(super) enum RoundTripError {
     Call(#[from] CallError),
     /// Reading the master's state failed.
     #[error(transparent)]
-    Look(#[from] InspectError),
+    Inspect(#[from] InspectError),
 }
 
 impl RoundTripError {
@@ -48,8 +48,8 @@ impl RoundTripError {
             Self::Connect(_) => Failure::NotConnected,
             Self::Call(CallError::NotSent(_) | CallError::NotConnected(_)) => Failure::NotSent,
             Self::Call(_) => Failure::MayHaveRun,
-            Self::Look(InspectError::NotAMaster(_)) => Failure::Unreadable,
-            Self::Look(_) => Failure::NotRead,
+            Self::Inspect(InspectError::NotAMaster(_)) => Failure::Unreadable,
+            Self::Inspect(_) => Failure::NotRead,
         }
     }
 }

@@ -201,7 +201,7 @@ impl<S: Storage> Store<S> {
 
     /// Stops recording to the present file for good, because another process has made `change`.
     fn changed(&mut self, change: ForeignChange) -> StoreError {
-        if matches!(change, ForeignChange::Lock) {
+        if matches!(change, ForeignChange::LockReplaced) {
             // The lock is taken again now. Meanwhile the open file, which is locked too, keeps other processes out. If
             // the lock cannot be taken, the next generation reports it.
             let _ = self.place.hold_lock();

@@ -30,7 +30,7 @@ pub enum ForeignChange {
     Content,
     /// The lock file is gone, or another file is in its place.
     #[error("its lock file was removed or replaced")]
-    Lock,
+    LockReplaced,
 }
 
 /// Why the file cannot be trusted.
@@ -96,7 +96,7 @@ impl<S: Storage> CheckJob<S> {
             Some(_) => {}
         }
         if storage.id_at(&self.names.lock())? != Some(self.lock_id) {
-            return Err(Finding::Changed(ForeignChange::Lock));
+            return Err(Finding::Changed(ForeignChange::LockReplaced));
         }
         match self.content {
             Some((length, crc)) if storage.checksum(path, length)? != crc => {

@@ -113,7 +113,7 @@ fn forget(host: &str, began: Instant) {
     }
 }
 
-/// Looks up a name. Waits for a permit if it has none.
+/// Looks up the addresses of `host` in a thread, and gives them to `tell`. Waits for a permit if `permit` is `None`.
 async fn look_up(
     host: String,
     began: Instant,

@@ -517,8 +517,8 @@ impl MasterNotifications {
     }
 }
 
-/// Which nodes, by port, to tell the state of which [`Subject`] once more, and when. Each time lies after the last
-/// moment at which the node may have read notifications in the wrong order.
+/// The repeats that are due: which node, named by its port, is told the state of which [`Subject`] once more, and when:
+/// after the last moment at which it may read older notifications.
 #[derive(Debug, Default)]
 struct Repeats {
     at: Schedule<(Subject, String)>,

@@ -76,7 +76,7 @@ impl ClusterDriver {
     }
 
     fn log_cut_off(&self, serves: bool) {
-        let silent = self.trouble.is_silent(self.member.settings().ttl / 2);
+        let silent = self.trouble.report_silence(self.member.settings().ttl / 2);
         let own = &self.member.settings().id;
         let leader = self.member.view().leader.as_ref();
         let why = match (

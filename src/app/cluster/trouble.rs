@@ -43,9 +43,9 @@ impl Trouble {
         }
     }
 
-    /// Whether etcd has not answered for longer than `limit`. If so, reports the silence, because the request under way
-    /// may fail only later.
-    pub(super) fn is_silent(&self, limit: Duration) -> bool {
+    /// Reports it if etcd has not answered for longer than `limit`, without waiting for the request under way to fail.
+    /// Returns whether it is silent for so long.
+    pub(super) fn report_silence(&self, limit: Duration) -> bool {
         let (known, heard) = self.lock().clone();
         let silent = heard.elapsed();
         if silent > limit && known.is_none() {

@@ -48,7 +48,7 @@ impl Outgoing {
         self.changes.extend(changes);
     }
 
-    /// How many changes are not in the journal yet.
+    /// How many changes etcd's journal does not have yet.
     pub fn count(&self) -> usize {
         self.changes.len()
     }

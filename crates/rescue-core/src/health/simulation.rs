@@ -34,7 +34,7 @@ enum Setup {
     OtherNetwork,
     /// The process belongs to another user.
     Hidden,
-    /// On another computer.
+    /// On another computer, so that this kernel shows nothing of it.
     Elsewhere,
 }
 
@@ -469,7 +469,8 @@ impl World {
         }
     }
 
-    /// Looks at all nodes. If `slow`, an event may happen meanwhile, as with real reads of the kernel's tables.
+    /// Judges all nodes by their sockets. If `slow`, something else may happen between two steps of that, as between real
+    /// reads of the kernel's tables.
     fn check_sockets(&mut self, slow: bool) {
         if std::mem::replace(&mut self.looking, true) {
             return;

@@ -39,9 +39,9 @@ pub(super) struct Outbox {
 pub(super) enum Payload {
     /// The call that a master would have sent.
     Call(Arc<Call>),
-    /// The state at the time of sending.
+    /// What the topic or parameter is when the notification is sent; nothing is stored here.
     State,
-    /// The state at the time of sending, told once more in case the node has read notifications in the wrong order.
+    /// The same, told once more in case the node has read notifications in the wrong order.
     StateAgain,
 }
 

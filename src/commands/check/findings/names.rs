@@ -4,7 +4,7 @@ use super::{
     super::facts::{Host, SetupFacts},
     Findings, list,
     network::other_host,
-    todo::{add_host, first_address, set_address},
+    todo::{first_address, host_entry, set_address},
 };
 
 /// A name lookup that takes longer than this, in milliseconds, is a finding: it delays every call to the node.
@@ -31,7 +31,7 @@ impl Findings {
                 format!("{name} has no address ({why}): no other node reaches the nodes of this computer"),
                 match facts.local {
                     Some(local) => {
-                        format!("{}, or {set_address}", add_host(&local.to_string(), name))
+                        format!("{}, or {set_address}", host_entry(&local.to_string(), name))
                     }
                     None => set_address,
                 },
@@ -104,7 +104,7 @@ impl Findings {
                 ),
                 format!(
                     "every new connection waits this long: {}",
-                    add_host(&first_address(Some(host)), &host.name)
+                    host_entry(&first_address(Some(host)), &host.name)
                 ),
             );
         }
@@ -121,7 +121,7 @@ impl Findings {
                     format!(
                         "where the nodes run, `export ROS_IP=$(hostname -I | cut -d' ' -f1)` and start them again; or \
                          {}",
-                        add_host("ADDRESS", name)
+                        host_entry("ADDRESS", name)
                     ),
                 );
             }

@@ -27,8 +27,8 @@ pub(super) fn set_address(facts: &SetupFacts) -> String {
     format!("`{unset}export ROS_IP={address}` before anything starts")
 }
 
-/// How to give `name` an address on this computer.
-pub(super) fn add_host(address: &str, name: &str) -> String {
+/// The command that makes this computer resolve `name` to `address`.
+pub(super) fn host_entry(address: &str, name: &str) -> String {
     format!("`echo {address} {name} | sudo tee -a /etc/hosts`")
 }
 

@@ -6,7 +6,7 @@ use super::{
         ros::Responder,
     },
     Findings, list,
-    todo::{add_host, first_address, own_uri, set_address},
+    todo::{first_address, host_entry, own_uri, set_address},
 };
 use crate::ros_env;
 
@@ -58,7 +58,7 @@ impl Findings {
                 format!(
                     "if it is this computer, `export ROS_MASTER_URI={}`, else {}",
                     own_uri(facts),
-                    add_host("ADDRESS", &host.name)
+                    host_entry("ADDRESS", &host.name)
                 ),
             ),
             Ok(addresses) if !host.is_here => self.bad(
@@ -111,7 +111,7 @@ impl Findings {
             self.warn(
                 SUBJECT,
                 format!("the master calls itself {name}, which has no address here ({why})"),
-                add_host(&first_address(facts.master_host.as_ref()), name),
+                host_entry(&first_address(facts.master_host.as_ref()), name),
             );
         }
     }
