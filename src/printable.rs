@@ -13,7 +13,7 @@ use serde::Serialize;
 const REPLACEMENT: char = '\u{fffd}';
 
 /// Whether the character breaks a line, commands a terminal, changes the direction of writing, or is invisible.
-fn is_unsafe(c: char) -> bool {
+pub(crate) fn is_unsafe(c: char) -> bool {
     c.is_control()
         || matches!(
             c,

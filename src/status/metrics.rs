@@ -13,6 +13,7 @@ use super::{
     stats::Stats,
     summary::{NodesStatus, Status},
 };
+use crate::printable;
 
 /// Number of nodes that have a line of their own.
 const ILL_MOST: usize = 100;
@@ -189,10 +190,21 @@ fn add_named(text: &mut String, name: &str, help: &str, value: impl Display) {
     );
 }
 
-/// A label's value with the escapes of Prometheus' text format.
+/// A label's value in Prometheus' text format. Characters that must not be printed, and the backslash, are shown by
+/// their numbers, such as `\u{a}`. So different names have different labels, and monitors and terminals are safe from them.
 fn escaped(value: &str) -> String {
-    let value = value.replace('\\', r"\\").replace('"', "\\\"");
-    value.replace('\n', r"\n")
+    let mut text = String::with_capacity(value.len());
+    for c in value.chars() {
+        match c {
+            '"' => text.push_str("\\\""),
+            // Prometheus reads two backslashes as one.
+            c if c == '\\' || printable::is_unsafe(c) => {
+                let _ = write!(text, "\\{}", c.escape_unicode());
+            }
+            c => text.push(c),
+        }
+    }
+    text
 }
 
 /// The role's name in JSON and in metrics.
@@ -227,6 +239,15 @@ fn head(text: &mut String, name: &str, help: &str, kind: &str) {
 mod tests {
     use super::*;
     use crate::status::cluster_facts::ClusterFacts;
+
+    #[test]
+    fn no_name_forges_a_line_or_hides_in_a_label() {
+        assert_eq!(escaped("/camera_\u{e9}"), "/camera_\u{e9}");
+        assert_eq!(escaped("/a\" 1\n/b"), r#"/a\" 1\\u{a}/b"#);
+        assert_eq!(escaped("/a\u{202e}b"), r"/a\\u{202e}b");
+        // What looks like the number of a character is none.
+        assert_eq!(escaped(r"\u{a}"), r"\\u{5c}u{a}");
+    }
 
     #[test]
     fn openmetrics_names_the_family_of_a_counter_and_ends() {
