@@ -205,6 +205,11 @@ impl World {
         }
         self.print(|| "all connections to the master break".to_owned());
         self.may_go_back = true;
+        if self.gate() == State::Injecting {
+            // An injection replaces all parameters, and its answer has what a client had set since the inspection. That
+            // answer is lost now.
+            self.bypassed = None;
+        }
         let time = self.dice.below(3_000);
         let event = recovery::Event::ConnectionEnds(self.life);
         self.after(time, Event::Recovery(event));
