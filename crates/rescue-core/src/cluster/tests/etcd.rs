@@ -36,6 +36,8 @@ pub(super) struct Sent {
 pub(super) enum Held {
     Records(Vec<Record>),
     State(Box<Master>),
+    /// A large value of which parts are gone. Nobody can read it.
+    Damaged,
 }
 
 /// A copy of etcd's data.
@@ -125,7 +127,7 @@ impl Etcd {
                 JournalEntry::Call { call: of, .. } => of.params() == call.params(),
                 JournalEntry::Session(_) => false,
             }),
-            Held::State(_) => false,
+            Held::State(_) | Held::Damaged => false,
         })
     }
 
@@ -135,7 +137,7 @@ impl Etcd {
         for (index, (_, held)) in self.log.iter().enumerate() {
             match held {
                 Held::State(of) if index * 1000 < place => state = (**of).clone(),
-                Held::State(_) => {}
+                Held::State(_) | Held::Damaged => {}
                 Held::Records(records) => {
                     let first = records.iter().take(place.saturating_sub(index * 1000));
                     for record in first {
@@ -365,13 +367,13 @@ impl Etcd {
             Some(manifest) => {
                 let parts = self.values.range(self.keys.parts(&manifest));
                 let parts: Vec<_> = parts.map(|(_, value)| value.clone()).collect();
-                let whole = manifest.assemble(&self.keys, &parts).unwrap();
-                match manifest.is_state() {
-                    false => {
+                match (manifest.assemble(&self.keys, &parts), manifest.is_state()) {
+                    (Err(_), _) => (Held::Damaged, put.value.len()),
+                    (Ok(whole), false) => {
                         let records = journal::records(&put.key, &whole).unwrap();
                         (Held::Records(records), whole.len())
                     }
-                    true => {
+                    (Ok(whole), true) => {
                         let checkpoint = format::decode(&whole).unwrap().checkpoint.unwrap();
                         let state = Master::from_snapshot(checkpoint.snapshot).unwrap();
                         (Held::State(Box::new(state)), whole.len())
@@ -396,8 +398,11 @@ impl Etcd {
                     }
                 }
             }
+            Held::Damaged => {}
         }
-        self.log(held.clone());
+        if !matches!(held, Held::Damaged) {
+            self.log(held.clone());
+        }
         let revision = self.view.revision;
         self.puts.push((revision, seq, held.clone(), bytes));
         self.entries.insert(seq, (held, bytes));
@@ -472,6 +477,10 @@ impl Etcd {
                         return read;
                     }
                 },
+                Held::Damaged => {
+                    read.is_readable = false;
+                    return read;
+                }
             }
         }
         read.is_readable = read.progress.seq >= self.seq();
@@ -488,7 +497,7 @@ impl Etcd {
         let new = new.filter(|(revision, ..)| (after + 1..=upto).contains(revision));
         let entries = new.map(|(revision, seq, held, bytes)| {
             let entry = match held {
-                Held::State(_) => WatchedEntry::Apart(*seq),
+                Held::State(_) | Held::Damaged => WatchedEntry::Apart(*seq),
                 Held::Records(records) => WatchedEntry::Records {
                     records: records.clone(),
                     bytes: *bytes,

@@ -227,6 +227,7 @@ impl History {
                 JournalEntry::Call { call, .. } => same(call.params()),
                 _ => false,
             }),
+            Held::Damaged => false,
         });
         in_log || call.reported || call.held || etcd.lost
     }
@@ -663,6 +664,7 @@ impl Places {
         for (index, (moment, held)) in etcd.log.iter().enumerate() {
             let records = match held {
                 Held::Records(records) => records,
+                Held::Damaged => continue,
                 Held::State(state) => {
                     let made = history.calls.iter().enumerate();
                     let made = made.filter(|(_, call)| call.made < *moment);
