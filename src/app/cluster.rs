@@ -553,7 +553,7 @@ fn entry(seq: u64, kv: &Kv) -> WatchedEntry {
     let bytes = kv.value.len();
     match (
         Manifest::read(&kv.value),
-        journal::records(&kv.key, &kv.value),
+        journal::decode_records(&kv.key, &kv.value),
     ) {
         (None, Ok(records)) => WatchedEntry::Records { records, bytes },
         _ => WatchedEntry::Apart(seq),

@@ -150,10 +150,10 @@ impl Replica {
     /// If they could not be read.
     pub async fn records(&self, entry: &Kv, revision: u64) -> Result<Vec<Record>, ReplicaError> {
         let Some(manifest) = Manifest::read(&entry.value) else {
-            return Ok(journal::records(&entry.key, &entry.value)?);
+            return Ok(journal::decode_records(&entry.key, &entry.value)?);
         };
         let whole = self.assemble(&manifest, revision).await?;
-        Ok(journal::records(&entry.key, &whole)?)
+        Ok(journal::decode_records(&entry.key, &whole)?)
     }
 
     fn manifest(&self, kv: &Kv) -> Result<Manifest, ReplicaError> {

@@ -358,8 +358,9 @@ pub fn check_size(bytes: usize) -> Result<(), JournalError> {
     }
 }
 
-/// The records of a journal entry or of a blob.
-pub fn records(key: &str, value: &[u8]) -> Result<Vec<Record>, JournalError> {
+/// Decodes the records in a value of etcd: an entry of the journal, or the joined parts of one that is too large for a
+/// single value (a *blob*). Errors name `key`.
+pub fn decode_records(key: &str, value: &[u8]) -> Result<Vec<Record>, JournalError> {
     format::read_records(value).map_err(|why| JournalError::Damaged {
         key: key.to_owned(),
         why,

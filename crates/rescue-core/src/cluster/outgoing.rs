@@ -250,7 +250,7 @@ mod tests {
     /// The numbers of the records that the next heartbeat adds to the journal.
     fn added(outgoing: &Outgoing, keys: &Keys, seq: u64) -> Vec<u64> {
         let entry = outgoing.entry(keys, seq).unwrap();
-        let records = entry.map(|put| journal::records(&put.key, &put.value).unwrap());
+        let records = entry.map(|put| journal::decode_records(&put.key, &put.value).unwrap());
         let records = records.into_iter().flatten();
         records.map(|record| record.seq).collect()
     }

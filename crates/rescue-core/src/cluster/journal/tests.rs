@@ -45,7 +45,7 @@ fn through(records: &[Record]) -> (Vec<Record>, usize) {
                 whole
             }
         };
-        let found = super::records(&key, &whole).unwrap();
+        let found = decode_records(&key, &whole).unwrap();
         assert_eq!(keys.seq_of(&key), found.last().map(|record| record.seq));
         read.extend(progress.take(found, whole.len()).unwrap());
         rest = &rest[batch.count..];
@@ -175,7 +175,7 @@ fn what_another_program_wrote_is_said_so() {
         "- {seq: 1, call: \"getPid\", params: []} #00000000 12345678\n",
         "- {seq: 1",
     ] {
-        let error = records("/robot/journal/1", value.as_bytes()).unwrap_err();
+        let error = decode_records("/robot/journal/1", value.as_bytes()).unwrap_err();
         assert!(error.to_string().contains("/robot/journal/1"), "{error}");
     }
     assert_eq!(Manifest::read(b"blob seq=1 bytes=x crc32c=0\n"), None);

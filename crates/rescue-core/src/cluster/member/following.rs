@@ -55,7 +55,7 @@ impl Reading {
         self.load_by(now);
     }
 
-    /// Asks for a read that begins after `now`. What the watch on etcd delivers may be much older.
+    /// Asks for a read of etcd that begins after `now`. What the watch delivers may be much older.
     pub(super) fn refresh(&mut self, now: Instant) {
         self.fresh = Some(1 + u8::from(self.loading));
         self.load_by(now);
@@ -211,7 +211,7 @@ impl Member {
         self.reading.ended(now);
     }
 
-    /// Passes the keys `leader` and `alive` to the machine.
+    /// Passes what etcd shows of its keys `origin`, `leader` and `alive` to the machine, which decides who leads.
     fn see(&mut self, now: Instant, view: View) {
         if view.revision >= self.reading.view.revision {
             self.reading.view = view.clone();

@@ -210,7 +210,7 @@ impl Member {
         if calls.is_empty() {
             match self.merging.unread {
                 true => self.find_conflicts_again(now),
-                false => self.merged(now),
+                false => self.finish_period(now),
             }
             return;
         }
@@ -303,8 +303,8 @@ impl Member {
         }
     }
 
-    /// Finishes the oldest period of being cut off: all its writes have been sent.
-    pub(super) fn merged(&mut self, now: Instant) {
+    /// Finishes the oldest period of being cut off: the leader has made, or judged as lost, all its writes.
+    pub(super) fn finish_period(&mut self, now: Instant) {
         let (sent, lost) = (self.merging.sent, self.merging.lost_count);
         self.report_news(News::Merged { sent, lost });
         self.merging = Merging {

@@ -119,7 +119,7 @@ impl WatchedEntry {
 /// The result of one read of etcd: the part of the journal that this computer did not know yet.
 #[derive(Clone, Debug)]
 pub struct Read {
-    /// The keys `origin`, `leader` and `alive` at the same revision.
+    /// etcd's keys `origin`, `leader` and `alive`, all as of one revision.
     pub view: View,
     /// Whether the journal could be read from its beginning. If not, only `view` and `members` count.
     pub is_readable: bool,
@@ -263,8 +263,9 @@ pub enum News {
     reason = "few exist at a time, and none is stored"
 )]
 pub enum Action {
-    /// Write `parts`, if any, provided that this computer still leads in `term`; then carry out `op` and add `entry` to
-    /// the journal. If `requires` is set, this succeeds only if this computer's entry among the members is that one. Ends
+    /// Write to etcd what the machine has decided. First the `parts` of a change that is too large for one transaction,
+    /// provided that this computer still leads in `term`; then, in one transaction on the conditions of `op`, the keys of
+    /// `op` and the journal's next `entry`. If `requires` is set, this succeeds only if this computer's entry among the members is that one. Ends
     /// with [`Input::Answer`].
     Send {
         number: u64,

@@ -361,7 +361,7 @@ impl Etcd {
         let seq = self.keys.seq_of(&put.key).unwrap();
         let (held, bytes) = match Manifest::read(&put.value) {
             None => {
-                let records = journal::records(&put.key, &put.value).unwrap();
+                let records = journal::decode_records(&put.key, &put.value).unwrap();
                 (Held::Records(records), put.value.len())
             }
             Some(manifest) => {
@@ -370,7 +370,7 @@ impl Etcd {
                 match (manifest.assemble(&self.keys, &parts), manifest.is_state()) {
                     (Err(_), _) => (Held::Damaged, put.value.len()),
                     (Ok(whole), false) => {
-                        let records = journal::records(&put.key, &whole).unwrap();
+                        let records = journal::decode_records(&put.key, &whole).unwrap();
                         (Held::Records(records), whole.len())
                     }
                     (Ok(whole), true) => {
