@@ -75,6 +75,10 @@ impl Member {
 
     /// Updates the position up to which the mirror is current.
     fn update_position(&mut self) {
+        if !self.reading.loaded && !self.records() {
+            // What the checkpoint holds still counts.
+            return;
+        }
         let seq = self.journal.progress.seq;
         // If `differs`, the mirror is at no position of the journal: it holds records or kept writes that the journal
         // lacks.
