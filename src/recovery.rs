@@ -108,7 +108,7 @@ pub(crate) struct Driver {
     timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
-    said: Option<LastMessage>,
+    last_message: Option<LastMessage>,
 }
 
 impl Driver {
@@ -145,7 +145,7 @@ impl Driver {
             probe_deadline: None,
             timers_late: Duration::ZERO,
             prepared: None,
-            said: None,
+            last_message: None,
         }
     }
 
@@ -270,7 +270,7 @@ impl Driver {
                         return input;
                     }
                 }
-                () = self.write_queue.lost() => return Input::BatchLost,
+                () = self.write_queue.batch_lost() => return Input::BatchLost,
                 () = self.write_queue.late_answered() => return Input::LateAnswered,
                 () = self.write_queue.late() => return Input::Late,
                 () = self.write_queue.slow() => return Input::Slow,
@@ -553,12 +553,12 @@ impl Driver {
     }
 
     fn open_gate(&mut self) {
-        self.said = None;
+        self.last_message = None;
         self.examiner.open_gate();
         self.set_run_id_later();
         if let Some(number) = self.restored.take() {
             // This comes last, so that calls do not wait while the state is copied.
-            self.rescues.keep(number, Instant::now());
+            self.rescues.keep_rescue(number, Instant::now());
         }
     }
 
@@ -622,7 +622,7 @@ fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     Some(Box::pin(async move {
         // The check blocks, because reading the command line needs the lock of the master's memory.
         let watched = crate::task::spawn_blocking(move || process::runs(id, "rosmaster")).await;
-        if let (Ok(true), Ok(ended)) = (watched, thread_exit::of(pid)) {
+        if let (Ok(true), Ok(ended)) = (watched, thread_exit::watch(pid)) {
             ended.await;
         } else {
             std::future::pending().await

@@ -93,7 +93,7 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
     let rosout = async {
         first_opening(&roscore).await;
         if rosout {
-            keep_rosout(&roscore).await;
+            supervise_rosout(&roscore).await;
         }
     };
     tokio::select! {
@@ -128,7 +128,7 @@ async fn version_call(roscore: &Roscore, key: &str, argument: &str) -> Option<Re
 static ENDED: AlarmLimit = AlarmLimit::new();
 
 /// Keeps one rosout running: that of this rosrescue, or one that exists already.
-async fn keep_rosout(roscore: &Roscore) {
+async fn supervise_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!(
             "rosout is not installed, so /rosout is not collected; run `apt-get install rosout`, or use --no-rosout"

@@ -96,8 +96,8 @@ impl WriteQueue {
 
     /// Waits until a batch is lost: its connection ended before the answer. The master may have run the batch, and may
     /// be dead. Nothing is sent until the caller changes the gate, which says whether calls pass to the master.
-    pub async fn lost(&self) {
-        self.signals.lost.notified().await;
+    pub async fn batch_lost(&self) {
+        self.signals.batch_lost.notified().await;
     }
 
     /// Waits until the master has left a write unanswered for the [patience](Self::set_patience), and the mirror can
@@ -132,7 +132,7 @@ impl WriteQueue {
 struct Signals {
     /// How long writes wait for the master.
     patience: watch::Sender<Patience>,
-    lost: Notify,
+    batch_lost: Notify,
     is_late: Notify,
     has_answered: Notify,
     /// Signals that the master takes too long to answer a call.
@@ -154,7 +154,7 @@ pub(crate) fn write_queue(
     let (items, rx) = mpsc::channel(CHANNEL);
     let signals = Arc::new(Signals {
         patience: watch::Sender::new(patience.clone()),
-        lost: Notify::new(),
+        batch_lost: Notify::new(),
         is_late: Notify::new(),
         has_answered: Notify::new(),
         slow: Notify::new(),

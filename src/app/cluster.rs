@@ -194,7 +194,7 @@ impl ClusterDriver {
             }
             Action::Watch(view) => {
                 if view.leader.is_none() {
-                    self.beside.spawn(survey::look_for_typo(
+                    self.beside.spawn(survey::warn_of_typo(
                         self.replica.clone(),
                         self.setup.config.robot.clone(),
                     ));

@@ -21,7 +21,7 @@ pub struct CheckpointArgs {
 #[derive(Args, Clone, Debug)]
 pub struct ReadArgs {
     #[command(flatten)]
-    pub place: CheckpointArgs,
+    pub checkpoint: CheckpointArgs,
     /// Use the readable part of a damaged checkpoint; `rosrescue verify` shows that part
     #[arg(long)]
     pub damaged: bool,
@@ -56,7 +56,7 @@ pub struct VerifyArgs {
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
     #[command(flatten)]
-    pub place: CheckpointArgs,
+    pub checkpoint: CheckpointArgs,
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -96,7 +96,7 @@ pub struct DiffArgs {
 #[derive(Args, Clone, Debug)]
 pub struct HistoryArgs {
     #[command(flatten)]
-    pub place: CheckpointArgs,
+    pub checkpoint: CheckpointArgs,
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -133,7 +133,7 @@ pub struct LogArgs {
     #[arg(long)]
     pub json: bool,
     #[command(flatten)]
-    pub place: CheckpointArgs,
+    pub checkpoint: CheckpointArgs,
     #[command(flatten)]
     pub hide: HideArgs,
 }
@@ -149,7 +149,7 @@ pub struct ReportArgs {
     #[arg(long, value_name = "URI", conflicts_with = "checkpoint")]
     pub uri: Option<String>,
     #[command(flatten)]
-    pub place: CheckpointArgs,
+    pub checkpoint: CheckpointArgs,
     #[command(flatten)]
     pub output: OutputArgs,
 }

@@ -51,7 +51,7 @@ pub(super) struct Opened {
 }
 
 impl Opened {
-    /// Describes a state of the log by its time and place.
+    /// Describes a state of the log by its time and checkpoint.
     pub(super) fn moment(&self) -> String {
         let (time, path) = (clock::wall_text(self.written), self.path.display());
         format!("the state of {time}, from {path}")
@@ -59,16 +59,16 @@ impl Opened {
 }
 
 /// The path of the checkpoint in use, with links resolved.
-pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
+pub(super) async fn present(checkpoint: &CheckpointArgs) -> PathBuf {
     let env = |name: &str| std::env::var(name).ok();
-    let running = match place.checkpoint {
+    let running = match checkpoint.checkpoint {
         None => checkpoint_of_running().await,
         Some(_) => None,
     };
     let path = running.unwrap_or_else(|| {
         let target = Running::find(&target());
         let port = target.map_or(DEFAULT_MASTER_PORT, |running| running.address.port);
-        config::checkpoint_path(place.checkpoint.as_deref(), port, &env)
+        config::checkpoint_path(checkpoint.checkpoint.as_deref(), port, &env)
     });
     fs::canonicalize(&path).unwrap_or(path)
 }
@@ -91,7 +91,10 @@ async fn checkpoint_of_running() -> Option<PathBuf> {
 }
 
 /// The checkpoint that `file` stands for: a path, or a name or number from the history.
-pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, CommandFailure> {
+pub(super) async fn find(
+    file: &Path,
+    checkpoint: &CheckpointArgs,
+) -> Result<PathBuf, CommandFailure> {
     match fs::canonicalize(file) {
         Ok(path) => return Ok(path),
         Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -100,7 +103,7 @@ pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf,
             return Err(CommandFailure::Usage(why));
         }
     }
-    let present = present(place).await;
+    let present = present(checkpoint).await;
     let listed = list(&present);
     let wanted = file.to_string_lossy();
     let named = |(number, kept): (usize, &Listed)| {
@@ -202,7 +205,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, CommandFailure> {
 /// The state of the checkpoint in use at an earlier time, rebuilt from the log of changes. `now` stands for its end,
 /// whatever the clock shows.
 pub(super) async fn read_at(at: When, args: &ReadArgs) -> Result<Opened, CommandFailure> {
-    let path = present(&args.place).await;
+    let path = present(&args.checkpoint).await;
     let time = match at {
         When::Now => u64::MAX,
         at => at.millis(clock::wall_millis()),
@@ -284,13 +287,13 @@ pub(super) async fn read_either(
     match (file, at) {
         (_, Some(at)) => read_at(at, args).await,
         (Some(file), None) => read(file, args).await,
-        (None, None) => read(&present(&args.place).await, args).await,
+        (None, None) => read(&present(&args.checkpoint).await, args).await,
     }
 }
 
 /// Reads the checkpoint that `file` stands for. Refuses a damaged one without `--damaged`.
 pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, CommandFailure> {
-    let opened = open(&find(file, &args.place).await?)?;
+    let opened = open(&find(file, &args.checkpoint).await?)?;
     let path = opened.path.display();
     if !opened.exact && !args.damaged {
         let why = opened

@@ -17,7 +17,7 @@ use crate::{
 };
 
 pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
-    let present = files::present(&args.place).await;
+    let present = files::present(&args.checkpoint).await;
     let reports = report_file::read(&present);
     let rows = files::list(&present)
         .into_iter()

@@ -48,20 +48,20 @@ const SETTINGS: [&str; 5] = [
 const PATHS: [&str; 4] = ["PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ROS_PACKAGE_PATH"];
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
-    let place = UnitPaths::new(&args.scope)?;
-    needs_root(&place, &args.scope)?;
-    carry_out(&install(args, &place).await?, &args.scope)
+    let paths = UnitPaths::new(&args.scope)?;
+    needs_root(&paths, &args.scope)?;
+    carry_out(&install(args, &paths).await?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
-    let place = UnitPaths::new(&args.scope)?;
-    needs_root(&place, &args.scope)?;
-    carry_out(&uninstall(&place), &args.scope)
+    let paths = UnitPaths::new(&args.scope)?;
+    needs_root(&paths, &args.scope)?;
+    carry_out(&uninstall(&paths), &args.scope)
 }
 
 /// Refuses a service of the computer without root, before any other obstacle is reported.
-fn needs_root(place: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure> {
-    if place.user || args.dry_run || rustix::process::geteuid().is_root() {
+fn needs_root(paths: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure> {
+    if paths.user || args.dry_run || rustix::process::geteuid().is_root() {
         return Ok(());
     }
     let words: Vec<_> = std::env::args().skip(1).collect();
@@ -71,7 +71,7 @@ fn needs_root(place: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure>
     )))
 }
 
-async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges, CommandFailure> {
+async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -98,7 +98,7 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
         }
         settings.extend(given(&PATHS));
     }
-    let run_as = account(args, place, &caller)?;
+    let run_as = account(args, paths, &caller)?;
     let program = std::env::current_exe();
     let program = program.map_err(|error| {
         CommandFailure::Failed(format!("cannot find this program's file: {error}"))
@@ -114,7 +114,7 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
         ));
     }
     plan.obstacles
-        .extend(misplaced(&program).filter(|_| !place.user));
+        .extend(misplaced(&program).filter(|_| !paths.user));
     if let Some(obstacle) = other_master(&settings, &service.advertised).await {
         match args.other_master {
             true => plan.notes.push(obstacle),
@@ -123,8 +123,8 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
             )),
         }
     }
-    let (disabled, before) = plan.plan_other_units(place, &service);
-    let files = place.files();
+    let (disabled, before) = plan.plan_other_units(paths, &service);
+    let files = paths.files();
     let [unit, socket_unit, dropin, socket_dropin] =
         files.each_ref().map(|path| fs::read_to_string(path).ok());
     let old = dropin.unwrap_or_default();
@@ -138,9 +138,9 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
         before: &before,
         disabled: &all_disabled,
     };
-    let [new_unit, new_socket_unit] = match place.is_packaged(&program) {
+    let [new_unit, new_socket_unit] = match paths.is_packaged(&program) {
         true => [None, None],
-        false => units::units(place.user).map(Some),
+        false => units::units(paths.user).map(Some),
     };
     let (new, new_socket) = (robot.service(), robot.socket());
     let is_socket_new = socket_dropin.as_ref() != Some(&new_socket);
@@ -167,19 +167,19 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
         }
     }
     let is_changed = !plan.changes.is_empty();
-    if is_changed && place.systemd_runs() {
-        plan.run(place.systemctl(&["daemon-reload"]));
+    if is_changed && paths.systemd_runs() {
+        plan.run(paths.systemctl(&["daemon-reload"]));
     }
     for unit in &disabled {
-        plan.run(place.systemctl(&[&["disable"], place.now_option(), &[unit]].concat()));
+        plan.run(paths.systemctl(&[&["disable"], paths.now_option(), &[unit]].concat()));
     }
-    let is_running = place.systemd_runs()
+    let is_running = paths.systemd_runs()
         && UNITS
             .iter()
-            .all(|unit| place.systemctl_confirms("is-active", unit));
+            .all(|unit| paths.systemctl_confirms("is-active", unit));
     let is_enabled = UNITS
         .iter()
-        .all(|unit| place.systemctl_confirms("is-enabled", unit));
+        .all(|unit| paths.systemctl_confirms("is-enabled", unit));
     if is_changed && is_running {
         // The settings that say what runs, and as which user.
         let key = |text: &str| {
@@ -189,11 +189,11 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
             let words = lines.map(|line| line.split(' ').take(2).collect::<String>());
             words.collect::<Vec<_>>()
         };
-        plan.renew(place, is_socket_new || key(&old) != key(&new));
-    } else if !is_enabled || (!is_running && place.systemd_runs()) {
-        plan.start(place, &service, !disabled.is_empty());
+        plan.renew(paths, is_socket_new || key(&old) != key(&new));
+    } else if !is_enabled || (!is_running && paths.systemd_runs()) {
+        plan.start(paths, &service, !disabled.is_empty());
     }
-    if !place.systemd_runs() {
+    if !paths.systemd_runs() {
         plan.notes
             .push("systemd is not running here: the service starts at the next boot".to_owned());
     }
@@ -202,15 +202,15 @@ async fn install(args: &InstallArgs, place: &UnitPaths) -> Result<SystemChanges,
             .get("USER")
             .is_some_and(|user| Path::new("/var/lib/systemd/linger").join(user).exists())
     };
-    if place.user && !lingers() {
+    if paths.user && !lingers() {
         plan.notes.push("the service runs while you are logged in. To run it from boot on: `loginctl enable-linger`".to_owned());
     }
     Ok(plan)
 }
 
-fn uninstall(place: &UnitPaths) -> SystemChanges {
+fn uninstall(paths: &UnitPaths) -> SystemChanges {
     let mut plan = SystemChanges::default();
-    let files = place.files();
+    let files = paths.files();
     let dropin = fs::read_to_string(&files[2]).unwrap_or_default();
     let is_ours =
         |path: &PathBuf| fs::read_to_string(path).is_ok_and(|text| text.starts_with(MARK));
@@ -220,14 +220,14 @@ fn uninstall(place: &UnitPaths) -> SystemChanges {
             .push("`rosrescue install` has installed nothing here".to_owned());
         return plan;
     }
-    plan.run(place.systemctl(&[&["disable"], place.now_option(), &UNITS].concat()));
+    plan.run(paths.systemctl(&[&["disable"], paths.now_option(), &UNITS].concat()));
     plan.changes
         .extend(ours.into_iter().map(|path| Change::Remove { path }));
-    if place.systemd_runs() {
-        plan.run(place.systemctl(&["daemon-reload"]));
+    if paths.systemd_runs() {
+        plan.run(paths.systemctl(&["daemon-reload"]));
     }
     for unit in units::disabled(&dropin) {
-        plan.run(place.systemctl(&[&["enable"], place.now_option(), &[&unit]].concat()));
+        plan.run(paths.systemctl(&[&["enable"], paths.now_option(), &[&unit]].concat()));
     }
     plan
 }
@@ -237,11 +237,11 @@ impl SystemChanges {
     /// rosrescue.
     fn plan_other_units(
         &mut self,
-        place: &UnitPaths,
+        paths: &UnitPaths,
         service: &Service,
     ) -> (Vec<String>, Vec<String>) {
         let (mut disabled, mut before) = (Vec::new(), Vec::new());
-        let all = place.other_units().into_iter();
+        let all = paths.other_units().into_iter();
         for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {
             match kind {
                 UnitKind::Roscore if !service.runs_rosmaster => self.obstacles.push(format!(
@@ -267,17 +267,17 @@ impl SystemChanges {
         (disabled, before)
     }
 
-    fn start(&mut self, place: &UnitPaths, service: &Service, port_will_be_free: bool) {
-        let mut options = place.now_option().to_vec();
-        if !service.runs_rosmaster && place.systemd_runs() {
+    fn start(&mut self, paths: &UnitPaths, service: &Service, port_will_be_free: bool) {
+        let mut options = paths.now_option().to_vec();
+        if !service.runs_rosmaster && paths.systemd_runs() {
             // A proxy counts as started once it has a master, which can take long.
             options.push("--no-block");
         }
-        self.run(place.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
+        self.run(paths.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
         let in_use = |address: &SocketAddr| {
             TcpListener::bind(address).is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
         };
-        if place.systemd_runs() && !port_will_be_free && service.listen.iter().any(in_use) {
+        if paths.systemd_runs() && !port_will_be_free && service.listen.iter().any(in_use) {
             let port = service.listen.first().map_or(0, SocketAddr::port);
             self.obstacles.push(format!(
                 "port {port} is in use: stop the robot and its roscore, then run this again"
@@ -286,13 +286,13 @@ impl SystemChanges {
     }
 
     /// Makes the running service use its new files.
-    fn renew(&mut self, place: &UnitPaths, restart: bool) {
+    fn renew(&mut self, paths: &UnitPaths, restart: bool) {
         if restart {
-            self.run(place.systemctl(&["stop", UNITS[1]]));
-            self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
+            self.run(paths.systemctl(&["stop", UNITS[1]]));
+            self.run(paths.systemctl(&[&["start"], &UNITS[..]].concat()));
         } else {
             // This kills rosrescue, and the next rosrescue adopts the running master. Calls wait for some 0.2 s.
-            self.run(place.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
+            self.run(paths.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }
 }

@@ -26,7 +26,7 @@ const LIVE_FILES: usize = 3;
 const FILES_AT_ONCE: usize = 32;
 
 pub(super) async fn run(args: &LogArgs) -> Result<Exit, CommandFailure> {
-    let path = files::present(&args.place).await;
+    let path = files::present(&args.checkpoint).await;
     let wanted = Wanted::new(args);
     let mut reader = LogReader::new(args.hide.hide_values.clone());
     let mut rescues = rescues(&path, &wanted);

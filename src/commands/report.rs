@@ -17,7 +17,7 @@ pub(super) async fn run(args: &ReportArgs) -> Result<Exit, CommandFailure> {
             (place, running.status().await?.last_rescues)
         }
         None => {
-            let present = files::present(&args.place).await;
+            let present = files::present(&args.checkpoint).await;
             let kept = report_file::read(&present).into_iter();
             let reports: Vec<_> = kept.map(|kept| kept.report).collect();
             (format!("beside {}", present.display()), reports)

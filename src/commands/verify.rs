@@ -12,7 +12,7 @@ use crate::{
 };
 
 pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, CommandFailure> {
-    let opened = files::open(&files::find(&args.file, &args.place).await?)?;
+    let opened = files::open(&files::find(&args.file, &args.checkpoint).await?)?;
     let verified = Verified {
         file: opened.path.display().to_string(),
         whole: opened.damage.is_empty(),

@@ -86,7 +86,7 @@ struct Pid {
 struct Noted {
     at: Instant,
     /// Whether rosrescue has notified the nodes itself. False if a master did, which may have died before it finished.
-    told: bool,
+    is_notified: bool,
 }
 
 /// Recent effects of calls. All lists are bounded.
@@ -213,7 +213,7 @@ impl Activity {
         let notifying = self.notifying && !standing_in;
         let noted = Noted {
             at: now,
-            told: standing_in && !noticed.left_to_master,
+            is_notified: standing_in && !noticed.left_to_master,
         };
         let outbox = &mut self.outbox;
         let before = outbox.len();
@@ -339,11 +339,11 @@ impl Activity {
     /// master that died then may not have sent, and all later ones. Afterwards they count as sent.
     pub fn take_owed(&mut self, now: Instant) -> Owed {
         fn take<K: Clone>(noted: &mut IndexMap<K, Noted>, now: Instant) -> Vec<K> {
-            let untold = noted.iter_mut().filter(|(_, noted)| !noted.told);
-            let recent = untold.filter(|(_, noted)| is_recent(noted.at, now));
+            let not_notified = noted.iter_mut().filter(|(_, noted)| !noted.is_notified);
+            let recent = not_notified.filter(|(_, noted)| is_recent(noted.at, now));
             recent
                 .map(|(key, noted)| {
-                    noted.told = true;
+                    noted.is_notified = true;
                     key.clone()
                 })
                 .collect()
@@ -358,10 +358,10 @@ impl Activity {
     }
 
     /// Marks recent changes as not sent, because a master that continues may send outdated notifications.
-    pub fn tell_again(&mut self) {
+    pub fn notify_again(&mut self) {
         let params = self.params.values_mut();
         for noted in self.topics.values_mut().chain(params) {
-            noted.told = false;
+            noted.is_notified = false;
         }
     }
 
@@ -397,7 +397,7 @@ impl Activity {
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,
-            told: false,
+            is_notified: false,
         };
         let topics = mirror.subscribed_topics();
         self.topics

@@ -63,7 +63,7 @@ impl Checkpointer {
     ) -> Self {
         let opened = ledger.seen_store().is_some();
         // A checkpoint that could not be opened was already logged at the start.
-        let said = ledger.unprotected().filter(|_| !opened);
+        let reported = ledger.unprotected().filter(|_| !opened);
         let mut checkpointer = Self {
             seq: 0,
             recorded_at: Instant::now(),
@@ -74,7 +74,7 @@ impl Checkpointer {
                 ledger: ledger.clone(),
                 board,
                 path: path.clone(),
-                said: Mutex::new(said),
+                reported: Mutex::new(reported),
             }),
             ledger,
             path,
@@ -87,7 +87,7 @@ impl Checkpointer {
         {
             checkpointer.ledger.give_up_disk();
         }
-        checkpointer.voice.say_protection();
+        checkpointer.voice.report_protection();
         checkpointer
     }
 
@@ -96,12 +96,12 @@ impl Checkpointer {
         let voice = Arc::clone(&self.voice);
         tokio::select! {
             () = stop.cancelled() => {}
-            () = voice.tell_of_silence() => {}
-            () = self.keep() => {}
+            () = voice.report_silence() => {}
+            () = self.save() => {}
         }
     }
 
-    async fn keep(mut self) {
+    async fn save(mut self) {
         loop {
             tokio::select! {
                 () = self.ledger.work.notified() => {}
@@ -133,11 +133,11 @@ impl Checkpointer {
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
         // Logs before the repair below, so that a failure is logged even if it is repaired at once.
-        self.voice.say_protection();
+        self.voice.report_protection();
         if self.compaction_is_due() {
             self.compact().await;
         }
-        self.voice.say_protection();
+        self.voice.report_protection();
     }
 
     /// Waits for the result of `work`, however long the disk takes. Calls `silent` when the disk has been silent for
@@ -181,7 +181,7 @@ impl Checkpointer {
         ledger.set_sync_is_late(false);
         if let Ok((checked, synced, free)) = done {
             self.voice.board.update(|facts| facts.disk.free = free);
-            // The store keeps a failure, and `say_protection` logs it.
+            // The store keeps a failure, and `report_protection` logs it.
             let noted = self.on_store(move |store| {
                 let _ = checked.map(|done| store.checked(done));
                 let _ = synced.map(|done| store.synced(done));
@@ -280,20 +280,20 @@ struct Voice {
     board: Arc<Board>,
     path: PathBuf,
     /// The last failure that was logged.
-    said: Mutex<Option<String>>,
+    reported: Mutex<Option<String>>,
 }
 
 impl Voice {
-    async fn tell_of_silence(&self) {
+    async fn report_silence(&self) {
         loop {
             self.ledger.disk_silent.notified().await;
-            self.say_protection();
+            self.report_protection();
         }
     }
 
     /// Logs once that the state is no longer recorded, and once that it is again. Also logs under which name a foreign
     /// file at the checkpoint's path was kept.
-    fn say_protection(&self) {
+    fn report_protection(&self) {
         let path = self.path.display();
         if let Some(kept) = self.ledger.take_kept() {
             rarely!(
@@ -303,8 +303,8 @@ impl Voice {
             );
         }
         let unprotected = self.ledger.unprotected();
-        let mut said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
-        match (&unprotected, &*said) {
+        let mut reported = self.reported.lock().unwrap_or_else(PoisonError::into_inner);
+        match (&unprotected, &*reported) {
             (Some(reason), None) => alarm!(
                 error,
                 UNPROTECTED,
@@ -323,7 +323,7 @@ impl Voice {
                 (facts.disk.protected, facts.disk.since) = (protected, Instant::now());
             }
         });
-        *said = unprotected;
+        *reported = unprotected;
     }
 }
 

@@ -27,7 +27,7 @@ impl Rescues {
 
     /// Keeps the present state, which a new master now holds, as the state after rescue `number`. The file is written
     /// in parallel with traffic.
-    pub(crate) fn keep(&self, number: u64, now: Instant) {
+    pub(crate) fn keep_rescue(&self, number: u64, now: Instant) {
         let bytes_most = self.bytes_most;
         if bytes_most == 0 || self.limit.pass(now).is_none() {
             return;

@@ -107,7 +107,7 @@ impl StoreQueue {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn look(&self, store: &mut Store) {
+    fn note_state(&self, store: &mut Store) {
         let mut seen = self.seen();
         seen.seq = store.seq();
         seen.journal_bytes = store.journal_bytes();
@@ -211,7 +211,7 @@ impl Journal {
         let shared = Arc::clone(&self.shared);
         let job = move |store: &mut Store| {
             let result = work(store);
-            shared.look(store);
+            shared.note_state(store);
             // The receiver may have been dropped.
             let _ = done.send(result);
         };

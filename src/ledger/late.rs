@@ -55,35 +55,37 @@ pub(super) fn once(behind: &LateState, writes: &[Request]) -> Option<Vec<(Subjec
         heard.add(subject, ());
     }
     let mut master = behind.state.clone();
-    let mut told = Vec::new();
+    let mut notified = Vec::new();
     for write in writes {
         let mut tells = Tells::default();
         master.apply_telling(write, &mut tells);
-        if tells.shuts_down || tells.told.iter().any(|(subject, _)| heard.has(subject)) {
+        if tells.shuts_down || tells.notified.iter().any(|(subject, _)| heard.has(subject)) {
             return None;
         }
-        for (subject, _) in &tells.told {
+        for (subject, _) in &tells.notified {
             heard.add(subject, ());
         }
-        told.extend(tells.told);
+        notified.extend(tells.notified);
     }
-    Some(told)
+    Some(notified)
 }
 
 /// The topics and parameters of which one call notifies nodes, each with the number of these nodes.
 #[derive(Default)]
 struct Tells {
-    told: Vec<(Subject, usize)>,
+    notified: Vec<(Subject, usize)>,
     shuts_down: bool,
 }
 
 impl NoticeSink for Tells {
     fn publisher_update(&mut self, to: &[String], topic: &str, _: &[String]) {
-        self.told.push((Subject::Topic(topic.to_owned()), to.len()));
+        self.notified
+            .push((Subject::Topic(topic.to_owned()), to.len()));
     }
 
     fn param_update(&mut self, to: &[String], key: &str, _: &Value) {
-        self.told.push((Subject::Param(key.to_owned()), to.len()));
+        self.notified
+            .push((Subject::Param(key.to_owned()), to.len()));
     }
 
     fn shutdown(&mut self, _: &str, _: &str) {

@@ -63,7 +63,7 @@ impl Ledger {
             displaced,
         } = self.with_activity(|_, activity| {
             if telling == Telling::Twice {
-                activity.tell_again();
+                activity.notify_again();
             }
             activity.take_owed(outage)
         });

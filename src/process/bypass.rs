@@ -195,11 +195,11 @@ impl Bypass {
     }
 }
 
-/// The clients of the master at `place`: inode and user of each socket on this computer, except those in `own`, and the
+/// The clients of `master`: inode and user of each socket on this computer, except those in `own`, and the
 /// addresses of other computers.
 fn split(
     table: Vec<Socket>,
-    place: &MasterAddresses,
+    master: &MasterAddresses,
     own: &HashSet<u64>,
     is_own: impl Fn(IpAddr) -> bool,
 ) -> (HashMap<u64, u32>, HashSet<IpAddr>) {
@@ -212,11 +212,11 @@ fn split(
         ..
     } in table
     {
-        if remote.port() == place.port && place.is_at(remote) {
+        if remote.port() == master.port && master.is_at(remote) {
             if !own.contains(&inode) {
                 clients.insert(inode, user);
             }
-        } else if local.port() == place.port && place.is_at(local) && !is_own(remote.ip()) {
+        } else if local.port() == master.port && master.is_at(local) && !is_own(remote.ip()) {
             hosts.insert(remote.ip());
         }
     }

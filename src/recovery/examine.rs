@@ -84,7 +84,7 @@ pub(crate) struct Examination {
     /// Differences that remain after the last repair.
     pub mismatches: Vec<String>,
     /// Time it took to read the master.
-    pub look: Duration,
+    pub inspection: Duration,
     /// Time the injection took.
     pub injection: Duration,
 }
@@ -262,7 +262,7 @@ impl Examiner {
             counts: Counts::default(),
             skipped: Vec::new(),
             mismatches: Vec::new(),
-            look: master.now() - start,
+            inspection: master.now() - start,
             injection: Duration::ZERO,
         };
         if resumed {
@@ -287,7 +287,7 @@ impl Examiner {
             self.ledger.set_old(Master::shows_old(&reply));
         }
         self.ledger.set_python(master.python());
-        examination.injection = (master.now() - start).saturating_sub(examination.look);
+        examination.injection = (master.now() - start).saturating_sub(examination.inspection);
         examination.counts = self.ledger.with_mirror(Master::counts);
         Ok(examination)
     }
@@ -355,7 +355,7 @@ impl Examiner {
         };
         self.remove_dead_rosout(master, may_be_roscores, bears, &found)
             .await;
-        examination.look = master.now() - start;
+        examination.inspection = master.now() - start;
         // From here until the gate opens the mirror must not change, because the master is compared
         // with the mirror.
         self.gate.set(State::Injecting);
@@ -383,9 +383,9 @@ impl Examiner {
             Treatment::Reconcile(Authority::PendingWrites) => RecoveryOutcome::Reconciled,
             Treatment::Reconcile(Authority::Mirror) => RecoveryOutcome::Injected,
         };
-        let say_difference = |difference: &[String]| match manner.known {
-            KnownMaster::Nothing => say_older(difference),
-            _ => say_difference(difference),
+        let report = |difference: &[String]| match manner.known {
+            KnownMaster::Nothing => log_newer_master(difference),
+            _ => log_difference(difference),
         };
         let (state, change) = match treatment {
             Treatment::Begin | Treatment::TakeOver | Treatment::Inject => {
@@ -405,7 +405,7 @@ impl Examiner {
                     (state, Change::Replace(before))
                 } else if pending.is_empty() {
                     self.ledger.delivered();
-                    say_difference(&self.ledger.adopt(found));
+                    report(&self.ledger.adopt(found));
                     return Ok(());
                 } else {
                     // Without a new token, a start with an older copy of the checkpoint would treat the writes as
@@ -415,7 +415,7 @@ impl Examiner {
             }
         };
         if state != mirror {
-            say_difference(&self.ledger.adopt(state.clone()));
+            report(&self.ledger.adopt(state.clone()));
         }
         if bears == TokenState::Nothing {
             // This master has no token of ours, so the previous master is gone and sends no more notifications. A
@@ -573,7 +573,7 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Deviation>, Examine
 }
 
 /// Logs the differences between the master and the mirror.
-fn say_difference(difference: &[String]) {
+fn log_difference(difference: &[String]) {
     if !difference.is_empty() {
         rarely!(
             warn,
@@ -584,7 +584,7 @@ fn say_difference(difference: &[String]) {
 }
 
 /// Logs the differences between a living master and the checkpoint.
-fn say_older(difference: &[String]) {
+fn log_newer_master(difference: &[String]) {
     if !difference.is_empty() {
         rarely!(
             warn,

@@ -52,7 +52,7 @@ impl ReportRecord {
 
 /// Writes a report next to the checkpoint at `checkpoint`, in another thread. The file is not
 /// synced.
-pub(super) fn keep(checkpoint: PathBuf, kept: ReportRecord) {
+pub(super) fn save(checkpoint: PathBuf, kept: ReportRecord) {
     if LIMIT.pass(Instant::now()).is_none() {
         return;
     }

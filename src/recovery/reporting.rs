@@ -84,7 +84,7 @@ impl Outage {
             master_speaks: speaks,
             phases: Phases {
                 absence_ms: ms(absence),
-                inspection_ms: ms(examination.look),
+                inspection_ms: ms(examination.inspection),
                 injection_ms: ms(examination.injection),
                 total_ms: ms(total),
             },
@@ -143,7 +143,7 @@ impl Driver {
         let works = store.filter(|store| store.unprotected.is_none() && report.is_rescue());
         let checkpoint = works.map(|store| store.path);
         if let (Some(checkpoint), RecoveryOutcome::Resumed) = (&checkpoint, report.outcome) {
-            report_file::keep(
+            report_file::save(
                 checkpoint.clone(),
                 ReportRecord::new(&self.board, &session, report.clone()),
             );
@@ -165,7 +165,7 @@ impl Driver {
                 if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
                     report.log_check();
                     if let Some(checkpoint) = checkpoint {
-                        report_file::keep(checkpoint, ReportRecord::new(&board, &session, report));
+                        report_file::save(checkpoint, ReportRecord::new(&board, &session, report));
                     }
                 }
             };
@@ -191,7 +191,7 @@ impl Driver {
     /// Logs a warning. Repeats the same text only after growing pauses.
     pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
-        let pause = match &self.said {
+        let pause = match &self.last_message {
             Some(said) if said.text == text && now < said.next => return,
             Some(said) if said.text == text => (said.pause * 2).min(LONGEST_REPEAT),
             _ => REPEAT,
@@ -199,6 +199,6 @@ impl Driver {
         tracing::warn!("{text}");
         AWAY.note_reported();
         let next = now + pause;
-        self.said = Some(LastMessage { text, pause, next });
+        self.last_message = Some(LastMessage { text, pause, next });
     }
 }

@@ -24,7 +24,7 @@ const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits(
 /// # Errors
 ///
 /// If the process is gone, or if the kernel cannot watch threads.
-pub(super) fn of(pid: i32) -> io::Result<impl Future<Output = ()> + Send + use<>> {
+pub(super) fn watch(pid: i32) -> io::Result<impl Future<Output = ()> + Send + use<>> {
     // Threads are listed in the order in which they were started.
     let threads = fs::read_dir(format!("/proc/{pid}/task"))?;
     let others = threads.skip(1).take(WATCHED).map(|entry| {
@@ -74,7 +74,7 @@ time.sleep(3600)
     #[tokio::test]
     async fn the_end_of_a_thread_is_reported() {
         if !is_possible() {
-            assert!(of(std::process::id().try_into().unwrap()).is_err());
+            assert!(watch(std::process::id().try_into().unwrap()).is_err());
             return;
         }
         for kill in [false, true] {
@@ -85,7 +85,7 @@ time.sleep(3600)
                 .spawn()
                 .unwrap();
             io::Read::read_exact(child.stdout.as_mut().unwrap(), &mut [0]).unwrap();
-            let mut end = Box::pin(of(child.id().try_into().unwrap()).unwrap());
+            let mut end = Box::pin(watch(child.id().try_into().unwrap()).unwrap());
             let early = tokio::time::timeout(Duration::from_millis(50), &mut end).await;
             assert!(early.is_err(), "nothing has ended");
             if kill {
@@ -103,6 +103,6 @@ time.sleep(3600)
 
     #[tokio::test]
     async fn a_process_that_is_gone_is_not_watched() {
-        assert!(of(i32::MAX).is_err());
+        assert!(watch(i32::MAX).is_err());
     }
 }

@@ -768,7 +768,7 @@ impl Dispatcher {
             let any = !items.is_empty();
             let items: Vec<_> = items
                 .into_iter()
-                .filter_map(|item| merge::judged(&ledger, item))
+                .filter_map(|item| merge::leave_out_conflicts(&ledger, item))
                 .collect();
             // If all these calls were answered without the master, the next ones are taken.
             if !any || !items.is_empty() {
@@ -979,7 +979,7 @@ impl Dispatcher {
                 item.reply(CallAnswer::Close);
                 continue;
             }
-            let Some(item) = merge::judged(&ledger, item) else {
+            let Some(item) = merge::leave_out_conflicts(&ledger, item) else {
                 continue;
             };
             if let Some(item) = answers.add(&ledger, now, item) {

@@ -134,7 +134,7 @@ impl Drain {
             Action::Disconnect => (self.in_flight, self.connection) = (None, None),
             Action::Answer(answers) => self.answer(answers),
             Action::Report(report) => match report {
-                Report::Lost => self.signals.lost.notify_one(),
+                Report::Lost => self.signals.batch_lost.notify_one(),
                 Report::Late => self.signals.is_late.notify_one(),
                 Report::LateAnswered => self.signals.has_answered.notify_one(),
                 Report::Slow => self.signals.slow.notify_one(),

@@ -24,9 +24,9 @@ use crate::{ledger::Ledger, upstream::Head};
 
 /// Whether each write of an item conflicts with changes by other computers, as decided last.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Judged(Arc<Mutex<Option<Vec<MergeVerdict>>>>);
+pub(super) struct Verdicts(Arc<Mutex<Option<Vec<MergeVerdict>>>>);
 
-impl Judged {
+impl Verdicts {
     fn set(&self, verdicts: Option<Vec<MergeVerdict>>) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = verdicts;
     }
@@ -44,7 +44,7 @@ impl Judged {
 #[derive(Debug)]
 pub(crate) struct Merge {
     ask: Ask,
-    judged: Judged,
+    judged: Verdicts,
 }
 
 /// Makes an item for the write queue. `origin` is the computer that was cut off. Also returns the receiver of its answer, and a handle that shows which of its
@@ -52,8 +52,8 @@ pub(crate) struct Merge {
 pub(super) fn item(
     ask: Ask,
     origin: Origin,
-) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Judged) {
-    let judged = Judged::default();
+) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Verdicts) {
+    let judged = Verdicts::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
     item.source = Source::Merge(ask.id.clone());
     item.origin = origin;
@@ -76,7 +76,7 @@ fn set_call(item: &mut Item, call: Request) {
 
 /// Leaves out writes that conflict with changes by other computers. If no write remains, answers the item and returns
 /// `None`.
-pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
+pub(super) fn leave_out_conflicts(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);
     };

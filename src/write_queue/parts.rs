@@ -22,7 +22,7 @@ impl Parts {
         let call = call.take_if(|call| {
             let entries = call.entries();
             (entries.len() > ENTRIES_WHOLE || entries.len() > 1 && bytes > BYTES_MAX)
-                && entries.iter().all(stands_alone)
+                && entries.iter().all(is_independent)
         })?;
         Some(Self(call.into_entries().into_iter().peekable()))
     }
@@ -48,7 +48,7 @@ impl Iterator for Parts {
 /// Whether the entry's result is independent of other entries. A malformed entry, or a parameter's value that the
 /// master cannot return, turns the whole multicall into a fault. A dict among the results also shows the writes of
 /// later entries.
-fn stands_alone(entry: &Entry) -> bool {
+fn is_independent(entry: &Entry) -> bool {
     let Entry::Request(call) = entry else {
         return false;
     };

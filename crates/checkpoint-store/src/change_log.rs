@@ -80,11 +80,11 @@ impl<S: Storage> LogKeeper<S> {
     }
 
     /// Adds the records of the generation at `path` that the log lacks. A failure leaves them out.
-    pub(super) fn keep(&mut self, storage: &S, names: &Names, path: &Path) {
+    pub(super) fn archive(&mut self, storage: &S, names: &Names, path: &Path) {
         if self.bytes_max == 0 {
             return;
         }
-        if let Err(error) = self.try_keep(storage, names, path)
+        if let Err(error) = self.try_archive(storage, names, path)
             && error.kind() != io::ErrorKind::NotFound
         {
             self.part = None;
@@ -93,7 +93,7 @@ impl<S: Storage> LogKeeper<S> {
         }
     }
 
-    fn try_keep(&mut self, storage: &S, names: &Names, path: &Path) -> io::Result<()> {
+    fn try_archive(&mut self, storage: &S, names: &Names, path: &Path) -> io::Result<()> {
         let bytes = names.read(storage, path)?;
         let framed = format::scan(&bytes).map_err(io::Error::other)?;
         let Some(header) = framed.header else {

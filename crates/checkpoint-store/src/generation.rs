@@ -117,7 +117,7 @@ impl<S: Storage> CompactionPlan<S> {
             }
             other => other,
         }?;
-        super::change_log::locked(&self.log).keep(storage, names, &names.previous());
+        super::change_log::locked(&self.log).archive(storage, names, &names.previous());
         let wanted = self.ticket.lock();
         if !*wanted {
             return Err(names.superseded());
@@ -376,7 +376,7 @@ impl<S: Storage> Store<S> {
 }
 
 impl PendingGeneration {
-    pub(super) fn keep(&mut self, body: &[u8]) {
+    pub(super) fn add(&mut self, body: &[u8]) {
         self.superseded |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
         if self.superseded {
             self.meanwhile = Vec::new();

@@ -54,7 +54,7 @@ impl<S: Storage> Store<S> {
             }
             let body = self.buffer.get(start..).unwrap_or_default();
             if let Some(pending) = &mut self.pending {
-                pending.keep(body);
+                pending.add(body);
             }
             if let Some(active) = &self.active
                 && !body.is_empty()
@@ -181,7 +181,7 @@ impl<S: Storage> Store<S> {
     /// nothing is being recorded, or if the status of the open file is already wrong, which stops recording.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
         let job = CheckJob::of(&self.place, self.active.as_mut()?);
-        job.map_err(|finding| self.lose(finding)).ok()
+        job.map_err(|finding| self.distrust(finding)).ok()
     }
 
     /// Notes the result of a check.
@@ -193,7 +193,7 @@ impl<S: Storage> Store<S> {
         let active = self.active.as_ref();
         let current = active.is_some_and(|active| active.generation == done.generation);
         match done.result {
-            Err(finding) if current => Err(self.lose(finding)),
+            Err(finding) if current => Err(self.distrust(finding)),
             // All is well, or the checked file has been replaced since.
             _ => Ok(()),
         }
@@ -214,7 +214,7 @@ impl<S: Storage> Store<S> {
         self.latch(StoreError::Changed { path, change })
     }
 
-    fn lose(&mut self, finding: Finding) -> StoreError {
+    fn distrust(&mut self, finding: Finding) -> StoreError {
         match finding {
             Finding::Changed(change) => self.changed(change),
             Finding::Io(error) => self.latch(failed("check", &self.place.names.path)(error)),

@@ -273,7 +273,7 @@ impl<S: Storage> Store<S> {
         self.overtake();
         let (storage, names) = (&self.place.storage, &self.place.names);
         for path in [names.previous(), names.path.clone()] {
-            change_log::locked(&self.log).keep(storage, names, &path);
+            change_log::locked(&self.log).archive(storage, names, &path);
         }
         self.unprotected = Some("its file has been set aside".to_owned());
         self.place.set_aside(reason)

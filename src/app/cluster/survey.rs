@@ -26,7 +26,7 @@ pub(super) async fn try_endpoints(replica: Replica) {
 }
 
 /// Warns if `robot`, a name without keys in etcd, may be a typo of another robot's name.
-pub(super) async fn look_for_typo(replica: Replica, robot: String) {
+pub(super) async fn warn_of_typo(replica: Replica, robot: String) {
     // By now etcd may have keys of this robot.
     if let Ok(mut robots) = replica.client.robots(LIMIT).await {
         robots.retain(|other| *other != robot);

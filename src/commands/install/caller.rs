@@ -52,10 +52,10 @@ fn own_name() -> Result<String, CommandFailure> {
 /// The user that runs the service. `None` for a user's own service. A dry run needs no sudo.
 pub(super) fn account(
     args: &InstallArgs,
-    place: &UnitPaths,
+    paths: &UnitPaths,
     caller: &BTreeMap<String, String>,
 ) -> Result<Option<String>, CommandFailure> {
-    if place.user {
+    if paths.user {
         return Ok(None);
     }
     let Some(user) = named_user(args, caller) else {

@@ -116,7 +116,7 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     let (mut connection, _) = served.listener.accept().await.unwrap();
     connection.read_u8().await.unwrap();
     drop(connection);
-    served.queue.lost().await;
+    served.queue.batch_lost().await;
 
     let ledger = &served.ledger;
     let topic = Subject::Topic("/t".to_owned());

@@ -15,8 +15,8 @@ impl Master {
         let watched = self.params.take_watched();
         let mut result = result?;
         for (at, value) in watched {
-            if let Some(place) = place(&mut result, &at) {
-                *place = value;
+            if let Some(element) = element_at(&mut result, &at) {
+                *element = value;
             }
         }
         Ok(result)
@@ -100,7 +100,7 @@ impl Master {
     }
 }
 
-fn place<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
+fn element_at<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
     at.iter().try_fold(value, |value, index| match value {
         Value::Array(elements) => elements.get_mut(*index),
         _ => None,

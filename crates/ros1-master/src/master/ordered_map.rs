@@ -10,7 +10,7 @@ use std::{
 
 use hashbrown::HashTable;
 
-/// Number of places in a chunk.
+/// Number of slots in a chunk.
 const CHUNK: usize = 128;
 /// Number of keys per shard from which the index gets more shards.
 const SHARD_MAX: usize = 256;
@@ -25,14 +25,14 @@ static HASHER: LazyLock<RandomState> = LazyLock::new(RandomState::new);
 pub struct OrderedMap<V>(Arc<Inner<V>>);
 
 struct Inner<V> {
-    /// The entries in their order. All chunks but the last one have [`CHUNK`] places.
+    /// The entries in their order. All chunks but the last one have [`CHUNK`] slots.
     chunks: Vec<Arc<Chunk<V>>>,
     /// Where each key is, in shards by the key's hash. The number of shards is a power of four.
-    shards: Vec<Arc<HashTable<Place>>>,
+    shards: Vec<Arc<HashTable<Slot>>>,
     len: usize,
 }
 
-/// Places for entries. A removed entry leaves its place empty.
+/// Slots for entries. A removed entry leaves its slot empty.
 type Chunk<V> = Vec<Option<Arc<Entry<V>>>>;
 
 #[derive(Clone, PartialEq, Eq)]
@@ -42,9 +42,9 @@ struct Entry<V> {
 }
 
 #[derive(Clone, Copy)]
-struct Place {
+struct Slot {
     hash: u64,
-    /// The place's number, counted through all chunks.
+    /// The slot's number, counted through all chunks.
     number: u32,
 }
 
@@ -58,17 +58,17 @@ impl<V> OrderedMap<V> {
     }
 
     pub fn get(&self, key: &str) -> Option<&V> {
-        let entry = self.0.entry(self.0.place(key)?.number)?;
+        let entry = self.0.entry(self.0.slot(key)?.number)?;
         Some(&entry.value)
     }
 
     pub fn contains_key(&self, key: &str) -> bool {
-        self.0.place(key).is_some()
+        self.0.slot(key).is_some()
     }
 
     /// The key as the map holds it, with its value.
     pub fn get_key_value(&self, key: &str) -> Option<(&String, &V)> {
-        let entry = self.0.entry(self.0.place(key)?.number)?;
+        let entry = self.0.entry(self.0.slot(key)?.number)?;
         Some((&entry.key, &entry.value))
     }
 
@@ -95,7 +95,7 @@ impl<V> OrderedMap<V> {
 impl<V: Clone> OrderedMap<V> {
     /// The value of `key`, to be changed.
     pub fn get_mut(&mut self, key: &str) -> Option<&mut V> {
-        let number = self.0.place(key)?.number;
+        let number = self.0.slot(key)?.number;
         Arc::make_mut(&mut self.0).value_mut(number)
     }
 
@@ -121,18 +121,18 @@ impl<V: Clone> OrderedMap<V> {
 
     /// Removes `key`. The others keep their order.
     pub fn remove(&mut self, key: &str) {
-        if let Some(place) = self.0.place(key) {
-            Arc::make_mut(&mut self.0).remove(place);
+        if let Some(slot) = self.0.slot(key) {
+            Arc::make_mut(&mut self.0).remove(slot);
         }
     }
 }
 
 impl<V> Inner<V> {
-    fn place(&self, key: &str) -> Option<Place> {
+    fn slot(&self, key: &str) -> Option<Slot> {
         let hash = HASHER.hash_one(key);
         let shard = self.shards.get(shard_of(hash, self.shards.len()))?;
-        let is_it = |place: &Place| {
-            place.hash == hash && self.entry(place.number).is_some_and(|it| it.key == key)
+        let is_it = |slot: &Slot| {
+            slot.hash == hash && self.entry(slot.number).is_some_and(|it| it.key == key)
         };
         shard.find(hash, is_it).copied()
     }
@@ -151,8 +151,8 @@ impl<V> Inner<V> {
         chunks.flat_map(|chunk| chunk.iter().flatten())
     }
 
-    /// Number of places, empty ones included.
-    fn places(&self) -> usize {
+    /// Number of slots, empty ones included.
+    fn slots(&self) -> usize {
         let full = self.chunks.len().saturating_sub(1) * CHUNK;
         full + self.chunks.last().map_or(0, |last| last.len())
     }
@@ -170,7 +170,7 @@ impl<V: Clone> Inner<V> {
     fn push(&mut self, entry: Arc<Entry<V>>) {
         let hash = HASHER.hash_one(&entry.key);
         // An entry needs more than a byte of memory, so there are never that many.
-        let number = u32::try_from(self.places()).unwrap_or(u32::MAX);
+        let number = u32::try_from(self.slots()).unwrap_or(u32::MAX);
         match self.chunks.last_mut().filter(|last| last.len() < CHUNK) {
             Some(last) => Arc::make_mut(last).push(Some(entry)),
             None => self.chunks.push(Arc::new(vec![Some(entry)])),
@@ -179,13 +179,13 @@ impl<V: Clone> Inner<V> {
         if self.len > self.shards.len() * SHARD_MAX {
             self.add_shards();
         }
-        self.index(Place { hash, number });
+        self.index(Slot { hash, number });
     }
 
-    fn index(&mut self, place: Place) {
+    fn index(&mut self, slot: Slot) {
         let count = self.shards.len();
-        if let Some(shard) = self.shards.get_mut(shard_of(place.hash, count)) {
-            Arc::make_mut(shard).insert_unique(place.hash, place, |place| place.hash);
+        if let Some(shard) = self.shards.get_mut(shard_of(slot.hash, count)) {
+            Arc::make_mut(shard).insert_unique(slot.hash, slot, |slot| slot.hash);
         }
     }
 
@@ -193,26 +193,26 @@ impl<V: Clone> Inner<V> {
         let count = (self.shards.len() * 4).max(1);
         let shards = vec![Arc::default(); count];
         for shard in std::mem::replace(&mut self.shards, shards) {
-            shard.iter().for_each(|place| self.index(*place));
+            shard.iter().for_each(|slot| self.index(*slot));
         }
     }
 
-    fn remove(&mut self, place: Place) {
+    fn remove(&mut self, slot: Slot) {
         let count = self.shards.len();
-        if let Some(shard) = self.shards.get_mut(shard_of(place.hash, count)) {
-            let is_it = |of: &Place| of.number == place.number;
-            if let Ok(found) = Arc::make_mut(shard).find_entry(place.hash, is_it) {
+        if let Some(shard) = self.shards.get_mut(shard_of(slot.hash, count)) {
+            let is_it = |of: &Slot| of.number == slot.number;
+            if let Ok(found) = Arc::make_mut(shard).find_entry(slot.hash, is_it) {
                 found.remove();
             }
         }
-        let number = place.number as usize;
+        let number = slot.number as usize;
         let chunk = self.chunks.get_mut(number / CHUNK);
         if let Some(slot) = chunk.and_then(|chunk| Arc::make_mut(chunk).get_mut(number % CHUNK)) {
             *slot = None;
         }
         self.len -= 1;
-        // Each removal has made one empty place, so this costs little on average.
-        if self.places() > 2 * self.len + CHUNK {
+        // Each removal has made one empty slot, so this costs little on average.
+        if self.slots() > 2 * self.len + CHUNK {
             let entries: Vec<_> = self.entries(0).cloned().collect();
             *self = Self::default();
             entries.into_iter().for_each(|entry| self.push(entry));
@@ -320,7 +320,7 @@ impl<V> Clone for OrderedMap<V> {
 impl<V: Eq> PartialEq for OrderedMap<V> {
     fn eq(&self, other: &Self) -> bool {
         let (a, b) = (&self.0.chunks, &other.0.chunks);
-        // Chunks or entries with equal pointers are equal. Chunks with other empty places may still hold the same.
+        // Chunks or entries with equal pointers are equal. Chunks with other empty slots may still hold the same.
         let is_same = |(a, b): &(&Arc<Chunk<V>>, &Arc<Chunk<V>>)| {
             Arc::ptr_eq(a, b) || a.iter().flatten().eq(b.iter().flatten())
         };
