@@ -318,7 +318,8 @@ impl Order {
     /// Queues, at the time `at`, a notification for the node at `port` with the state of `subject` at the time of
     /// sending.
     pub fn notify_of_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
-        self.repeats.last.insert((subject.clone(), port.to_owned()));
+        let thing = (subject.clone(), port.to_owned());
+        self.repeats.last.insert(thing, at);
         self.repeats.add(at, port.to_owned(), subject);
     }
 
@@ -365,12 +366,14 @@ impl Order {
             }
             let is_repeat = notification.is_repeat();
             let Some(call) = self.outbox.call(port, notification, mirror) else {
+                self.repeats.last.remove(&(subject, port.to_owned()));
                 continue;
             };
             if written && !is_repeat || sending_until.is_some() {
                 let again = now + REPEAT_AFTER;
                 self.repeats.add(again, port.to_owned(), subject.clone());
             }
+            self.repeats.sent(now, port, &subject);
             let recipient = Recipient {
                 port: port.to_owned(),
                 subject,
@@ -395,6 +398,11 @@ impl Order {
     /// Drops all waiting notifications for the node at `port`.
     pub fn drop_port(&mut self, port: &str) {
         self.outbox.remove(port);
+        let repeats = &mut self.repeats;
+        let planned = &repeats.at.at;
+        repeats
+            .last
+            .retain(|thing, _| thing.1 != port || planned.contains_key(thing));
     }
 
     /// Drops all waiting notifications. From now on another computer notifies nodes.
@@ -406,9 +414,7 @@ impl Order {
     /// Queues the notifications whose time has come: those that tell a state once more (see [`REPEAT_AFTER`]), and
     /// those of [`Self::notify_of_state_at`].
     pub fn queue_due_repeats(&mut self, now: Instant) {
-        while let Some((_, repeat)) = self.repeats.at.take_due(now) {
-            self.repeats.last.remove(&repeat);
-            let (subject, port) = repeat;
+        while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
             self.outbox.add(&port, subject, Payload::StateAgain);
         }
     }
@@ -523,7 +529,8 @@ impl MasterNotifications {
 struct Repeats {
     at: Schedule<(Subject, String)>,
     /// Those that come after older notifications of another sender, which nothing that the master sends makes needless.
-    last: BTreeSet<(Subject, String)>,
+    /// The node is told the state at or after this time.
+    last: BTreeMap<(Subject, String), Instant>,
     is_new: bool,
 }
 
@@ -531,6 +538,18 @@ impl Repeats {
     fn add(&mut self, at: Instant, port: String, subject: Subject) {
         self.is_new |= self.at.next().is_none_or(|next| at < next);
         self.at.set((subject, port), at);
+    }
+
+    /// Notes that the node at `port` is told the state of `subject` now.
+    fn sent(&mut self, now: Instant, port: &str, subject: &Subject) {
+        let thing = (subject.clone(), port.to_owned());
+        match self.last.get(&thing) {
+            Some(last) if now < *last && !self.at.at.contains_key(&thing) => {
+                self.add(*last, thing.1, thing.0);
+            }
+            Some(last) if now >= *last => drop(self.last.remove(&thing)),
+            _ => {}
+        }
     }
 
     /// Drops the planned notifications about `subject` for nodes at ports other than `kept`, or puts them off until the
@@ -542,7 +561,8 @@ impl Repeats {
         let others = about.filter(|((_, port), _)| !kept.contains(port.as_str()));
         let others: Vec<_> = others.map(|(thing, at)| (*at, thing.clone())).collect();
         for (at, thing) in others {
-            if self.last.contains(&thing) {
+            if let Some(last) = self.last.get_mut(&thing) {
+                *last = until.max(*last);
                 self.at.set(thing, at.max(until));
                 continue;
             }

@@ -430,3 +430,38 @@ fn a_state_that_must_come_last_is_told_after_newer_notifications_of_the_master()
     assert_eq!(order.next_repeat(), None);
     sent(order.next_notification(at + Duration::from_secs(1), A, &mirror));
 }
+
+/// A call in flight may make the master notify nodes, so ours is put off. But that call may change nothing.
+#[test]
+fn a_state_that_must_come_last_is_told_although_another_reason_had_put_it_off() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    let end = now + Duration::from_secs(1);
+    let idle = call("unregisterPublisher", &["/b", "/t", "http://b:1/"]);
+    let concern = Concern::of_call(Some(&idle));
+    order.calls_sent(concern.notified_subjects(), Vec::new());
+    order.notify_of_state(A, topic("/t"));
+    order.notify_of_state_at(end, A, topic("/t"));
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
+    // Put off once more while the call is still in flight.
+    let soon = now + REPEAT_AFTER;
+    order.queue_due_repeats(soon);
+    assert_eq!(
+        order.next_notification(soon, A, &mirror),
+        NextNotification::Idle
+    );
+    order.calls_settled();
+    order.master_notifies(soon, &topic("/t"), 1);
+    let mut told = 0;
+    while let Some(at) = order.next_repeat() {
+        order.queue_due_repeats(at);
+        if let NextNotification::Send { number, .. } = order.next_notification(at, A, &mirror) {
+            order.notification_taken(number);
+            told += usize::from(at >= end);
+        }
+    }
+    assert_eq!(told, 1);
+}
