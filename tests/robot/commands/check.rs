@@ -92,7 +92,9 @@ fn a_computer_in_order_has_no_problem() {
     let said = words.stdout();
     let port = format!("ok       port            {port} is free");
     assert!(said.contains(&port), "{said:?}");
-    assert!(said.last().unwrap().starts_with("0 problems, "), "{said:?}");
+    let last = said.last().unwrap();
+    let warns = last.starts_with("0 problems, ");
+    assert!(warns || last == "No problems found.", "{said:?}");
 }
 
 #[test]
