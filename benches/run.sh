@@ -1,6 +1,6 @@
 #!/bin/sh
 # Measures every table of docs/benchmarks.md on this computer and writes them, with the present commit in each caption.
-# The build alone takes more than eight minutes on two cores. Nothing else should run meanwhile.
+# Takes twenty minutes on two cores, five of them for the build. Nothing else should run meanwhile.
 set -eu
 cd "$(dirname "$0")/.."
 
