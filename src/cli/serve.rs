@@ -249,7 +249,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub max_body: u64,
-    /// The parameters whose values the status page hides.
+    /// The parameters whose values are hidden, on pages and in logs.
     #[command(flatten)]
     pub hide: HideArgs,
     /// Run without the guardian process, which keeps the port open and restarts rosrescue. With a systemd socket

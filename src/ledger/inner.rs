@@ -347,7 +347,8 @@ impl Inner {
         self.session_unwritten = true;
     }
 
-    /// Passes `entries` to the other computers. `sources` are their origins; missing ones stand for this computer.
+    /// Queues `entries` for the other computers. `sources` says for each of the first entries where it came from; the rest
+    /// came from this computer.
     pub(super) fn share(&mut self, entries: &[RecordContent], sources: &[&Source]) {
         let Shared::Here { sharing, .. } = &mut self.shared else {
             return;

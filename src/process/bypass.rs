@@ -124,7 +124,7 @@ impl MasterAddresses {
     }
 }
 
-/// The clients that bypass this rosrescue.
+/// Which clients call the master directly, past this rosrescue.
 #[derive(Debug, Default)]
 pub(crate) struct Bypass {
     /// When each client's last connection was seen.

@@ -64,7 +64,8 @@ impl Outage {
         self.port_open = Some(now);
     }
 
-    /// The report of an outage that ends at `now` with this `examination`.
+    /// The report of an outage that ends at `now` with this `examination`. `speaks` names the master's versions of HTTP and
+    /// Python.
     pub(super) fn report(&self, now: Instant, examination: Examination, speaks: String) -> Report {
         let total = now.duration_since(self.since);
         let absence = self

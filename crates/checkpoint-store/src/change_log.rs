@@ -183,7 +183,8 @@ impl<S: Storage> LogKeeper<S> {
 }
 
 impl<S: Storage> OpenPart<S> {
-    /// Adds the records after the last one, up to the first gap, or until the part is full.
+    /// Adds those records of `framed` that follow the last record of this part of the log, up to the first gap in their
+    /// numbers, or until the part is full.
     fn add(mut self, storage: &S, framed: &Framed<'_>) -> io::Result<Self> {
         let mut lines = Vec::new();
         let mut last = self.last;

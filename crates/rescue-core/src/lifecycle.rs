@@ -67,7 +67,7 @@ enum Timer {
 struct TakenPorts {
     /// Number of consecutive ones.
     count: usize,
-    /// Whether the last one still runs.
+    /// Whether the last of these masters still runs.
     last_runs: bool,
 }
 

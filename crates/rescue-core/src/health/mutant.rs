@@ -1,6 +1,6 @@
 //! Wrong rules about dead nodes. A test puts each of them in, and the simulation must find it.
 
-/// A wrong rule.
+/// A rule about deaths that a test breaks on purpose. The simulation must notice each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum WrongRule {
     /// A node is dead when its socket is closed, whether or not its process runs.

@@ -78,7 +78,7 @@ pub enum Input {
     Spawned,
     /// No master could be spawned.
     SpawnFailed {
-        /// Whether the mirror has answered writes that no master has run yet.
+        /// Whether there are pending writes: answered by the mirror, and not yet run by the present master.
         pending: bool,
     },
     /// The spawned master has ended.

@@ -271,6 +271,7 @@ impl Params {
 }
 
 /// The namespace `name` in `members`, created if needed. Replaces a value that is not a namespace.
+/// Always `Some`, although the type of a value does not show that.
 fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> {
     let value = members.entry(name.to_owned()).or_insert(Value::Nil);
     if !matches!(value, Value::Struct(_)) {

@@ -207,7 +207,7 @@ impl Master {
         }
     }
 
-    /// Notes for each node that `known` has at the same address where that one has registered from. For a state that was
+    /// Takes from `known` where each node has registered from, if it has the same address in both. For a state that was
     /// read from a master.
     pub fn keep_origins(&mut self, known: &Self) {
         for (caller_id, known) in &known.registry.nodes {

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{commands::counted, status::summary::shortened};
 
-/// Subject of findings about other computers of the robot.
+/// Subject of findings about how this computer reaches others.
 const NETWORK: &str = "network";
 
 impl Findings {

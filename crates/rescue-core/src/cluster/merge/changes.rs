@@ -128,7 +128,8 @@ impl Changes {
         }
     }
 
-    /// Whether the node that made `call` has replaced it: another computer had forwarded the call.
+    /// Whether `call`, which was answered for a node of another computer, is no longer needed: the same node has set the
+    /// same parameter, or one above it, since.
     pub(super) fn has_replaced(&self, call: &Request) -> bool {
         let (Some(path), Some(node)) = (param_of(call), call.caller()) else {
             return false;
