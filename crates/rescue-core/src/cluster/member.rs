@@ -54,7 +54,7 @@ pub use self::{
     chores::PUBLISH_EVERY,
     probes::PROBES,
     types::{
-        Action, Cause, ForwardedWrites, Holds, Input, LocalCheckpoint, MemberEntry,
+        Action, Cause, ForwardedWrites, Holdings, Input, LocalCheckpoint, MemberEntry,
         MemberEntryChange, News, Read, WatchedEntry,
     },
 };
@@ -116,13 +116,13 @@ pub struct Member {
     keys: Keys,
     machine: Machine,
     published: LastPublished,
-    own: LocalCheckpoint,
+    local: LocalCheckpoint,
     data_loss: DataLoss,
     journal: Journal,
     reading: Reading,
     position: JournalPosition,
     /// How much of a journal the ledger's state holds, even if etcd has lost that journal.
-    held: Holds,
+    held: Holdings,
     outgoing: Outgoing,
     cut_off: CutOff,
     merging: Merging,
@@ -149,19 +149,19 @@ impl Member {
     pub fn new(
         settings: Settings,
         keys: Keys,
-        own: LocalCheckpoint,
+        local: LocalCheckpoint,
         mut cut_off: CutOff,
         id: String,
     ) -> Self {
-        let known = own.restored;
-        let held = Holds {
-            journal_number: own.journal_number,
-            term: own.term,
-            seq: own.seq,
+        let known = local.restored;
+        let held = Holdings {
+            journal_number: local.journal_number,
+            term: local.term,
+            seq: local.seq,
         };
         let mut machine = Machine::new(settings);
-        machine.note_journal(own.journal_number);
-        cut_off.note_seen(&own.state);
+        machine.note_journal(local.journal_number);
+        cut_off.note_seen(&local.state);
         Self {
             keys,
             machine,
@@ -170,7 +170,7 @@ impl Member {
                 standing: Standing::Nobody { known },
                 has_master: false,
             },
-            own,
+            local,
             data_loss: DataLoss::default(),
             journal: Journal::default(),
             reading: Reading::default(),
@@ -304,7 +304,7 @@ impl Member {
 
     /// The number of writes that are not in etcd yet.
     pub fn uncommitted(&self) -> usize {
-        match self.keeps() {
+        match self.keeps_writes() {
             true => self.cut_off.len(),
             false => self.outgoing.count(),
         }
@@ -383,12 +383,12 @@ impl Member {
 
     /// Whether the mirror may answer: its state is that of the session which continues.
     fn knows(&self) -> bool {
-        self.own.restored
+        self.local.restored
             || self.reading.loaded && self.machine.session() == machine::JournalSession::GoesOn
     }
 
     /// Whether writes answered now are kept for a later leader.
-    fn keeps(&self) -> bool {
+    fn keeps_writes(&self) -> bool {
         self.published.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 

@@ -20,7 +20,7 @@ impl Member {
         self.end_master();
         let base = match led || self.follows() {
             true => &self.journal.state,
-            false => &self.own.state,
+            false => &self.local.state,
         };
         // The nodes continue from what they wrote in earlier periods of being cut off.
         let base = self.cut_off.on(base);
@@ -31,7 +31,7 @@ impl Member {
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
-            self.keep(kept);
+            self.store_writes(kept);
             self.serve_alone();
         } else {
             // The standing changes first, so that no more calls are forwarded.
@@ -81,14 +81,14 @@ impl Member {
             self.cut_off.begin(base);
         }
         if first {
-            self.keep_all();
+            self.store_all_writes();
         }
     }
 
     /// Keeps the writes after record `committed` up to `acknowledged`: they were answered but are not in the journal.
     pub(super) fn give_back(&mut self, committed: u64, acknowledged: u64) {
         let changes = self.outgoing.take_all();
-        if self.keeps() {
+        if self.keeps_writes() {
             return;
         }
         let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
@@ -97,12 +97,12 @@ impl Member {
             let base = self.journal.state.clone();
             self.begin_cut_off(base);
             let kept = self.cut_off.add(answered, true);
-            self.keep(kept);
+            self.store_writes(kept);
         }
     }
 
     /// Stores exactly the writes that a leader must still get.
-    pub(super) fn keep_all(&mut self) {
+    pub(super) fn store_all_writes(&mut self) {
         let kept = self
             .partition_writes()
             .map(|(base, calls)| (base.clone(), calls));
@@ -112,7 +112,7 @@ impl Member {
         });
     }
 
-    pub(super) fn keep(&mut self, calls: Vec<Request>) {
+    pub(super) fn store_writes(&mut self, calls: Vec<Request>) {
         if !calls.is_empty() {
             self.act(Action::AddPartitionWrites(calls));
         }

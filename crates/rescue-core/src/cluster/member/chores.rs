@@ -71,7 +71,7 @@ impl Member {
             let leads = self.machine.role() == Role::Leading;
             if !leads || self.journal.progress.seq >= seq {
                 self.chores.kept_until = None;
-                self.keep_all();
+                self.store_all_writes();
             }
         }
         let term = self.machine.term();

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Action, Holds, Member, MemberEntry, MemberEntryChange, News};
+use super::{Action, Holdings, Member, MemberEntry, MemberEntryChange, News};
 use crate::cluster::{
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
@@ -26,7 +26,7 @@ struct Loss {
     /// When this computer noticed the loss.
     since: Instant,
     /// How much of the lost journal this computer holds.
-    holds: Holds,
+    holds: Holdings,
     /// The origin that etcd showed when the loss was noticed.
     origin: u64,
     /// The keys as etcd showed them then. A living leader changes them. `None` if they are of a later journal than the lost
@@ -39,7 +39,7 @@ struct Loss {
 pub(super) struct DataLoss {
     present: Option<Loss>,
     /// How much of the lost journal the other computers hold, by their names.
-    others: BTreeMap<String, Holds>,
+    others: BTreeMap<String, Holdings>,
     /// Whether another computer is known to hold more of the lost journal.
     is_second: bool,
     /// How often etcd has lost data.
@@ -51,7 +51,7 @@ pub(super) struct DataLoss {
 }
 
 impl DataLoss {
-    pub(super) fn holds(&self) -> Option<Holds> {
+    pub(super) fn holds(&self) -> Option<Holdings> {
         self.present.map(|loss| loss.holds)
     }
 
@@ -146,7 +146,7 @@ impl Member {
         // The term in a checkpoint is a revision of etcd, too.
         let known = match self.reading.loaded {
             true => 0,
-            false => self.own.term,
+            false => self.local.term,
         };
         let floor = before.revision.max(known);
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
@@ -162,7 +162,7 @@ impl Member {
             let is_unreadable = !is_readable && self.machine.role() == Role::CatchingUp;
             return older || is_lost_again && !trusts() || is_unreadable;
         }
-        let is_old = !self.reading.loaded && view.journal_number < self.own.journal_number;
+        let is_old = !self.reading.loaded && view.journal_number < self.local.journal_number;
         let is_old = is_old || view.term() < known;
         let torn = view.is_torn() || is_old || !is_readable || is_without_end;
         let torn = torn && !trusts();
@@ -201,7 +201,7 @@ impl Member {
         if std::mem::take(&mut self.reading.loaded) {
             // Before the new journal has the state, it holds nothing.
             if !journal.own_wins && journal.progress.seq > 0 {
-                (self.own.state, self.own.restored) = (journal.state, true);
+                (self.local.state, self.local.restored) = (journal.state, true);
             }
             // The mirror goes on answering. That of a process which has just started may be older than the new journal.
             self.position = JournalPosition {
@@ -210,7 +210,7 @@ impl Member {
             };
         }
         self.journal.own_wins = true;
-        (self.own.term, self.own.journal_number) = (0, 0);
+        (self.local.term, self.local.journal_number) = (0, 0);
         self.reading.load_by(now);
         let since = now;
         self.data_loss.present = Some(Loss {
@@ -253,7 +253,7 @@ impl Member {
         // Another computer may have lost a later journal, which this one has not seen.
         self.data_loss.is_second &= holds == before;
         let (leads, view) = (self.published.role == Role::Leading, self.view());
-        let shown = Holds {
+        let shown = Holdings {
             journal_number: view.journal_number,
             term: view.term(),
             seq: view.seq(),

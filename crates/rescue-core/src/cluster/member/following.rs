@@ -238,7 +238,7 @@ impl Member {
 
     /// Whether the checkpoint holds all of a journal that ends with the record `seq`.
     fn is_whole(&self, seq: u64) -> bool {
-        self.own.seq >= seq || Mutant::OwnDiskWins.lives()
+        self.local.seq >= seq || Mutant::OwnDiskWins.lives()
     }
 
     /// Applies new records of the journal.
@@ -347,7 +347,7 @@ impl Member {
             let before = std::mem::replace(&mut journal.state, state);
             // The first state of a new journal comes from the computer that held the most.
             let before = match journal.own_wins {
-                true => &self.own.state,
+                true => &self.local.state,
                 false => &before,
             };
             if !first {
@@ -397,7 +397,7 @@ impl Member {
     /// Whether `leader` is an earlier process of this computer, and still in the term of the checkpoint.
     fn was_self(&self, leader: &Leader) -> bool {
         let own = self.settings();
-        leader.id != own.id && leader.name == own.name && leader.term == self.own.term
+        leader.id != own.id && leader.name == own.name && leader.term == self.local.term
     }
 
     /// Handles what computers have written into their entries among the members.

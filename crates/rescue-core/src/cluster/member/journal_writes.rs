@@ -52,10 +52,10 @@ impl Member {
         }
         let is_alone = self.machine.role() == Role::Alone;
         let leads_on = self.machine.writes_journal();
-        if self.keeps() {
+        if self.keeps_writes() {
             let ours = changes.iter().filter(|of| is_ours(of));
             let kept = self.cut_off.add(ours, leads_on);
-            self.keep(kept);
+            self.store_writes(kept);
         }
         self.outgoing.add(changes);
         if !is_alone {

@@ -196,7 +196,7 @@ impl Member {
         if period.pending.len() > writes.len() {
             period.pending = writes.iter().collect();
             if !self.chores.keeps_file() {
-                self.keep_all();
+                self.store_all_writes();
             }
         }
     }
@@ -315,7 +315,7 @@ impl Member {
         self.cut_off.sent();
         self.chores.publish_entry_by(now);
         if !self.chores.keeps_file() {
-            self.keep_all();
+            self.store_all_writes();
         }
         self.adopt();
         if let (Role::Leading, Some(term)) = (self.published.role, self.machine.term()) {

@@ -46,12 +46,12 @@ impl Member {
                 self.chores.keep_until(if at_once { 0 } else { last });
             }
         }
-        self.keep_term(term);
+        self.store_term(term);
         self.publish_leading(term);
     }
 
     /// Has the checkpoint name the present term.
-    pub(super) fn keep_term(&mut self, term: u64) {
+    pub(super) fn store_term(&mut self, term: u64) {
         let journal_number = self.view().journal_number;
         let stored = (term, journal_number);
         if std::mem::replace(&mut self.before.term, stored) != stored {
@@ -125,7 +125,7 @@ impl Member {
             self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
         }
         // A computer that is cut off and serves has its own history.
-        let binds = !self.keeps();
+        let binds = !self.keeps_writes();
         self.act(Action::StopRecording { binds });
         let known = self.knows();
         self.publish_standing(Standing::Nobody { known });

@@ -1,6 +1,6 @@
 //! Publishes where this computer's calls go, and how current its mirror is.
 
-use super::{Action, Holds, Member};
+use super::{Action, Holdings, Member};
 use crate::cluster::{
     machine::Role,
     standing::{AnsweredCalls, JournalPosition, Standing},
@@ -58,7 +58,7 @@ impl Member {
         if let Some((_, term)) = self.leader()
             && term == self.held.term
         {
-            self.keep_term(term);
+            self.store_term(term);
         }
         let standing = match self.leader() {
             // Partition writes must be merged before new calls.
@@ -83,7 +83,7 @@ impl Member {
         // If `differs`, the mirror is at no position of the journal: it holds records or kept writes that the journal
         // lacks.
         let lost = self.data_loss.since().is_some();
-        let differs = self.own.seq > seq || lost || !self.cut_off.is_empty();
+        let differs = self.local.seq > seq || lost || !self.cut_off.is_empty();
         if self.journal.own_wins && differs && !self.records() {
             return;
         }
@@ -104,7 +104,7 @@ impl Member {
             false => seq,
         };
         self.position = JournalPosition { epoch, term, seq };
-        self.held = Holds {
+        self.held = Holdings {
             journal_number,
             term,
             seq,

@@ -52,7 +52,7 @@ pub struct MemberEntry {
     /// See [`Settings::boot`].
     pub boot: String,
     /// Set while etcd has lost its data: the position in the lost journal up to which this computer holds the state.
-    pub holds: Option<Holds>,
+    pub holds: Option<Holdings>,
     /// The origin of a journal that this computer could not read from its beginning, or 0. Its leader checks that.
     pub unreadable: u64,
     /// Changes when this process stops notifying nodes, because it no longer leads or is no longer cut off, and with
@@ -64,7 +64,7 @@ pub struct MemberEntry {
 
 /// A position in a journal that etcd has lost: the journal's number, its leader's term and a record number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct Holds {
+pub struct Holdings {
     #[serde(default)]
     pub journal_number: u64,
     pub term: u64,
@@ -242,7 +242,7 @@ pub enum News {
     EtcdLost,
     /// The master was killed, because another computer may lead.
     Lapsed,
-    /// The start waits until `until`, because the computer at `uri` may have this name.
+    /// The start waits until `until`, because the computer at `uri` may have the same name.
     Suspect {
         uri: String,
         until: Instant,
