@@ -12,7 +12,7 @@ use crate::{
     config::{Config, MasterConfig},
     gate::State,
     guardian::handover::Sockets,
-    ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
+    ledger::{Ledger, checkpointer::Checkpointer, disk_jobs::DISK_PATIENCE},
     nodes,
     process::{ProcessError, Rosmaster, bypass},
     recovery::{Driver, course::Step, master_process::MasterProcess},

@@ -9,11 +9,11 @@ pub(crate) mod activity;
 mod answers;
 pub(crate) mod checkpointer;
 pub(crate) mod delivery;
+pub(crate) mod disk_jobs;
 pub(crate) mod durability;
 pub(crate) mod first;
 pub(crate) mod history;
 mod inner;
-pub(crate) mod journal;
 pub(crate) mod late;
 pub(crate) mod mutant;
 pub(crate) mod owed;
@@ -291,7 +291,7 @@ impl Ledger {
             && !inner.doubted
             && matches!(inner.shared, Shared::Nobody)
             && inner.journal.is_some()
-            && Write::of(call).is_some_and(|write| inner.mirror.accepts(&write));
+            && Write::parse(call).is_some_and(|write| inner.mirror.accepts(&write));
         if !is_certain {
             return;
         }
@@ -409,7 +409,7 @@ impl Ledger {
         inner.shared = Shared::Elsewhere;
         inner.order.forget_notifications();
         drop(inner);
-        self.agreement.lost();
+        self.agreement.note_deposed();
         last.map(|last| last.seq)
     }
 

@@ -302,7 +302,7 @@ impl Activity {
     }
 
     fn note(&mut self, now: Instant, call: &Request) {
-        let Some(write) = Write::of(call) else {
+        let Some(write) = Write::parse(call) else {
             return;
         };
         let caller = write.caller;

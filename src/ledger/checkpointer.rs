@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{
     Ledger,
-    journal::{DISK_PATIENCE, StoreState},
+    disk_jobs::{DISK_PATIENCE, StoreState},
 };
 use crate::{
     cli::SyncPolicy,

@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 use super::{
     Ledger,
-    journal::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
+    disk_jobs::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
     shared::Agreed,
 };
 
@@ -133,7 +133,7 @@ impl Ledger {
         *self.attempted.borrow() >= version
     }
 
-    fn worker(&self) -> Option<Arc<journal::StoreQueue>> {
+    fn worker(&self) -> Option<Arc<disk_jobs::StoreQueue>> {
         self.lock().journal.as_ref().map(Journal::worker)
     }
 

@@ -56,7 +56,7 @@ impl Ledger {
         origin: Origin,
     ) -> Option<AnsweredFirst> {
         let mut inner = self.lock();
-        let write = Write::of(call)?;
+        let write = Write::parse(call)?;
         let heard = concern.recipients();
         let is_certain = !inner.injecting
             && !inner.doubted

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use checkpoint_store::history;
 
-use super::{Ledger, journal::StoreState};
+use super::{Ledger, disk_jobs::StoreState};
 use crate::limit::Limit;
 
 pub(crate) struct Rescues {

@@ -17,8 +17,8 @@ use tokio::sync::Notify;
 
 use super::{
     activity::{Activity, Noticed},
+    disk_jobs::Journal,
     durability::{Mark, Whole},
-    journal::Journal,
     late::LateState,
     mutant::Mutant,
     pending::{PendingWrites, TooMany},

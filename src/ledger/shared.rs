@@ -46,7 +46,7 @@ impl Agreement {
     }
 
     /// Notes that another computer has the master, so what was not agreed never will be.
-    pub(super) fn lost(&self) {
+    pub(super) fn note_deposed(&self) {
         self.0.send_modify(|agreed| {
             *agreed = Agreed {
                 times_led: agreed.times_led + 1,

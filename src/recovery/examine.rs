@@ -398,7 +398,7 @@ impl Examiner {
                 });
                 // A master does not tell which nodes subscribe to parameters.
                 let hidden = |call: &Request| {
-                    let write = Write::of(call);
+                    let write = Write::parse(call);
                     write.is_some_and(|write| write.target() == WriteTarget::ParamSubscriber)
                 };
                 if state != found || pending.iter().any(hidden) {

@@ -174,7 +174,7 @@ mod tests {
     use super::*;
     use crate::status::report::{Phases, RecoveryOutcome};
 
-    fn kept(session: &str, number: u64) -> ReportRecord {
+    fn record(session: &str, number: u64) -> ReportRecord {
         ReportRecord {
             session: session.to_owned(),
             rescues: number,
@@ -216,9 +216,9 @@ mod tests {
         // An earlier process died while it wrote a report.
         fs::write(folder.path().join("chkpt.yaml.report.new"), "rosre").unwrap();
         for number in 1..=25 {
-            write(&checkpoint, &kept("a", number)).unwrap();
+            write(&checkpoint, &record("a", number)).unwrap();
         }
-        let mut early = kept("a", 26);
+        let mut early = record("a", 26);
         early.report.detected_at = 0.0;
         write(&checkpoint, &early).unwrap();
         let mut names: Vec<_> = fs::read_dir(folder.path())
@@ -248,7 +248,7 @@ mod tests {
         let nothing = earlier(&checkpoint, "b", false, 0);
         assert_eq!((nothing.last_number, nothing.worker_restarts), (0, 0));
         for (session, number) in [("a", 1), ("b", 2), ("b", 3)] {
-            write(&checkpoint, &kept(session, number)).unwrap();
+            write(&checkpoint, &record(session, number)).unwrap();
         }
         // A report of an older version, and a damaged one.
         let other = |name: &str| folder.path().join(format!("chkpt.yaml.report-{name}.txt"));

@@ -429,7 +429,7 @@ impl Calls {
         incoming: Incoming,
         hold: &mut Hold,
     ) -> Result<HttpReply, Unanswered> {
-        if let Some(parts) = Parts::of(&mut call, body.len()) {
+        if let Some(parts) = Parts::split(&mut call, body.len()) {
             drop(body);
             return self.write_parts(&head, parts, incoming, hold).await;
         }

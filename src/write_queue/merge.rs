@@ -34,7 +34,7 @@ impl Verdicts {
     /// The answer to the computer that sent the writes. `reply` is the master's reply to the writes that were made.
     pub(super) fn answer(&self, reply: &Reply) -> wire::MergeAnswer {
         match &*self.0.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some(verdicts) => wire::MergeAnswer::of(verdicts, reply),
+            Some(verdicts) => wire::MergeAnswer::from_reply(verdicts, reply),
             None => wire::MergeAnswer::Again,
         }
     }

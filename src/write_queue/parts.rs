@@ -18,7 +18,7 @@ pub(crate) struct Parts(Peekable<vec::IntoIter<Entry>>);
 
 impl Parts {
     /// Splits `call`. `None` if it must be sent whole. `bytes` is the length of its body.
-    pub(crate) fn of(call: &mut Option<Request>, bytes: usize) -> Option<Self> {
+    pub(crate) fn split(call: &mut Option<Request>, bytes: usize) -> Option<Self> {
         let call = call.take_if(|call| {
             let entries = call.entries();
             (entries.len() > ENTRIES_WHOLE || entries.len() > 1 && bytes > BYTES_MAX)
@@ -84,7 +84,7 @@ mod tests {
     }
 
     fn sizes(call: Request, bytes: usize) -> Option<Vec<usize>> {
-        let parts = Parts::of(&mut Some(call), bytes)?;
+        let parts = Parts::split(&mut Some(call), bytes)?;
         Some(parts.map(|part| part.entries().len()).collect())
     }
 
@@ -104,7 +104,7 @@ mod tests {
         assert_eq!(sizes(call.clone(), 0), None);
         assert_eq!(sizes(call.clone(), 2 * BYTES_MAX), Some(vec![2, 3]));
         let mut whole = Some(call.clone());
-        let parts = Parts::of(&mut whole, 2 * BYTES_MAX).unwrap();
+        let parts = Parts::split(&mut whole, 2 * BYTES_MAX).unwrap();
         assert_eq!(whole, None);
         let entries = parts.flat_map(Request::into_entries).collect();
         assert_eq!(Request::of_entries(entries), call);
@@ -127,7 +127,7 @@ mod tests {
             malformed(Request::multicall(many(1000))),
         ] {
             let mut whole = Some(call.clone());
-            assert!(Parts::of(&mut whole, 0).is_none());
+            assert!(Parts::split(&mut whole, 0).is_none());
             assert_eq!(whole, Some(call));
         }
     }

@@ -566,7 +566,7 @@ impl World {
                     // The network is sometimes slow.
                     let late = self.dice.one_in(20).then(|| self.dice.below(60_000));
                     self.print(|| format!("rosrescue tells {port} {:?}", call.params));
-                    let time = self.tell(&call, &port, late.unwrap_or(0)) + 50;
+                    let time = self.notify_node(&call, &port, late.unwrap_or(0)) + 50;
                     self.ports.insert(port.clone(), true);
                     self.after(time, Event::Taken(port, number));
                 }
@@ -588,7 +588,7 @@ impl World {
     }
 
     /// A notification arrives at the node at `port`, and one of its threads reads it.
-    fn tell(&mut self, call: &Call, port: &str, late: u64) -> u64 {
+    fn notify_node(&mut self, call: &Call, port: &str, late: u64) -> u64 {
         // The answer to the call that has set this value may still wait for the disk.
         let key = call.params.get(1).map(text).unwrap_or_default();
         let sets = |waiting: &&Waiting| {

@@ -162,7 +162,7 @@ mod tests {
         xmlrpc::Value,
     };
 
-    fn place() -> (tempfile::TempDir, PathBuf) {
+    fn scratch_path() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.yaml");
         (folder, path)
@@ -185,7 +185,7 @@ mod tests {
 
     #[test]
     fn only_the_last_sessions_and_rescues_are_kept() {
-        let (_folder, path) = place();
+        let (_folder, path) = scratch_path();
         for number in 1..=7 {
             file(&path, &format!("session-{number}"), 1);
         }
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn the_oldest_files_are_removed_to_meet_the_size_limit_but_the_last_session_stays() {
-        let (_folder, path) = place();
+        let (_folder, path) = scratch_path();
         for number in 1..=3 {
             file(&path, &format!("session-{number}"), 10);
             file(&path, &format!("rescue-{number}"), 10);
@@ -221,7 +221,7 @@ mod tests {
 
     #[test]
     fn the_state_of_a_rescue_is_kept_as_a_whole_checkpoint_with_its_number() {
-        let (_folder, path) = place();
+        let (_folder, path) = scratch_path();
         let checkpoint = Checkpoint {
             seq: 7,
             ..Checkpoint::default()
@@ -240,7 +240,7 @@ mod tests {
 
     #[test]
     fn the_state_of_a_rescue_is_kept_without_the_drill_that_caused_it() {
-        let (_folder, path) = place();
+        let (_folder, path) = scratch_path();
         let list = |nodes: &[&str]| nodes.iter().map(|node| (*node).to_owned()).collect();
         let robot = || {
             let mut checkpoint = Checkpoint::default();

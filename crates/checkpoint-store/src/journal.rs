@@ -180,7 +180,7 @@ impl<S: Storage> Store<S> {
     /// A job that checks whether the file at the path and the lock are those of this store, and unchanged. `None` if
     /// nothing is being recorded, or if the status of the open file is already wrong, which stops recording.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
-        let job = CheckJob::of(&self.place, self.active.as_mut()?);
+        let job = CheckJob::prepare(&self.place, self.active.as_mut()?);
         job.map_err(|finding| self.distrust(finding)).ok()
     }
 

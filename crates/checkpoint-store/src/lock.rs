@@ -72,7 +72,7 @@ impl DiskLock {
     }
 
     pub(super) fn id(&self) -> io::Result<FileId> {
-        Ok(FileId::of(&self.file.metadata()?))
+        Ok(FileId::from_metadata(&self.file.metadata()?))
     }
 }
 
@@ -135,7 +135,7 @@ fn holder(file: File) -> Option<u32> {
 /// Binds the socket named after the checkpoint. A datagram socket has no queue of connections that another process
 /// could fill.
 fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
-    let root = FileId::of(&fs::metadata("/")?);
+    let root = FileId::from_metadata(&fs::metadata("/")?);
     // In two containers, one path can stand for two files. Containers that share a network namespace share the names of
     // sockets too, so the name must depend on the container: on its mount namespace and its root folder.
     let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();

@@ -19,7 +19,7 @@ pub struct FileId {
 }
 
 impl FileId {
-    pub(super) fn of(metadata: &Metadata) -> Self {
+    pub(super) fn from_metadata(metadata: &Metadata) -> Self {
         Self {
             device: metadata.dev(),
             inode: metadata.ino(),
@@ -29,7 +29,7 @@ impl FileId {
     /// The id of the file at `path`, if there is one. A broken link counts as a file.
     pub(super) fn at(path: &Path) -> io::Result<Option<Self>> {
         match fs::metadata(path).or_else(|_| fs::symlink_metadata(path)) {
-            Ok(metadata) => Ok(Some(Self::of(&metadata))),
+            Ok(metadata) => Ok(Some(Self::from_metadata(&metadata))),
             Err(error) if is_absence(&error) => Ok(None),
             Err(error) => Err(error),
         }
@@ -251,7 +251,7 @@ impl Storage for Disk {
     fn status(&self, file: &File) -> io::Result<FileStatus> {
         let metadata = file.metadata()?;
         Ok(FileStatus {
-            id: FileId::of(&metadata),
+            id: FileId::from_metadata(&metadata),
             length: metadata.len(),
             modified: i128::from(metadata.mtime()) * 1_000_000_000
                 + i128::from(metadata.mtime_nsec()),

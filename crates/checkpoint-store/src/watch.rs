@@ -67,7 +67,7 @@ pub struct Checked {
 impl<S: Storage> CheckJob<S> {
     /// Prepares a check that `place` still holds the `active` file. Here it compares only the metadata of the open file
     /// (`fstat`), and fails if these show a change.
-    pub(super) fn of(place: &LockedPath<S>, active: &mut Active<S>) -> Result<Self, Finding> {
+    pub(super) fn prepare(place: &LockedPath<S>, active: &mut Active<S>) -> Result<Self, Finding> {
         let status = place.storage.status(&active.file)?;
         active.compare(&status).map_err(Finding::Changed)?;
         let content = std::mem::take(&mut active.suspect);

@@ -13,7 +13,6 @@
 mod accepted;
 mod difference;
 mod inspect;
-mod order;
 mod plan;
 mod reconcile;
 mod restore;
@@ -22,6 +21,7 @@ mod roscore;
 mod tests;
 mod token;
 mod treatment;
+mod unordered;
 
 pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;

@@ -20,7 +20,7 @@ use rescue_core::{
 use ros1_master::master::{Master, Request};
 
 use crate::{
-    ledger::journal::{DISK_PATIENCE, SILENT},
+    ledger::disk_jobs::{DISK_PATIENCE, SILENT},
     limit::rarely,
     wait,
 };

@@ -13,7 +13,7 @@ use super::Pages;
 use crate::{
     clock,
     gate::State,
-    ledger::journal::StoreState,
+    ledger::disk_jobs::StoreState,
     nodes::liveness::Life,
     status::{
         DiskStatus,

@@ -171,7 +171,7 @@ mod tests {
 
     const OPEN: State = State::Open { incarnation: 1 };
 
-    fn of(gate: State, cluster: &ClusterFacts) -> Condition {
+    fn condition_of(gate: State, cluster: &ClusterFacts) -> Condition {
         let mut facts = Facts::new(Mode::Core);
         facts.cluster = Some(cluster.clone());
         let situation = Situation {
@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn one_that_follows_is_well_and_names_the_leader() {
         let mut cluster = ClusterFacts::of_three();
-        let well = of(State::Elsewhere, &cluster);
+        let well = condition_of(State::Elsewhere, &cluster);
         assert!(well.is_good(), "{well:?}");
         assert_eq!(
             well.line(),
@@ -199,7 +199,7 @@ mod tests {
              Every change is recorded."
         );
         cluster.etcd = trouble();
-        let line = of(State::Elsewhere, &cluster).line();
+        let line = condition_of(State::Elsewhere, &cluster).line();
         assert!(
             line.contains("cannot take over now (etcd has no majority)"),
             "{line}"
@@ -210,7 +210,7 @@ mod tests {
     fn without_a_leader_writes_wait_and_after_a_while_an_operator_is_needed() {
         let mut cluster = ClusterFacts::of_three();
         cluster.leaderless = Some(Instant::now());
-        let short = of(State::Elsewhere, &cluster);
+        let short = condition_of(State::Elsewhere, &cluster);
         assert_eq!(
             (short.name, &short.action),
             (ConditionName::NoLeader, &None)
@@ -220,12 +220,15 @@ mod tests {
             "{short:?}"
         );
         cluster.leaderless = Instant::now().checked_sub(2 * PATIENCE);
-        assert!(of(State::Elsewhere, &cluster).action.is_some());
+        assert!(condition_of(State::Elsewhere, &cluster).action.is_some());
         cluster.role = Role::CatchingUp;
-        assert_eq!(of(State::Elsewhere, &cluster).name, ConditionName::NoLeader);
+        assert_eq!(
+            condition_of(State::Elsewhere, &cluster).name,
+            ConditionName::NoLeader
+        );
         cluster.role = Role::Joining;
         for gate in [State::Elsewhere, State::Unknown] {
-            assert_eq!(of(gate, &cluster).name, ConditionName::NoLeader);
+            assert_eq!(condition_of(gate, &cluster).name, ConditionName::NoLeader);
         }
     }
 
@@ -234,7 +237,7 @@ mod tests {
         let mut cluster = ClusterFacts::of_three();
         cluster.role = Role::Alone;
         cluster.uncommitted = 3;
-        let serving = of(OPEN, &cluster);
+        let serving = condition_of(OPEN, &cluster);
         assert_eq!(serving.name, ConditionName::Alone);
         assert!(
             serving
@@ -248,7 +251,7 @@ mod tests {
         );
         assert!(serving.action.is_some());
         cluster.etcd = trouble();
-        let refusing = of(State::Elsewhere, &cluster);
+        let refusing = condition_of(State::Elsewhere, &cluster);
         assert_eq!(refusing.name, ConditionName::Alone);
         assert!(refusing.text.contains("--alone refuse"), "{refusing:?}");
         assert!(
@@ -259,7 +262,7 @@ mod tests {
         assert!(action(refusing).contains("restore the network"));
         // The `--cluster` option may be wrong, instead of the network.
         cluster.leader = None;
-        let never = action(of(OPEN, &cluster));
+        let never = action(condition_of(OPEN, &cluster));
         assert!(never.contains("rosrescue check --cluster"), "{never}");
     }
 
@@ -267,21 +270,21 @@ mod tests {
     fn one_that_leads_is_as_a_single_one_and_says_who_could_take_over() {
         let mut cluster = ClusterFacts::of_three();
         cluster.role = Role::Leading;
-        let well = of(OPEN, &cluster);
+        let well = condition_of(OPEN, &cluster);
         assert!(well.is_good(), "{well:?}");
         assert!(
             well.text.contains("these could take over: pc-1."),
             "{well:?}"
         );
         assert_eq!(
-            of(State::StandingIn, &cluster).name,
+            condition_of(State::StandingIn, &cluster).name,
             ConditionName::StandingIn
         );
         cluster.members.retain(|member| member.name != "pc-1");
-        let last = of(OPEN, &cluster);
+        let last = condition_of(OPEN, &cluster);
         assert!(!last.is_good() && last.action.unwrap().contains("pc-3"));
         cluster.members.retain(|member| member.name == "pc-2");
-        let first = of(OPEN, &cluster);
+        let first = condition_of(OPEN, &cluster);
         assert!(first.is_good() && first.text.contains("No other computer could take over."));
     }
 }

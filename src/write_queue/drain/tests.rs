@@ -32,7 +32,7 @@ const SUBSCRIBER: &str = "http://a:1/";
 const PUBLISHER: &str = "http://b:1/";
 
 /// The publishers in the notification that is sent now, if one is.
-fn told(ledger: &Ledger) -> Option<Value> {
+fn notified_value(ledger: &Ledger) -> Option<Value> {
     match ledger.with_order(|order, mirror| {
         order.next_notification(Instant::now(), port_of(SUBSCRIBER), mirror)
     }) {
@@ -121,11 +121,11 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     let ledger = &served.ledger;
     let topic = Subject::Topic("/t".to_owned());
     ledger.with_order(|order, _| order.notify_of_state(port_of(SUBSCRIBER), topic));
-    assert_eq!(told(ledger), None);
+    assert_eq!(notified_value(ledger), None);
     served.gate.set(State::StandingIn);
     answered.await.unwrap();
     ledger.with_order(|order, _| order.queue_due_repeats(Instant::now() + REPEAT_AFTER));
-    assert_eq!(told(ledger), Some(Value::Array(Vec::new())));
+    assert_eq!(notified_value(ledger), Some(Value::Array(Vec::new())));
 }
 
 /// A multicall that reads what the master cannot return, and changes something else, runs and is answered with a fault.

@@ -128,7 +128,7 @@ impl World {
         }
         let call = master.notices[&port].front().unwrap().call();
         self.print(|| format!("the master tells {port} {:?}", call.params));
-        let time = self.tell(&call, &port, 0);
+        let time = self.notify_node(&call, &port, 0);
         self.after(time + 50, Event::TakenFromMaster(life, port));
     }
 

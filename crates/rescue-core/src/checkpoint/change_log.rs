@@ -285,7 +285,7 @@ impl LogReader {
 
 /// Applies `call`, which is no multicall, to `state`. Returns what it changed.
 fn changes(state: &mut Master, call: &Request, hide: &Hide) -> Vec<Difference> {
-    let Some(write) = Write::of(call) else {
+    let Some(write) = Write::parse(call) else {
         state.apply_telling(call, &mut ());
         return Vec::new();
     };

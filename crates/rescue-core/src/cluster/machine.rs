@@ -126,7 +126,7 @@ impl Machine {
     }
 
     /// When etcd last answered.
-    pub fn heard(&self) -> Option<Instant> {
+    pub fn answered_at(&self) -> Option<Instant> {
         self.heard
     }
 

@@ -122,7 +122,7 @@ pub fn merge<'a>(
             MergeVerdict::Overtaken(lost) => merged.lost.push(lost),
         }
         if *call.method() == Method::DeleteParam {
-            ChangeSubject::of(call)
+            ChangeSubject::changed_by(call)
                 .into_iter()
                 .for_each(|it| deleted.add(it));
         }
@@ -145,14 +145,14 @@ pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> MergeVerd
     let parts: Vec<&str> = names::parts(&path).collect();
     let present = value_at(now.params(), &parts).cloned();
     if matches!(why, Conflict::Parameter(_)) && !parts.is_empty() {
-        let wanted = Write::of(call).and_then(|write| write.value());
+        let wanted = Write::parse(call).and_then(|write| write.value());
         if wanted == present.as_ref() {
             return MergeVerdict::Redundant;
         }
     }
     // The present owner of the name or service has already ended that registration.
     let over = matches!(why, Conflict::Node { .. } | Conflict::Service { .. });
-    if over && Write::of(call).is_some_and(|write| write.unregisters()) {
+    if over && Write::parse(call).is_some_and(|write| write.unregisters()) {
         return MergeVerdict::Redundant;
     }
     let call = call.clone();
@@ -160,7 +160,7 @@ pub fn judge_write(changes: &Changes, now: &Master, call: &Request) -> MergeVerd
 }
 
 fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict> {
-    let write = Write::of(call)?;
+    let write = Write::parse(call)?;
     let caller = write.caller;
     let node = |api| node(changes, now, caller, api);
     let registered_again = |publishes, topic: &str| {

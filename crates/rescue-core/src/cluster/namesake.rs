@@ -108,7 +108,7 @@ mod tests {
 
     const TTL: Duration = Duration::from_secs(2);
 
-    fn own(uri: &str) -> Settings {
+    fn settings(uri: &str) -> Settings {
         Settings {
             name: "a".to_owned(),
             id: "a-2".to_owned(),
@@ -158,16 +158,16 @@ mod tests {
     fn a_leader_of_the_same_name_elsewhere_is_a_sign_and_an_earlier_boot_of_this_computer_is_not() {
         let (here, there) = ("http://10.0.0.1:11311/", "http://10.0.0.2:11311/");
         let is_sign = |own: &Settings, view| sign_of_leader(own, &view).is_some();
-        assert!(is_sign(&own(here), led("a", there, "", 5)));
-        assert!(!is_sign(&own(here), led("b", there, "", 5)));
-        assert!(!is_sign(&own(here), led("a", here, "", 5)));
+        assert!(is_sign(&settings(here), led("a", there, "", 5)));
+        assert!(!is_sign(&settings(here), led("b", there, "", 5)));
+        assert!(!is_sign(&settings(here), led("a", here, "", 5)));
         // Copies of one disk without ROS_IP: both say the host name.
         let copy = "http://robot:11311/";
-        assert!(is_sign(&own(copy), led("a", copy, "boot-1", 5)));
-        assert!(!is_sign(&own(copy), led("a", copy, "boot-2", 5)));
+        assert!(is_sign(&settings(copy), led("a", copy, "boot-1", 5)));
+        assert!(!is_sign(&settings(copy), led("a", copy, "boot-2", 5)));
         let mut released = led("a", there, "", 5);
         released.alive.as_mut().unwrap().released = Some(String::new());
-        assert!(!is_sign(&own(here), released));
+        assert!(!is_sign(&settings(here), released));
     }
 
     #[test]
@@ -182,7 +182,7 @@ mod tests {
         assert_eq!(watch.living(now + TTL, &changed), changed.first());
         assert!(watch.is_over(now + MEMBER_SAYS));
         assert_eq!(watch.living(now + MEMBER_SAYS, &changed), None);
-        let leader = |revision| sign_of_leader(&own("u"), &led("a", there, "", revision));
+        let leader = |revision| sign_of_leader(&settings("u"), &led("a", there, "", revision));
         let [first, next] = [5, 6].map(|revision| leader(revision).unwrap());
         let watch = NamesakeWatch::new(now, TTL, vec![first.clone()]);
         assert_eq!(watch.hold(), Some(now + TTL));
@@ -197,7 +197,7 @@ mod tests {
         assert_eq!((watch.hold(), watch.suspect()), (None, None));
         let there = "http://10.0.0.2:11311/";
         assert_eq!(watch.living(now, &[member(there, 5)]), None);
-        let leader = sign_of_leader(&own("u"), &led("a", there, "", 7)).unwrap();
+        let leader = sign_of_leader(&settings("u"), &led("a", there, "", 7)).unwrap();
         let signs = [member(there, 5), leader.clone()];
         assert_eq!(watch.living(now, &signs), Some(&leader));
         assert_eq!(watch.living(now + YOUNG, &signs), None);

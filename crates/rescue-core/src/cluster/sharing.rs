@@ -50,7 +50,7 @@ impl Recent {
         let subjects: Vec<_> = call
             .calls()
             .into_iter()
-            .flat_map(ChangeSubject::of)
+            .flat_map(ChangeSubject::changed_by)
             .collect();
         self.bytes += bytes_of(&subjects);
         self.changes.push_back((seq, source.clone(), subjects));

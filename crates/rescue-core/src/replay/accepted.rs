@@ -1,6 +1,6 @@
 //! Finds out which writes of a call a master has executed, and whether the mirror agrees.
 
-use super::order;
+use super::unordered;
 use ros1_master::master::{Entry, Master, Method, Request, entry_reply, is_success};
 use ros1_master::xmlrpc::{Reply, Value};
 
@@ -28,7 +28,7 @@ impl Answered<'_> {
         let live = live && *method == Method::SubscribeParam;
         let same = match [&self.reply, mirror].map(is_success) {
             [true, true] => {
-                let in_any_order = || self.unordered && order::are_alike(&self.reply, mirror);
+                let in_any_order = || self.unordered && unordered::are_alike(&self.reply, mirror);
                 live || self.reply == *mirror || in_any_order()
             }
             [true, false] => live,

@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use indexmap::IndexMap;
 use thiserror::Error;
 
-use super::{Token, TokenState, order};
+use super::{Token, TokenState, unordered};
 use ros1_master::master::names::{self, CALLER_ID};
 use ros1_master::master::{
     Master, Method, OrderedMap, Registrations, Request, ServiceEntry, Snapshot, SnapshotNode,
@@ -65,12 +65,12 @@ impl Inspection {
     /// as on Python 2.
     pub fn arrange_like(&mut self, mirror: &Master) {
         let registry = mirror.registry();
-        order::arrange(&mut self.publishers, registry.publishers.keys());
-        order::arrange(&mut self.subscribers, registry.subscribers.keys());
-        order::arrange(&mut self.services, registry.services.keys());
-        order::arrange(&mut self.topic_types, mirror.topic_types().keys());
+        unordered::arrange(&mut self.publishers, registry.publishers.keys());
+        unordered::arrange(&mut self.subscribers, registry.subscribers.keys());
+        unordered::arrange(&mut self.services, registry.services.keys());
+        unordered::arrange(&mut self.topic_types, mirror.topic_types().keys());
         if let Some(params) = &mut self.params {
-            order::arrange_params(params, mirror.params());
+            unordered::arrange_params(params, mirror.params());
         }
     }
 

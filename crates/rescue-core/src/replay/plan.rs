@@ -6,7 +6,7 @@ use bytes::Bytes;
 
 use super::inspect::lookup;
 use super::restore::{self, Manner, Restore};
-use super::{Token, order};
+use super::{Token, unordered};
 use ros1_master::master::{CALLER_ID, Master, Method, Request, Write, reply_entry, returnable};
 use ros1_master::xmlrpc::{self, ListWriter, Reply, Struct, Value};
 
@@ -315,7 +315,7 @@ impl Plan {
             let Some(call) = calls.get(index) else { break };
             let in_any_order = || {
                 let lists = !matches!(call.method(), Method::GetParam);
-                order::sorted(result, lists) == order::sorted(predicted, lists)
+                unordered::sorted(result, lists) == unordered::sorted(predicted, lists)
             };
             if is_alike(result, predicted) || !ordered && in_any_order() {
                 continue;
@@ -418,7 +418,7 @@ fn is_alike(result: &Value, predicted: &Value) -> bool {
 /// Names a call that was not answered as predicted.
 fn mismatch(call: &Request) -> String {
     let method = call.method();
-    let write = Write::of(call);
+    let write = Write::parse(call);
     let name = write.as_ref().map(Write::name).or_else(|| call.text(1));
     let subject = name.map_or_else(String::new, |name| {
         format!(" of `{name}` by `{}`", call.caller().unwrap_or_default())

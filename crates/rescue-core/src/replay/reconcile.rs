@@ -43,7 +43,7 @@ pub fn reconcile(
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        let Some(Write { caller, effect }) = Write::of(call) else {
+        let Some(Write { caller, effect }) = Write::parse(call) else {
             continue;
         };
         // A node that has another address by now has lost its earlier subscriptions.

@@ -352,7 +352,7 @@ mod tests {
         Request::from(Call::new(method, vec!["/n".into()]))
     }
 
-    fn of(methods: &[&str]) -> Kind {
+    fn kind_of(methods: &[&str]) -> Kind {
         Request::multicall(methods.iter().map(|method| call(method))).kind()
     }
 
@@ -362,14 +362,20 @@ mod tests {
 
     #[test]
     fn the_kind_of_a_multicall_covers_all_its_entries() {
-        assert_eq!(of(&[]), Kind::Read);
-        assert_eq!(of(&["getPid"]), Kind::Identity);
-        assert_eq!(of(&["getPid", "getParam"]), Kind::Read);
-        assert_eq!(of(&["getParam", "unregisterPublisher"]), Kind::Unregister);
-        assert_eq!(of(&["getParam", "nonsense"]), Kind::Unknown);
-        assert_eq!(of(&["unregisterService", "nonsense"]), Kind::Mutate);
-        assert_eq!(of(&["unregisterService", "setParam"]), Kind::Mutate);
-        assert_eq!(of(&["setParam", "shutdown", "nonsense"]), Kind::Shutdown);
+        assert_eq!(kind_of(&[]), Kind::Read);
+        assert_eq!(kind_of(&["getPid"]), Kind::Identity);
+        assert_eq!(kind_of(&["getPid", "getParam"]), Kind::Read);
+        assert_eq!(
+            kind_of(&["getParam", "unregisterPublisher"]),
+            Kind::Unregister
+        );
+        assert_eq!(kind_of(&["getParam", "nonsense"]), Kind::Unknown);
+        assert_eq!(kind_of(&["unregisterService", "nonsense"]), Kind::Mutate);
+        assert_eq!(kind_of(&["unregisterService", "setParam"]), Kind::Mutate);
+        assert_eq!(
+            kind_of(&["setParam", "shutdown", "nonsense"]),
+            Kind::Shutdown
+        );
         let inner = Request::multicall([call("subscribeParam")]);
         let nested = Request::multicall([inner, call("getPid")]);
         assert_eq!(nested.kind(), Kind::Mutate);

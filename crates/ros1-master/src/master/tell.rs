@@ -114,7 +114,7 @@ impl Master {
     /// The node that `call` displaces: the call registers something under that node's name at another address, so the
     /// master tells the old node to shut down. Leaves [`Displaced::pid`] empty.
     pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
-        let (node, api) = Write::of(call)?.registrant()?;
+        let (node, api) = Write::parse(call)?.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
         let topics = self.publications(node).chain(self.subscriptions(node));
         Some(Displaced {

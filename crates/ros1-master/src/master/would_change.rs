@@ -40,7 +40,7 @@ impl Master {
         if !call.method().kind().mutates() {
             return Some(true);
         }
-        let Write { caller, effect } = Write::of(call)?;
+        let Write { caller, effect } = Write::parse(call)?;
         // The calling node, if it is registered at this address.
         let node = |api: &str| {
             let node = self.registry.nodes.get(caller);

@@ -12,7 +12,7 @@ use crate::xmlrpc::Value;
 /// use ros1_master::master::{Effect, Method, Request, Write};
 ///
 /// let call = Request::new(Method::RegisterPublisher, ["/arm/talker", "chatter", "std_msgs/String", "http://arm:1/"]);
-/// let write = Write::of(&call).unwrap();
+/// let write = Write::parse(&call).unwrap();
 /// assert!(matches!(&write.effect, Effect::RegisterPublisher { topic, .. } if topic == "/arm/chatter"));
 /// assert_eq!(write.registrant(), Some(("/arm/talker", "http://arm:1/")));
 /// ```
@@ -84,7 +84,7 @@ pub enum WriteTarget {
 impl<'a> Write<'a> {
     /// The write that `call` makes. `None` for a multicall, for a call that changes nothing, and for a call that every
     /// master refuses because of its arguments.
-    pub fn of(call: &'a Request) -> Option<Self> {
+    pub fn parse(call: &'a Request) -> Option<Self> {
         let (caller, rest) = call.params().split_first()?;
         let caller = caller.as_str()?;
         let decode = call.method().decoder()?;
@@ -98,7 +98,7 @@ impl<'a> Write<'a> {
 
     /// The writes in `call`, in order: those of its entries if it is a multicall.
     pub fn all(call: &'a Request) -> impl Iterator<Item = Self> {
-        call.calls().into_iter().filter_map(Self::of)
+        call.calls().into_iter().filter_map(Self::parse)
     }
 
     /// The resolved name of the topic, service or parameter.

@@ -136,7 +136,7 @@ fn port(facts: &mut SetupFacts) -> &mut Port {
 }
 
 /// The warnings and problems that remain after `spoil` has broken one thing.
-fn said(spoil: impl FnOnce(&mut SetupFacts)) -> Vec<Finding> {
+fn findings_of(spoil: impl FnOnce(&mut SetupFacts)) -> Vec<Finding> {
     let mut facts = robot();
     spoil(&mut facts);
     let mut found = from_facts(&facts);
@@ -147,7 +147,7 @@ fn said(spoil: impl FnOnce(&mut SetupFacts)) -> Vec<Finding> {
 /// Asserts that `spoil` causes exactly one finding, with these words and something to do.
 #[track_caller]
 fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut SetupFacts)) {
-    let found = said(spoil);
+    let found = findings_of(spoil);
     let [finding] = found.as_slice() else {
         panic!("{found:?}");
     };
@@ -216,7 +216,7 @@ fn assert_has_a_command(finding: &Finding) {
 /// The todo of the only finding that `spoil` causes.
 #[track_caller]
 fn todo(spoil: impl FnOnce(&mut SetupFacts)) -> String {
-    let found = said(spoil);
+    let found = findings_of(spoil);
     assert_eq!(found.len(), 1, "{found:?}");
     found[0].todo.clone()
 }

@@ -29,7 +29,10 @@ impl Member {
             return;
         };
         let ttl = self.settings().ttl;
-        let silent = self.machine.heard().is_none_or(|heard| heard + ttl <= now);
+        let silent = self
+            .machine
+            .answered_at()
+            .is_none_or(|heard| heard + ttl <= now);
         let pause = ttl / if silent { PROBES_IN_SILENCE } else { PROBES };
         let probing = &mut self.probing;
         if !probing.under_way && *probing.at.get_or_insert(now) <= now {

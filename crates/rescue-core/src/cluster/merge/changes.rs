@@ -45,8 +45,9 @@ impl ChangeSubject {
 
     /// What `call`, which is no multicall, changes. Empty for an unregistration, which conflicts with nothing, and for a
     /// value that a merge sets again.
-    pub fn of(call: &Request) -> Vec<Self> {
-        let Some(Write { caller, effect }) = Write::of(call).filter(|write| write.caller != TELLER)
+    pub fn changed_by(call: &Request) -> Vec<Self> {
+        let Some(Write { caller, effect }) =
+            Write::parse(call).filter(|write| write.caller != TELLER)
         else {
             return Vec::new();
         };
@@ -88,7 +89,7 @@ pub(super) fn param_path(key: &str) -> String {
 
 /// The resolved name of the parameter that `call` sets or deletes.
 pub fn parameter_of(call: &Request) -> Option<String> {
-    Write::of(call)?.parameter().map(str::to_owned)
+    Write::parse(call)?.parameter().map(str::to_owned)
 }
 
 /// The path of the parameter that `call` sets or deletes.
@@ -163,7 +164,7 @@ impl Changes {
         }
         for call in call.calls() {
             if !self.expected.has(call) {
-                ChangeSubject::of(call)
+                ChangeSubject::changed_by(call)
                     .into_iter()
                     .for_each(|it| self.add(it));
             }
@@ -304,7 +305,7 @@ impl ExpectedCalls {
         self.calls().any(|call| {
             let below = param_of(call).and_then(|of| path.strip_prefix(of.as_str()));
             let Some(below) = below else { return false };
-            let set = Write::of(call).and_then(|write| write.value());
+            let set = Write::parse(call).and_then(|write| write.value());
             let parts: Vec<&str> = names::parts(below).collect();
             let value = match (set, parts.as_slice()) {
                 (set, []) => set,
@@ -317,7 +318,7 @@ impl ExpectedCalls {
 
     fn registers(&self, node: &str, api: &str) -> bool {
         let mut calls = self.calls();
-        calls.any(|call| Write::of(call).and_then(|it| it.registrant()) == Some((node, api)))
+        calls.any(|call| Write::parse(call).and_then(|it| it.registrant()) == Some((node, api)))
     }
 }
 

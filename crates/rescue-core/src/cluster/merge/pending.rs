@@ -125,7 +125,7 @@ impl WritesToSend {
 
 /// The slot that `call` registers or unregisters, with the address, and whether it registers.
 fn slot(call: &Request) -> Option<(RegistrationSlot, String, bool)> {
-    let write = Write::of(call)?;
+    let write = Write::parse(call)?;
     let api = write.address()?;
     let slot = RegistrationSlot {
         target: write.target(),

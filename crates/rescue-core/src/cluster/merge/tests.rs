@@ -52,7 +52,7 @@ fn after(base: &[Request], there: &[Request], here: &[Request]) -> Merged {
     merge(&changes, &now, pending.calls())
 }
 
-fn lost(base: &[Request], there: &[Request], here: Request) -> Option<Conflict> {
+fn conflict_of(base: &[Request], there: &[Request], here: Request) -> Option<Conflict> {
     let mut merged = after(base, there, &[here]);
     merged.lost.pop().map(|lost| lost.why)
 }
@@ -214,59 +214,65 @@ fn a_parameter_that_was_changed_wins_with_all_below_and_above_it() {
     let parameter = |key: &str| Some(Conflict::Parameter(key.to_owned()));
     let base = [set("/a/b", "1"), set("/c", "1")];
     assert_eq!(
-        lost(&base, &[set("/a/b", "2")], set("/a/b", "3")),
+        conflict_of(&base, &[set("/a/b", "2")], set("/a/b", "3")),
         parameter("/a/b")
     );
     assert_eq!(
-        lost(&base, &[set("/a/x", "2")], set("/a", "3")),
+        conflict_of(&base, &[set("/a/x", "2")], set("/a", "3")),
         parameter("/a")
     );
     assert_eq!(
-        lost(&base, &[set("/a", "2")], set("/a/b", "3")),
+        conflict_of(&base, &[set("/a", "2")], set("/a/b", "3")),
         parameter("/a/b")
     );
     assert_eq!(
-        lost(&base, &[set("/new", "2")], set("/new/b", "3")),
+        conflict_of(&base, &[set("/new", "2")], set("/new/b", "3")),
         parameter("/new/b")
     );
     let delete = call(Method::DeleteParam, &["/n", "/a/b"]);
     assert_eq!(
-        lost(&base, std::slice::from_ref(&delete), set("/a/b", "3")),
+        conflict_of(&base, std::slice::from_ref(&delete), set("/a/b", "3")),
         parameter("/a/b")
     );
     assert_eq!(
-        lost(&base, &[set("/a/b", "2")], delete.clone()),
+        conflict_of(&base, &[set("/a/b", "2")], delete.clone()),
         parameter("/a/b")
     );
     // A change beside the parameter is no conflict.
     assert_eq!(
-        lost(&base, &[set("/a/x", "2"), set("/c", "2")], set("/a/b", "3")),
+        conflict_of(&base, &[set("/a/x", "2"), set("/c", "2")], set("/a/b", "3")),
         None
     );
-    assert_eq!(lost(&base, &[set("/new/x", "2")], set("/new/b", "3")), None);
-    assert_eq!(lost(&base, &[], delete), None);
+    assert_eq!(
+        conflict_of(&base, &[set("/new/x", "2")], set("/new/b", "3")),
+        None
+    );
+    assert_eq!(conflict_of(&base, &[], delete), None);
     // A name is relative to its caller.
     let private = call(Method::SetParam, &["/a", "~b", "3"]);
-    assert_eq!(lost(&base, &[set("/a/b", "2")], private), parameter("/a/b"));
+    assert_eq!(
+        conflict_of(&base, &[set("/a/b", "2")], private),
+        parameter("/a/b")
+    );
 }
 
 #[test]
 fn a_name_that_another_node_has_taken_is_not_taken_back() {
     let base = [publish("/n", "/t", "http://old:1/")];
     let there = [publish("/n", "/t", "http://there:1/")];
-    let taken = lost(&base, &there, publish("/n", "/u", "http://here:1/"));
+    let taken = conflict_of(&base, &there, publish("/n", "/u", "http://here:1/"));
     let api = "http://there:1/".to_owned();
     let name = "/n".to_owned();
     assert_eq!(taken, Some(Conflict::Node { name, api }));
     // The other side's health check has unregistered the node because it could not reach it.
     let gone = call(Method::UnregisterPublisher, &["/n", "/t", "http://old:1/"]);
     assert_eq!(
-        lost(&base, &[gone], publish("/n", "/t", "http://old:1/")),
+        conflict_of(&base, &[gone], publish("/n", "/t", "http://old:1/")),
         None
     );
     // The node was started again on this computer.
     assert_eq!(
-        lost(&base, &[], publish("/n", "/t", "http://here:1/")),
+        conflict_of(&base, &[], publish("/n", "/t", "http://here:1/")),
         None
     );
 }
@@ -276,19 +282,22 @@ fn a_service_of_another_node_stays() {
     let service =
         |node: &str, api: &str| call(Method::RegisterService, &[node, "/s", api, "http://n:1/"]);
     let there = [service("/there", "rosrpc://there:1")];
-    let taken = lost(&[], &there, service("/here", "rosrpc://here:1"));
+    let taken = conflict_of(&[], &there, service("/here", "rosrpc://here:1"));
     let (name, node) = ("/s".to_owned(), "/there".to_owned());
     assert_eq!(taken, Some(Conflict::Service { name, node }));
     let base = [service("/old", "rosrpc://old:1")];
-    assert_eq!(lost(&base, &[], service("/here", "rosrpc://here:1")), None);
+    assert_eq!(
+        conflict_of(&base, &[], service("/here", "rosrpc://here:1")),
+        None
+    );
 }
 
 #[test]
 fn what_a_node_has_registered_again_stays() {
     let gone = call(Method::UnregisterPublisher, &["/n", "/t", "http://n:1/"]);
     let there = [publish("/n", "/t", "http://n:1/")];
-    assert!(lost(&[], &there, gone.clone()).is_some());
-    assert_eq!(lost(&there, &[], gone), None);
+    assert!(conflict_of(&[], &there, gone.clone()).is_some());
+    assert_eq!(conflict_of(&there, &[], gone), None);
 }
 
 #[test]

@@ -93,7 +93,7 @@ pub enum MergeAnswer {
 
 impl MergeAnswer {
     /// The answer for writes that were decided on as in `verdicts`. `reply` is the master's reply to those that it ran.
-    pub fn of(verdicts: &[MergeVerdict], reply: &Reply) -> Self {
+    pub fn from_reply(verdicts: &[MergeVerdict], reply: &Reply) -> Self {
         let results = match reply {
             Reply::Value(Value::Array(results)) => results.as_slice(),
             _ => &[],
@@ -218,7 +218,7 @@ mod tests {
             Value::Array(vec![reply.into()])
         };
         let reply = Reply::Value(vec![result(1, "done"), result(-1, "no")].into());
-        let answer = MergeAnswer::of(&verdicts, &reply);
+        let answer = MergeAnswer::from_reply(&verdicts, &reply);
         let expected = MergeAnswer::Done(vec![
             WriteOutcome::Holds,
             WriteOutcome::Lost {

@@ -207,7 +207,7 @@ impl History {
         self.of(call).reported = true;
     }
 
-    pub(super) fn held(&mut self, call: &Request) {
+    pub(super) fn note_held(&mut self, call: &Request) {
         self.of(call).held = true;
     }
 
@@ -274,7 +274,7 @@ impl History {
         self.calls[call].heard.is_some()
     }
 
-    pub(super) fn heard(&mut self, call: usize, now: u64) {
+    pub(super) fn note_answered(&mut self, call: usize, now: u64) {
         self.calls[call].heard.get_or_insert(now);
     }
 

@@ -595,7 +595,7 @@ impl World {
                 let input = Input::Decided { seq, goes_on };
                 self.after(delay, Event::Input(at, life, input));
             }
-            Action::PublishStanding(standing) => self.stand(at, standing),
+            Action::PublishStanding(standing) => self.set_standing(at, standing),
             Action::StopRecording { binds } => {
                 for (_, asker, _) in self.computers[at].leave(binds) {
                     self.merge_answered(asker, at, None);
@@ -690,7 +690,7 @@ impl World {
                         self.history.reported(&call);
                     } else {
                         self.counts.merged += 1;
-                        self.history.held(&call);
+                        self.history.note_held(&call);
                     }
                 }
             }
@@ -751,7 +751,7 @@ impl World {
         }
     }
 
-    fn stand(&mut self, at: usize, standing: Standing) {
+    fn set_standing(&mut self, at: usize, standing: Standing) {
         let computer = &mut self.computers[at];
         if standing == Standing::Alone {
             computer.ledger.unanswered.retain(|of| of.origin == at);

@@ -2,7 +2,7 @@ use super::*;
 use crate::replay::{Inspection, NotAMaster, Token, TokenState, difference};
 
 /// Reads the state of `master` as rosrescue does over the network.
-fn look(master: &mut Master, previous: &Master) -> Master {
+fn read_back(master: &mut Master, previous: &Master) -> Master {
     let token = Token::new("m", 1);
     let reply = master.apply(&Inspection::call(&token)).reply;
     let look = match Inspection::decode(&reply, &token) {
@@ -38,7 +38,7 @@ fn busy() -> Master {
 #[test]
 fn an_inspection_reads_everything_that_a_master_shows() {
     let mut master = busy();
-    let found = look(&mut master.clone(), &Master::default());
+    let found = read_back(&mut master.clone(), &Master::default());
     let mut blind = master.snapshot();
     blind.param_subscribers = Default::default();
     blind.nodes.remove("/w");
@@ -51,7 +51,7 @@ fn an_inspection_reads_everything_that_a_master_shows() {
         Vec::<String>::new()
     );
     let previous = master.clone();
-    assert_eq!(look(&mut master, &previous), previous);
+    assert_eq!(read_back(&mut master, &previous), previous);
 }
 
 #[test]
@@ -69,7 +69,7 @@ fn an_inspection_believes_the_master_about_changes() {
     ] {
         master.apply(&call);
     }
-    let found = look(&mut master.clone(), &previous);
+    let found = read_back(&mut master.clone(), &previous);
     // `/s` is another process now, which does not have the old one's subscriptions.
     assert_eq!(found, master);
 }
@@ -79,10 +79,10 @@ fn an_empty_master_shows_no_state_and_no_token() {
     let token = Token::new("m", 1);
     let mut master = Master::default();
     master.set_identity(42, "http://h/".to_owned());
-    let look = |master: &mut Master| {
+    let inspect = |master: &mut Master| {
         Inspection::decode(&master.apply(&Inspection::call(&token)).reply, &token).unwrap()
     };
-    let first = look(&mut master);
+    let first = inspect(&mut master);
     assert_eq!(
         (first.pid(), first.bears(), first.is_empty()),
         (42, TokenState::Nothing, true)
@@ -94,19 +94,19 @@ fn an_empty_master_shows_no_state_and_no_token() {
         .zip([TokenState::Earlier, TokenState::Present])
     {
         master.apply(call);
-        let next = look(&mut master);
+        let next = inspect(&mut master);
         assert_eq!((next.bears(), next.is_empty()), (bears, true));
     }
     master.apply(&set("/a", 1));
-    assert!(!look(&mut master).is_empty());
+    assert!(!inspect(&mut master).is_empty());
     // A later number is found even if the master also has an earlier one.
     let [session, _] = Token::new("m", 12).set_calls();
     master.apply(&session);
-    assert_eq!(look(&mut master).bears(), TokenState::Later(12));
+    assert_eq!(inspect(&mut master).bears(), TokenState::Later(12));
     let [session, _] = Token::new("m", 0).set_calls();
     master.apply(&session);
     master.apply(&token.remove());
-    assert_eq!(look(&mut master).bears(), TokenState::Earlier);
+    assert_eq!(inspect(&mut master).bears(), TokenState::Earlier);
 }
 
 #[test]
@@ -114,7 +114,7 @@ fn parameters_that_the_master_cannot_return_come_from_the_previous_state() {
     let mut master = busy();
     master.apply(&set("/bad", vec![Value::Nil]));
     let previous = master.clone();
-    assert_eq!(look(&mut master, &previous), previous);
+    assert_eq!(read_back(&mut master, &previous), previous);
 }
 
 #[test]

@@ -8,7 +8,7 @@ use super::{
         computers::{Cluster, Unusable},
         facts::SetupFacts,
     },
-    one, said,
+    findings_of, one,
 };
 use crate::{
     cluster::etcd::{EtcdError, Tried},
@@ -48,7 +48,7 @@ fn peer_port(endpoint: &str) -> Result<u64, EtcdError> {
 
 #[test]
 fn a_cluster_without_problems_has_no_findings() {
-    assert_eq!(said(|facts| given(facts, |_| {})), []);
+    assert_eq!(findings_of(|facts| given(facts, |_| {})), []);
 }
 
 #[test]
@@ -61,7 +61,7 @@ fn a_wrong_endpoint_is_a_warning_while_a_majority_answers_and_a_problem_otherwis
             given(facts, |of| of.tried[1].cluster = peer_port("http://b:2380"));
         },
     );
-    let found = said(|facts| {
+    let found = findings_of(|facts| {
         given(facts, |of| {
             for tried in of.tried.iter_mut().skip(1) {
                 tried.cluster = peer_port(&tried.endpoint);
@@ -88,7 +88,7 @@ fn a_robot_that_etcd_does_not_know_while_it_knows_another_one() {
             unknown(facts, &["robot-7"]);
         },
     );
-    assert_eq!(said(|facts| unknown(facts, &[])), []);
+    assert_eq!(findings_of(|facts| unknown(facts, &[])), []);
 }
 
 #[test]

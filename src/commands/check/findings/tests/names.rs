@@ -58,10 +58,11 @@ fn each_advice_about_addresses_is_one_command() {
         facts.env.hostname = Some("old".to_owned());
         facts.own = host("old", "10.0.0.9", false);
     };
-    let said = todo(wrong);
+    let findings_of = todo(wrong);
     assert!(
-        said.starts_with("`unset ROS_HOSTNAME; export ROS_IP=10.0.0.7` before anything starts"),
-        "{said}"
+        findings_of
+            .starts_with("`unset ROS_HOSTNAME; export ROS_IP=10.0.0.7` before anything starts"),
+        "{findings_of}"
     );
     let unknown = |facts: &mut SetupFacts| {
         wrong(facts);
@@ -69,15 +70,15 @@ fn each_advice_about_addresses_is_one_command() {
     };
     assert!(todo(unknown).contains("ROS_IP=$(hostname -I | cut -d' ' -f1)`"));
     // An address is not looked for in /etc/hosts.
-    let said = todo(|facts| {
+    let findings_of = todo(|facts| {
         facts.env.ip = Some("10.99.99.99".to_owned());
         facts.own = host("10.99.99.99", "10.99.99.99", false);
     });
-    assert!(!said.contains("/etc/hosts"), "{said}");
-    let said = todo(|facts| facts.own.took = Duration::from_secs(4));
+    assert!(!findings_of.contains("/etc/hosts"), "{findings_of}");
+    let findings_of = todo(|facts| facts.own.took = Duration::from_secs(4));
     assert!(
-        said.contains("`echo 10.0.0.7 robot | sudo tee -a /etc/hosts`"),
-        "{said}"
+        findings_of.contains("`echo 10.0.0.7 robot | sudo tee -a /etc/hosts`"),
+        "{findings_of}"
     );
 }
 

@@ -9,16 +9,16 @@ use super::{
         reach::{Outcome, Reached},
         ros::Responder,
     },
-    from_facts, host, nowhere, one, port, robot, rosrescue, said, taken, todo,
+    findings_of, from_facts, host, nowhere, one, port, robot, rosrescue, taken, todo,
 };
 use crate::ros_env::MasterUri;
 
 #[test]
 fn a_robot_without_problems_has_no_findings() {
-    assert_eq!(said(|_| {}), []);
+    assert_eq!(findings_of(|_| {}), []);
     assert!(from_facts(&robot()).len() >= 8);
     // There is no finding either while rosrescue runs, with its own master and its checkpoint in use.
-    let found = said(|facts| {
+    let found = findings_of(|facts| {
         port(facts).taken = taken(rosrescue(None));
         facts.disk.holder = Some(LockHolder { pid: Some(7) });
         facts.node_hosts = vec![(host("robot", "10.0.0.7", true), vec!["/a".to_owned()])];
@@ -62,7 +62,7 @@ fn a_firewall_between_the_computers_is_found() {
         far(facts);
         facts.reached = vec![base(40_001, "/a", blocked(false))];
     });
-    let answered = said(|facts| {
+    let answered = findings_of(|facts| {
         far(facts);
         facts.reached = vec![base(40_001, "/a", Outcome::Answered)];
     });
@@ -76,7 +76,7 @@ fn a_firewall_between_the_computers_is_found() {
             facts.firewall = Some("ufw");
         },
     );
-    assert_eq!(said(|facts| facts.firewall = Some("ufw")), []);
+    assert_eq!(findings_of(|facts| facts.firewall = Some("ufw")), []);
 }
 
 /// On a computer that only runs nodes, the check does not ask for what a master needs.
@@ -91,7 +91,7 @@ fn another_computer_of_the_robot() {
         facts.disk.refused = Some("denied".to_owned());
         facts.units.clear();
     };
-    assert_eq!(said(elsewhere), []);
+    assert_eq!(findings_of(elsewhere), []);
     one(
         Warning,
         "ROS_MASTER_URI",

@@ -10,7 +10,7 @@ use super::{
         ros::Responder,
         units::UnitKind,
     },
-    one, process, rosrescue, said, unit,
+    findings_of, one, process, rosrescue, unit,
 };
 use crate::ros_env::MasterUri;
 
@@ -58,7 +58,10 @@ fn the_master_of_a_proxy() {
             .units
             .push(unit("roscore.service", UnitKind::Roscore, true));
     };
-    assert_eq!(said(|facts| proxy(facts, Responder::Master(Some(9)))), []);
+    assert_eq!(
+        findings_of(|facts| proxy(facts, Responder::Master(Some(9)))),
+        []
+    );
     one(Warning, "master", "no answer from", |facts| {
         proxy(facts, Responder::Nobody)
     });
@@ -87,7 +90,7 @@ fn units_of_systemd() {
         "robot.service runs roslaunch",
         with(UnitKind::Roslaunch, true),
     );
-    assert_eq!(said(with(UnitKind::Roscore, false)), []);
+    assert_eq!(findings_of(with(UnitKind::Roscore, false)), []);
     one(Note, "systemd", "no rosrescue service", |facts| {
         facts.units.clear()
     });
@@ -110,6 +113,6 @@ fn a_launch_file_with_a_master_of_its_own_is_said_with_its_line() {
     one(Note, "launch files", "there are more", |facts| {
         facts.launches.is_cut = true;
     });
-    let found = said(|facts| facts.launches.settings = vec![setting.clone(); 30]);
+    let found = findings_of(|facts| facts.launches.settings = vec![setting.clone(); 30]);
     assert_eq!(found.len(), 11);
 }

@@ -7,7 +7,7 @@ use super::{
         Severity::{Note, Problem, Warning},
         facts::SetupFacts,
     },
-    one, said,
+    findings_of, one,
 };
 
 #[test]
@@ -87,7 +87,7 @@ fn what_the_computer_lacks() {
     one(Warning, "memory", "100 MiB are free", |facts| {
         facts.memory = Some(100 << 20)
     });
-    assert_eq!(said(|facts| facts.memory = None), []);
+    assert_eq!(findings_of(|facts| facts.memory = None), []);
 }
 
 #[test]
@@ -108,5 +108,5 @@ fn a_file_system_without_inodes_takes_no_checkpoint() {
             facts.disk.inodes = Some(500);
         },
     );
-    assert_eq!(said(|facts| facts.disk.inodes = None), []);
+    assert_eq!(findings_of(|facts| facts.disk.inodes = None), []);
 }

@@ -6,7 +6,7 @@ use super::{
         facts::SetupFacts,
         shell::ShellSetting,
     },
-    host, nowhere, one, said, todo,
+    findings_of, host, nowhere, one, todo,
 };
 use crate::ros_env::MasterUri;
 
@@ -99,7 +99,7 @@ fn traps_of_ros_ip_and_ros_hostname() {
             facts.node_hosts = vec![(host("base", "10.0.0.9", false), vec!["/a".to_owned()])];
         },
     );
-    let alone = said(|facts| {
+    let alone = findings_of(|facts| {
         ip(facts, "127.0.0.1");
         facts.own = host("127.0.0.1", "127.0.0.1", true);
     });
@@ -128,14 +128,17 @@ fn a_stale_file_of_the_shell_is_found() {
         |facts| facts.shell = vec![setting("ROS_IP", "10.0.0.9")],
     );
     let same = setting("ROS_MASTER_URI", "http://robot:11311/");
-    assert_eq!(said(|facts| facts.shell = vec![same]), []);
+    assert_eq!(findings_of(|facts| facts.shell = vec![same]), []);
     // This shell has the wrong address from that file.
-    let said = todo(|facts| {
+    let findings_of = todo(|facts| {
         facts.env.ip = Some("10.0.0.9".to_owned());
         facts.own = host("10.0.0.9", "10.0.0.9", false);
         facts.shell = vec![setting("ROS_IP", "10.0.0.9")];
     });
-    assert!(said.ends_with("`sed -i 120d /home/r/.bashrc`"), "{said}");
+    assert!(
+        findings_of.ends_with("`sed -i 120d /home/r/.bashrc`"),
+        "{findings_of}"
+    );
 }
 
 #[test]

@@ -92,7 +92,7 @@ impl There {
             fault @ Reply::Fault { .. } => panic!("{fault:?}"),
         });
         let results = results.collect::<Vec<_>>();
-        MergeAnswer::of(&verdicts, &Reply::Value(results.into()))
+        MergeAnswer::from_reply(&verdicts, &Reply::Value(results.into()))
     }
 }
 

@@ -157,7 +157,7 @@ impl World {
         let computer = &mut self.computers[at];
         let waits = computer.waiting.iter().any(|(of, _)| *of == call);
         if waits {
-            self.history.heard(call, self.now);
+            self.history.note_answered(call, self.now);
             let made = self.history.calls[call].made;
             if self.plan.alone == WhenAlone::Serve && computer.undisturbed_since <= made {
                 let waited = Duration::from_micros(self.now - made);
@@ -205,7 +205,7 @@ impl World {
                             }
                         }
                     }
-                    wire::MergeAnswer::of(&verdicts, &Reply::Value(results.into()))
+                    wire::MergeAnswer::from_reply(&verdicts, &Reply::Value(results.into()))
                 }
             });
         }
@@ -402,7 +402,7 @@ impl World {
             return;
         }
         if self.network.joins(from, to) {
-            return self.told(from, to, key, value);
+            return self.note_notified(from, to, key, value);
         }
         if self.computers[from].ledger.sharing.is_some() {
             self.owed[from][to] = true;
@@ -422,11 +422,11 @@ impl World {
         }
         let stuck = self.stuck.remove(&(from, master, to)).unwrap_or_default();
         for (key, value) in stuck.into_iter().filter(|_| lives) {
-            self.told(from, to, key, value);
+            self.note_notified(from, to, key, value);
         }
     }
 
-    fn told(&mut self, from: usize, to: usize, key: usize, value: Option<i32>) {
+    fn note_notified(&mut self, from: usize, to: usize, key: usize, value: Option<i32>) {
         self.trace(|| format!("{from} tells {to} that {key} is {value:?}"));
         self.history.told[to][key] = value;
     }
