@@ -151,7 +151,7 @@ impl Nodes {
     }
 }
 
-/// Watches the nodes as long as it is polled. Reads the socket table every second, and when a node has registered.
+/// Watches the nodes as long as it is polled. Reads the socket table every second, and when a node has registered or moved.
 pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut looks = interval(LOOK_AGAIN);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -159,6 +159,10 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut noted = None;
     loop {
         tokio::select! {
+            () = nodes.local.moved.notified() => {
+                nodes.local.report_moves();
+                continue;
+            }
             _ = looks.tick() => {
                 let unowned = nodes.local.unowned();
                 if !unowned.is_empty() {
@@ -184,6 +188,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
 /// Checks all nodes once.
 fn check_nodes(nodes: &Arc<Nodes>) {
     let names = local::names(&nodes.ledger);
+    nodes.local.report_moves();
     let registered: BTreeSet<_> = names.iter().map(|name| name.port.clone()).collect();
     // This blocks for less than a millisecond: the kernel generates some kilobytes.
     let listening = match registered.is_empty() {

@@ -42,6 +42,10 @@ pub(crate) struct LocalNodes {
     feuds: Mutex<Feuds>,
     /// Wakes the task that reads the socket table, because a node has registered.
     pub(super) registered: Notify,
+    /// Moved names whose evidence has not been read yet, because no call waits for it.
+    unreported: Mutex<Vec<Moving>>,
+    /// Wakes the task that reports [`Self::unreported`].
+    pub(super) moved: Notify,
 }
 
 #[derive(Debug, Default)]
@@ -100,6 +104,8 @@ impl LocalNodes {
             facts: Mutex::default(),
             feuds: Mutex::default(),
             registered: Notify::new(),
+            unreported: Mutex::default(),
+            moved: Notify::new(),
         }
     }
 

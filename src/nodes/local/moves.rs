@@ -1,8 +1,15 @@
 //! Calls that move a name to another address: the master shuts down whatever node listens at the old one.
+//!
+//! With `--reap report`, such a call does not wait until the kernel's sockets are read: [`LocalNodes::report_moves`]
+//! reads them at the same time. A node that ends within that millisecond counts as ended.
 
-use std::{collections::BTreeSet, sync::PoisonError, time::Instant};
+use std::{
+    collections::BTreeSet,
+    sync::{MutexGuard, PoisonError},
+    time::Instant,
+};
 
-use rescue_core::health::{Eviction, Evidence, Feud, Moving};
+use rescue_core::health::{Eviction, Evidence, Feud, Moving, Reap};
 use ros1_master::master::{Master, Request};
 
 use super::LocalNodes;
@@ -20,22 +27,16 @@ impl MoveJudge for LocalNodes {
         if moving.is_empty() {
             return None;
         }
-        let mut gone = BTreeSet::new();
-        for moving in moving {
-            let evidence = self.evidence_now(&moving);
-            self.note_feud(&moving, evidence);
-            let hits_another = moving.hits_another(evidence);
-            if moving.is_unregistered_first(self.reap, evidence) {
-                if hits_another {
-                    self.stats.shutdowns_prevented.count();
-                    log_prevented_shutdown(&moving);
-                }
-                gone.insert(moving.node);
-            } else if hits_another {
-                self.stats.shutdowns_misdirected.count();
-                log_misdirected_shutdown(&moving);
-            }
+        if self.reap == Reap::Report {
+            self.lock_unreported().extend(moving);
+            self.moved.notify_one();
+            return Some(None);
         }
+        let gone: BTreeSet<_> = moving
+            .into_iter()
+            .filter(|moving| self.judge(moving))
+            .map(|moving| moving.node)
+            .collect();
         Some(ledger.with_mirror(|mirror| Eviction::for_nodes(mirror, gone)))
     }
 
@@ -45,6 +46,43 @@ impl MoveJudge for LocalNodes {
 }
 
 impl LocalNodes {
+    /// Reports the moves that no call has waited for. Must precede [`Self::update`] with names that were read after such
+    /// a move, because the update forgets what was known of the old address. Blocks for less than a millisecond if there
+    /// are any.
+    pub(in crate::nodes) fn report_moves(&self) {
+        let moves = std::mem::take(&mut *self.lock_unreported());
+        for moving in moves {
+            self.judge(&moving);
+        }
+    }
+
+    fn lock_unreported(&self) -> MutexGuard<'_, Vec<Moving>> {
+        self.unreported
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Reads what the kernel shows about the node at the old address, and reports it. Returns whether that node must be
+    /// unregistered before the call.
+    fn judge(&self, moving: &Moving) -> bool {
+        let evidence = self.evidence_now(moving);
+        self.note_feud(moving, evidence);
+        let is_first = moving.is_unregistered_first(self.reap, evidence);
+        if moving.hits_another(evidence) {
+            match is_first {
+                true => {
+                    self.stats.shutdowns_prevented.count();
+                    log_prevented_shutdown(moving);
+                }
+                false => {
+                    self.stats.shutdowns_misdirected.count();
+                    log_misdirected_shutdown(moving);
+                }
+            }
+        }
+        is_first
+    }
+
     /// The feuds of this moment.
     pub(crate) fn feuds(&self) -> Vec<Feud> {
         let mut feuds = self.feuds.lock().unwrap_or_else(PoisonError::into_inner);
