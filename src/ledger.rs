@@ -539,8 +539,7 @@ impl Ledger {
     /// The mirror's version and state, and the [`Token`] for the next master.
     pub fn next(&self) -> (u64, Master, Token) {
         let inner = self.lock();
-        let token = Token::new(&inner.session.mark, inner.next_incarnation());
-        (inner.version, inner.mirror.clone(), token)
+        (inner.version, inner.mirror.clone(), inner.next_token())
     }
 
     /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. A master has run the
@@ -674,12 +673,11 @@ impl Ledger {
     }
 
     /// Decides what the present master needs after it was late and has answered. Freezes the mirror until
-    /// [`Self::end_injection`] or [`Self::serve`]. Begins a new incarnation (see [`Token`]) if the master must run
-    /// writes.
+    /// [`Self::end_injection`] or [`Self::serve`].
     ///
     /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
     /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
-    pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
+    pub(crate) fn begin_catch_up(&self) -> Option<CatchUp> {
         let mut inner = self.lock();
         let behind = inner.behind.take();
         let behind = behind.filter(|behind| behind.answered && behind.is_exact)?;
@@ -691,24 +689,34 @@ impl Ledger {
             return Some(CatchUp::Nothing);
         }
         let writes = inner.pending.calls().get(behind.ran..)?.to_vec();
-        let told = once(&behind, &writes)?;
+        let notified = once(&behind, &writes)?;
         inner.injecting = true;
-        let before = inner.token();
-        let announced = inner.announce();
-        for (subject, nodes) in told {
-            inner.order.master_notifies(now, &subject, nodes);
-        }
-        let missed = Missed {
+        Some(CatchUp::Run(Box::new(Missed {
             behind: behind.state,
             writes,
+            notified,
             mirror: inner.mirror.clone(),
-            before,
-            token: inner.token(),
-            announced,
-        };
+            before: inner.token(),
+            token: inner.next_token(),
+        })))
+    }
+
+    /// Begins the incarnation of [`Missed::token`], like [`Self::succeed`]: the late master is about to run the writes
+    /// that it has missed, and to notify nodes of them.
+    ///
+    /// `None` if another incarnation has begun meanwhile.
+    pub(crate) fn send_missed(&self, now: Instant, missed: &Missed) -> Option<Mark> {
+        let mut inner = self.lock();
+        if inner.next_token() != missed.token {
+            return None;
+        }
+        let announced = inner.announce();
+        for (subject, nodes) in &missed.notified {
+            inner.order.master_notifies(now, subject, *nodes);
+        }
         drop(inner);
         self.write();
-        Some(CatchUp::Run(Box::new(missed)))
+        Some(announced)
     }
 
     /// Runs `work` on the [`Order`] and the mirror.

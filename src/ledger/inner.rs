@@ -268,6 +268,11 @@ impl Inner {
         Token::new(&self.session.mark, self.session.incarnation)
     }
 
+    /// The [`Token`] of the next incarnation.
+    pub(super) fn next_token(&self) -> Token {
+        Token::new(&self.session.mark, self.next_incarnation())
+    }
+
     /// Notes that the mirror has changed without a record. The next complete checkpoint is due.
     pub(super) fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;

@@ -9,8 +9,6 @@ use ros1_master::{
     xmlrpc::Value,
 };
 
-use super::durability::Mark;
-
 /// The state of a late master once it has answered its outstanding calls.
 pub(super) struct LateState {
     pub(super) state: Master,
@@ -39,12 +37,13 @@ pub(crate) struct Missed {
     /// The state that the master holds.
     pub(crate) behind: Master,
     pub(crate) writes: Vec<Request>,
+    /// The topics and parameters of which the master notifies nodes when it runs [`Self::writes`], each with the number
+    /// of these nodes.
+    pub(crate) notified: Vec<(Subject, usize)>,
     /// The state that the master holds after it has run the missed writes.
     pub(crate) mirror: Master,
     pub(crate) before: Token,
     pub(crate) token: Token,
-    /// The record that must be on the disk before the master gets anything.
-    pub(crate) announced: Mark,
 }
 
 /// The topics and parameters of which the master notifies nodes when it runs `writes`, each with the number of these

@@ -196,8 +196,12 @@ struct World {
     /// Calls that a client has sent more than once.
     sent_again: Vec<Request>,
     caught_up: u64,
-    /// The last value that a client has set directly at a master, and the number of that master.
+    /// The last value that a client has set directly at a master, and the number of that master. `None` if it may be
+    /// lost.
     bypassed: Option<(i32, u64)>,
+    /// Whether an injection's connection broke, and the gate has not opened since. The next injection lets the mirror win
+    /// over what a client has set meanwhile, and over what only the lost answer has shown; see decision 52.
+    injection_broke: bool,
     /// Whether the connections to a living master broke, or a master was taken for hung. It may go on and notify nodes of
     /// what it knows after the mirror has told them newer news. Nobody can see that, so values may go back before the
     /// last one comes.
@@ -267,6 +271,7 @@ impl World {
             sent_again: Vec::new(),
             caught_up: 0,
             bypassed: None,
+            injection_broke: false,
             may_go_back: false,
             broken: Vec::new(),
             prints: std::env::var_os("ROSRESCUE_STEPS").is_some(),
@@ -838,6 +843,7 @@ fn each_rule_is_needed() {
         (Mutant::KeepsAnswered, 0),
         (Mutant::ReadsTooEarly, 3_000),
         (Mutant::AnnouncesNothing, 32_200),
+        (Mutant::UndoesDirectChange, 190_800),
     ] {
         let found = mistake(Some(mutant), from, 10_000);
         let (seed, broken) = found.unwrap_or_else(|| panic!("{mutant:?} goes unnoticed"));

@@ -194,7 +194,7 @@ impl World {
         let params = [Value::from("/direct"), key.as_str().into(), value.into()];
         master.state.apply(&Request::new(Method::SetParam, params));
         self.print(|| format!("a client sets {key} to {value} at the master"));
-        self.bypassed = Some((value, life));
+        self.bypassed = (!self.injection_broke).then_some((value, life));
         let time = self.dice.below(COMPARE_WITHIN);
         self.after(time, Event::Compares);
     }
@@ -205,11 +205,6 @@ impl World {
         }
         self.print(|| "all connections to the master break".to_owned());
         self.may_go_back = true;
-        if self.gate() == State::Injecting {
-            // An injection replaces all parameters, and its answer has what a client had set since the inspection. That
-            // answer is lost now.
-            self.bypassed = None;
-        }
         let time = self.dice.below(3_000);
         let event = recovery::Event::ConnectionEnds(self.life);
         self.after(time, Event::Recovery(event));

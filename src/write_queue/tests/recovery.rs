@@ -250,7 +250,10 @@ impl World {
                 Step::Disconnect => self.disconnect(),
                 Step::Shut(gate) => self.shut(gate),
                 Step::NotifyAll => self.notify_all(),
-                Step::ReportDeathWhileInjected => {}
+                Step::ReportDeathWhileInjected => {
+                    self.injection_broke = true;
+                    self.bypassed = None;
+                }
                 Step::SetPatience(patience) => {
                     self.dispatch(super::Input::Patience(patience));
                 }
@@ -317,6 +320,7 @@ impl World {
             Action::OpenGate => {
                 self.recovery.examiner.open_gate();
                 self.recovery.owed_told = false;
+                self.injection_broke = false;
             }
             Action::Spawn => {
                 self.start_master();
