@@ -12,14 +12,12 @@ use rescue_core::checkpoint::{
 };
 use ros1_master::master::{Master, Method, Request};
 
+use super::seal::{position, sealed};
+
 /// Separates the present file from its previous generation, which may follow it.
 const PREVIOUS: &[u8] = b"=== previous generation ===\n";
 
-const MAGIC: &str = "# rosrescue checkpoint v2 ";
-const RECORD_START: &[u8] = b"- {seq: ";
-
-/// Loads the bytes as they are, and again with all check sums corrected, which a fuzzer could never do by
-/// itself.
+/// Loads the bytes as they are, and again with all check sums corrected.
 pub(crate) fn check(bytes: &[u8]) {
     let at = position(bytes, PREVIOUS);
     let (present, previous) = match at {
@@ -28,52 +26,6 @@ pub(crate) fn check(bytes: &[u8]) {
     };
     load(present, previous);
     load(&sealed(present), previous.map(sealed).as_deref());
-}
-
-fn position(bytes: &[u8], what: &[u8]) -> Option<usize> {
-    bytes.windows(what.len()).position(|window| window == what)
-}
-
-/// The file with a first line and records whose check sums are right.
-fn sealed(bytes: &[u8]) -> Vec<u8> {
-    let Some(end) = bytes.iter().position(|&byte| byte == b'\n') else {
-        return bytes.to_vec();
-    };
-    let (first, rest) = bytes.split_at(end + 1);
-    let Some(fields) = std::str::from_utf8(first)
-        .ok()
-        .and_then(|line| line.strip_prefix(MAGIC))
-    else {
-        return bytes.to_vec();
-    };
-    let field = |name| fields.split(' ').find(|field| field.starts_with(name));
-    let journal = b"\njournal:\n";
-    let length = position(rest, journal).map_or(rest.len(), |at| at + journal.len());
-    let (snapshot, records) = rest.split_at(length);
-    let mut out = format!(
-        "{MAGIC}{} {} snapshot={length} crc32c={:08x} header=",
-        field("generation=").unwrap_or("generation=1"),
-        field("seq=").unwrap_or("seq=0"),
-        crc32c::crc32c(snapshot),
-    )
-    .into_bytes();
-    let stamp = crc32c::crc32c(&out);
-    out.extend_from_slice(format!("{stamp:08x}\n").as_bytes());
-    out.extend_from_slice(snapshot);
-    for line in records.split_inclusive(|&byte| byte == b'\n') {
-        let body = line.windows(2).rposition(|window| window == b" #");
-        match body.and_then(|end| line.get(..end)) {
-            Some(body) if line.starts_with(RECORD_START) && line.ends_with(b"\n") => {
-                let start = out.len();
-                out.extend_from_slice(body);
-                out.extend_from_slice(format!(" #{stamp:08x}").as_bytes());
-                let check = crc32c::crc32c(&out[start..]);
-                out.extend_from_slice(format!(" {check:08x}\n").as_bytes());
-            }
-            _ => out.extend_from_slice(line),
-        }
-    }
-    out
 }
 
 /// Panics if loading panics, or if the loaded state is not read back after it was written.

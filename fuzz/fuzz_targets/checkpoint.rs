@@ -4,5 +4,9 @@
 
 #[path = "../checks/checkpoint.rs"]
 mod checkpoint;
+#[path = "../checks/seal.rs"]
+mod seal;
+#[path = "../checks/seal_records.rs"]
+mod seal_records;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| checkpoint::check(bytes));

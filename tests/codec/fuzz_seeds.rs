@@ -3,6 +3,14 @@
 
 #[path = "../../fuzz/checks/checkpoint.rs"]
 mod checkpoint;
+#[path = "../../fuzz/checks/cluster.rs"]
+mod cluster;
+#[path = "../../fuzz/checks/history.rs"]
+mod history;
+#[path = "../../fuzz/checks/seal.rs"]
+mod seal;
+#[path = "../../fuzz/checks/seal_records.rs"]
+mod seal_records;
 #[path = "../../fuzz/checks/xmlrpc.rs"]
 mod xmlrpc;
 
@@ -30,4 +38,14 @@ fn the_seeds_of_the_xmlrpc_fuzz_target_pass() {
 #[test]
 fn the_seeds_of_the_checkpoint_fuzz_target_pass() {
     each_seed("checkpoint", checkpoint::check);
+}
+
+#[test]
+fn the_seeds_of_the_history_fuzz_target_pass() {
+    each_seed("history", history::check);
+}
+
+#[test]
+fn the_seeds_of_the_cluster_fuzz_target_pass() {
+    each_seed("cluster", cluster::check);
 }

@@ -269,8 +269,12 @@ impl LogFile {
     }
 }
 
-/// Decompresses a part. Stops as soon as the part is larger than its first line allows.
-fn decompress(bytes: &[u8]) -> io::Result<Vec<u8>> {
+/// Decompresses a closed part of the log. Stops as soon as the part is larger than its first line allows.
+///
+/// # Errors
+///
+/// If `bytes` are not such a part.
+pub fn decompress(bytes: &[u8]) -> io::Result<Vec<u8>> {
     let mut decoder = MultiGzDecoder::new(bytes);
     let mut text = Vec::new();
     decoder.by_ref().take(FIRST_BYTES).read_to_end(&mut text)?;
