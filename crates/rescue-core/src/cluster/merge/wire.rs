@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::{Conflict, LostWrite, MergeVerdict};
 use ros1_master::{
-    master::{CALLER_ID, Method, Request, entry_reply, is_success},
+    master::{CALLER_ID, Method, Request, entry_reply, is_success, returnable},
     xmlrpc::{Call, Reply, Value},
 };
 
@@ -53,7 +53,8 @@ pub enum WriteOutcome {
     Holds,
     /// The master refused the write.
     Refused(String),
-    /// Another computer has changed the same parameter, node, service or topic registration.
+    /// Another computer has changed the same parameter, node, service or topic registration. `present` is the parameter's
+    /// value now. `None` if it has none, or one that no answer can contain.
     Lost { why: String, present: Option<Value> },
 }
 
@@ -143,7 +144,11 @@ fn value(outcome: &WriteOutcome) -> Value {
     let (code, text, present) = match outcome {
         WriteOutcome::Holds => (1, "", None),
         WriteOutcome::Refused(text) => (0, text.as_str(), None),
-        WriteOutcome::Lost { why, present } => (-1, why.as_str(), present.clone()),
+        WriteOutcome::Lost { why, present } => {
+            // With such a value the whole answer would be a fault, and be asked for again and again.
+            let present = present.clone().filter(returnable::is_readable);
+            (-1, why.as_str(), present)
+        }
     };
     let parts = [Value::Int(code), text.into()].into_iter().chain(present);
     Value::Array(parts.collect())
@@ -176,6 +181,8 @@ fn text(reply: &Reply) -> String {
 
 #[cfg(test)]
 mod tests {
+    use ros1_master::xmlrpc::{decode_reply, encode_reply};
+
     use super::*;
 
     fn set(key: &str, value: i32) -> Request {
@@ -233,6 +240,22 @@ mod tests {
         assert_eq!(MergeAnswer::read(&answer.to_reply(), 3), None);
         let again = MergeAnswer::Again.to_reply();
         assert_eq!(MergeAnswer::read(&again, 4), Some(MergeAnswer::Again));
+    }
+
+    /// Found by the fuzz target `cluster`.
+    #[test]
+    fn a_value_that_no_answer_can_contain_is_left_out_of_it() {
+        let whole = b"<methodCall><methodName>m</methodName><params><param><value><int>18446744073709551615</int></value></param></params></methodCall>";
+        let present = Request::decode(whole).unwrap().params().first().cloned();
+        assert!(present.is_some());
+        let why = "it was changed".to_owned();
+        let lost = |present| {
+            let why = why.clone();
+            MergeAnswer::Done(vec![WriteOutcome::Lost { why, present }])
+        };
+        let sent = encode_reply(&lost(present).to_reply());
+        let read = MergeAnswer::read(&decode_reply(&sent).unwrap(), 1);
+        assert_eq!(read, Some(lost(None)));
     }
 
     #[test]
