@@ -48,6 +48,7 @@ struct Copy {
     snapshot: Option<(u64, Master, Vec<Displaced>)>,
     state: Master,
     values: BTreeMap<String, Vec<u8>>,
+    members: BTreeMap<String, (MemberEntry, u64)>,
 }
 
 #[derive(Debug)]
@@ -190,6 +191,7 @@ impl Etcd {
             snapshot: self.snapshot.clone(),
             state: self.state.clone(),
             values: self.values.clone(),
+            members: self.members.clone(),
         }));
     }
 
@@ -201,6 +203,7 @@ impl Etcd {
             snapshot,
             state,
             values,
+            members,
         } = *self.saved.clone().unwrap();
         let revision = match is_bumped {
             true => self.view.revision + 1000,
@@ -208,7 +211,7 @@ impl Etcd {
         };
         self.compacted = revision;
         (self.puts, self.deletes) = (Vec::new(), Vec::new());
-        self.members.clear();
+        self.members = members;
         (self.view, self.entries, self.snapshot) = (view, entries, snapshot);
         (self.state, self.values) = (state, values);
         self.view.revision = revision;

@@ -122,7 +122,7 @@ impl World {
                         .breaks("a leader answers what no journal holds");
                 }
                 // A leader of the etcd that was lost may not know of the loss yet.
-                if term <= self.etcd.view().revision && !self.etcd.is_lost {
+                if term <= self.etcd.view().revision && !self.etcd.is_lost && !restored {
                     self.term = self.term.max(term);
                 }
             }
