@@ -24,6 +24,8 @@ pub(crate) enum Mutant {
     KeepsAnswered,
     /// An injection is not announced in the journal.
     AnnouncesNothing,
+    /// A master is read although it may still run calls of closed connections.
+    ReadsBeforeRun,
     /// The mirror wins over what another program has set in a late master while it caught up.
     UndoesDirectChange,
     /// The master is read although it has not run all writes that the mirror has answered first.

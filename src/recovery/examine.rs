@@ -251,7 +251,9 @@ impl Examiner {
         };
         let mut resumed = resumes(&first);
         if !is_new && !resumed {
-            master.settle().await?;
+            if !Mutant::ReadsBeforeRun.lives() {
+                master.settle().await?;
+            }
             self.ledger.settled();
             first = self.first_look(master).await?;
             resumed = resumes(&first);

@@ -108,6 +108,8 @@ enum Event {
     Breaks,
     /// A client sets a parameter directly at the master.
     Bypasses,
+    /// A node's process ends. Another one begins under the same name.
+    NodeRestarts,
     /// The write queue compares the master with the mirror.
     Compares,
     Recovery(recovery::Event),
@@ -195,6 +197,8 @@ struct World {
     values: node::Values,
     /// Calls that a client has sent more than once.
     sent_again: Vec<Request>,
+    /// Calls of nodes that ended before they were answered. Some have run, at any time.
+    abandoned: Vec<Request>,
     caught_up: u64,
     /// The last value that a client has set directly at a master, and the number of that master. `None` if it may be
     /// lost.
@@ -269,6 +273,7 @@ impl World {
             time: 0,
             values: HashMap::new(),
             sent_again: Vec::new(),
+            abandoned: Vec::new(),
             caught_up: 0,
             bypassed: None,
             injection_broke: false,
@@ -301,6 +306,7 @@ impl World {
                 0..2 => Event::Breaks,
                 2..5 => Event::WorkerDies,
                 5 => Event::Bypasses,
+                6 => Event::NodeRestarts,
                 _ => Event::Dies,
             };
             world.after(time, event);
@@ -372,12 +378,28 @@ impl World {
         self.after(pause, Event::Arrives(node, call));
     }
 
+    /// The process of a node ends, and what it has not sent is lost. Its name starts again at another port.
+    fn node_restarts(&mut self) {
+        let living = self.nodes.iter().enumerate();
+        let living = living.filter(|(_, node)| !node.is_dead);
+        let living: Vec<_> = living.map(|(index, _)| index).collect();
+        let node = living[self.dice.below(living.len() as u64) as usize];
+        self.print(|| format!("{} starts again", self.nodes[node].name));
+        let next = self.nodes[node].restart();
+        self.nodes.push(next);
+        self.calls_left += CALLS / 4;
+        self.call(self.nodes.len() - 1);
+    }
+
     fn arrives(&mut self, node: usize, call: Request) {
+        if self.nodes[node].is_dead {
+            return self.abandoned.push(call);
+        }
         if self.is_down {
             // The listening socket stays open meanwhile.
             return self.after(5_000, Event::Arrives(node, call));
         }
-        self.print(|| format!("/n{node} calls {call:?}"));
+        self.print(|| format!("{} calls {call:?}", self.nodes[node].name));
         if call.kind() == Kind::Read {
             let begun = match Mutant::NoOrder.lives() {
                 true => Ok(None),
@@ -525,7 +547,7 @@ impl World {
             let Waiting {
                 node, call, since, ..
             } = waiting;
-            self.print(|| format!("/n{node} is answered: {call:?}"));
+            self.print(|| format!("{} is answered: {call:?}", self.nodes[node].name));
             let took = self.now - since;
             if took > ANSWERED_WITHIN {
                 self.broken.push(format!("{call:?} took {took} µs"));
@@ -605,8 +627,12 @@ impl World {
             self.note_value(&set);
         }
         let time = 100 + late + self.scheduled();
-        let at = self.nodes.iter().position(|node| node.port() == port);
-        if let Some(node) = at {
+        let lives = |node: &Node| node.port() == port && !node.is_dead;
+        if let Some(node) = self.nodes.iter().position(lives) {
+            if call.method == "shutdown" {
+                let name = &self.nodes[node].name;
+                self.broken.push(format!("{name} lives, and is shut down"));
+            }
             self.nodes[node].arrives(call, &self.values);
             self.after(time, Event::Heard(node, Thread::Server(call.clone())));
         }
@@ -648,6 +674,7 @@ impl World {
                 let time = 30 + self.scheduled();
                 self.after(time, Event::Heard(node, Thread::Main(call, reply)));
             }
+            Event::Heard(node, _) if self.nodes[node].is_dead => {}
             Event::Heard(node, thread) => {
                 let answered = match &thread {
                     Thread::Main(call, _) => Some(call.clone()),
@@ -678,6 +705,7 @@ impl World {
             Event::Breaks => self.breaks(),
             Event::Recovery(event) => self.recovers(event),
             Event::Bypasses => self.bypasses(),
+            Event::NodeRestarts => self.node_restarts(),
             Event::Compares => {
                 self.after(COMPARE_WITHIN, Event::Compares);
                 input = Input::Compare;
@@ -733,6 +761,20 @@ impl World {
         (self.broken, self.caught_up)
     }
 
+    /// The state of the master without parameter subscriptions of processes that have ended. No read shows them. So a
+    /// master that was late keeps them if the name has registered at another address meanwhile, and unregistered.
+    fn without_subscriptions_of_the_dead(&self, mut state: Master, mirror: &Master) -> Master {
+        let dead = self.nodes.iter().filter(|node| node.is_dead);
+        for node in dead.filter(|node| mirror.api_of(&node.name) != Some(&node.api)) {
+            for number in 0..PARAMS {
+                let words = [&node.name, &node.api, &format!("/p{number}")];
+                let words = words.map(String::as_str);
+                state.apply(&Request::new(Method::UnsubscribeParam, words));
+            }
+        }
+        state
+    }
+
     /// Checks the promises at the end.
     fn check(&mut self) {
         if !self.waiting.is_empty() {
@@ -741,20 +783,27 @@ impl World {
             self.broken.push(format!("never answered: {calls:?}"));
         }
         let mirror = self.ledger.with_mirror(Clone::clone);
-        let mistakes = self.nodes.iter().flat_map(|node| node.mistakes(&mirror));
+        let (dead, living): (Vec<_>, Vec<_>) = self.nodes.iter().partition(|node| node.is_dead);
+        let dead = dead.into_iter().map(|node| node.api.as_str()).collect();
+        let mistakes = living
+            .into_iter()
+            .flat_map(|node| node.mistakes(&mirror, &dead));
         self.broken.extend(mistakes);
         if !self.may_go_back {
             let gone_back = self.nodes.iter().flat_map(|node| node.gone_back.clone());
             self.broken.extend(gone_back);
         }
-        match &self.master {
-            Some(master) if master.state() == mirror => {}
-            Some(master) => {
-                let state = master.state();
+        let state = self.master.as_ref().map(Process::state);
+        let state = state.map(|state| self.without_subscriptions_of_the_dead(state, &mirror));
+        match state {
+            Some(state) if state == mirror => {}
+            Some(state) => {
                 let mut difference = replay::difference(&mirror, &state);
                 let subscribers = |state: &Master| BTreeSet::from_iter(state.param_subscribers());
-                if self.deaths > 0 && subscribers(&mirror) == subscribers(&state) {
-                    // Their order cannot be read from a master, and the process that knew it has died.
+                let has_restarted = self.deaths > 0 || self.nodes.len() > NODES as usize;
+                if has_restarted && subscribers(&mirror) == subscribers(&state) {
+                    // Their order cannot be read from a master. The process that knew it has died, or a master has lost
+                    // the subscriptions of a node that has another address now.
                     difference.retain(|what| !what.starts_with("the parameter subscribers"));
                 }
                 if !difference.is_empty() {
@@ -764,7 +813,7 @@ impl World {
             }
             None => self.broken.push("there is no master".to_owned()),
         }
-        for node in &self.nodes {
+        for node in self.nodes.iter().filter(|node| !node.is_dead) {
             self.broken.extend(node.lost_registrations(&mirror));
         }
         if let Some((value, life)) = self.bypassed.filter(|(_, life)| *life == self.life) {
@@ -790,7 +839,11 @@ impl World {
                 .iter()
                 .filter(|set| set.call.params().get(2) == value.as_ref());
             let is_last = |set: &&&Done| sets.iter().all(|other| other.from <= set.to);
-            if !sets.is_empty() && !written.clone().any(|set| is_last(&set)) {
+            let is_abandoned = self
+                .abandoned
+                .iter()
+                .any(|call| call.text(1) == Some(&key) && call.params().get(2) == value.as_ref());
+            if !sets.is_empty() && !is_abandoned && !written.clone().any(|set| is_last(&set)) {
                 self.broken.push(format!("{key} is {value:?}, of {sets:?}"));
             }
         }
@@ -844,6 +897,7 @@ fn each_rule_is_needed() {
         (Mutant::ReadsTooEarly, 3_000),
         (Mutant::AnnouncesNothing, 32_200),
         (Mutant::UndoesDirectChange, 190_800),
+        (Mutant::ReadsBeforeRun, 0),
     ] {
         let found = mistake(Some(mutant), from, 10_000);
         let (seed, broken) = found.unwrap_or_else(|| panic!("{mutant:?} goes unnoticed"));

@@ -74,7 +74,8 @@ impl World {
             return;
         };
         if now < master.stopped {
-            let time = master.stopped - now;
+            // Each connection has a thread of its own.
+            let time = master.stopped - now + self.scheduled();
             return self.after(time, Event::MasterGets(life, asked, request));
         }
         master.running -= 1;

@@ -29,11 +29,15 @@ pub(super) enum Thread {
     Server(Call),
 }
 
-/// A node, and what it believes.
+/// A process of a node, and what it believes.
 #[derive(Debug)]
 pub(super) struct Node {
-    name: String,
-    api: String,
+    pub(super) name: String,
+    pub(super) api: String,
+    /// The number of the node, and how many processes it has had before.
+    number: u64,
+    earlier: u64,
+    pub(super) is_dead: bool,
     library: Library,
     /// The publishers of each subscribed topic, as the node last heard.
     topics: BTreeMap<String, Vec<String>>,
@@ -57,6 +61,9 @@ impl Node {
         Self {
             name: format!("/n{number}"),
             api: format!("http://n{number}:1/"),
+            number,
+            earlier: 0,
+            is_dead: false,
             library,
             topics: BTreeMap::new(),
             params: BTreeMap::new(),
@@ -67,6 +74,19 @@ impl Node {
             blocked: Vec::new(),
             arrived: BTreeMap::new(),
             gone_back: Vec::new(),
+        }
+    }
+
+    /// Ends this process. Returns the next one, which has another port.
+    pub(super) fn restart(&mut self) -> Self {
+        self.is_dead = true;
+        let earlier = self.earlier + 1;
+        Self {
+            api: format!("http://n{}:{}/", self.number, earlier + 1),
+            earlier,
+            // A master never notifies a name of a parameter that it has set itself.
+            set: self.set.clone(),
+            ..Self::new(self.number, self.library)
         }
     }
 
@@ -216,12 +236,17 @@ impl Node {
         None
     }
 
-    /// The node's beliefs that contradict `state`.
-    pub(super) fn mistakes(&self, state: &Master) -> Vec<String> {
+    /// The node's beliefs that contradict `state`. No master tells subscribers that a publisher at one of the `dead`
+    /// addresses has lost its name to another process.
+    pub(super) fn mistakes(&self, state: &Master, dead: &BTreeSet<&str>) -> Vec<String> {
         let mut mistakes = Vec::new();
         for (topic, list) in &self.topics {
             let truth = state.publishers_of(topic);
-            if *list != truth {
+            let living = |list: &[String]| {
+                let living = list.iter().filter(|api| !dead.contains(api.as_str()));
+                living.cloned().collect::<Vec<_>>()
+            };
+            if living(list) != living(&truth) {
                 let name = &self.name;
                 mistakes.push(format!("{name} {topic}: {list:?} instead of {truth:?}"));
             }

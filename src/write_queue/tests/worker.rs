@@ -147,6 +147,7 @@ impl World {
                     | Event::Dies
                     | Event::Breaks
                     | Event::Bypasses
+                    | Event::NodeRestarts
                     | Event::Compares
                     | Event::WorkerDies
                     | Event::DiskFails
