@@ -46,7 +46,7 @@ use self::activity::Activity;
 pub(crate) use self::durability::Mark;
 use self::{
     inner::{Inner, Notifier},
-    late::{CatchUp, LateState, Missed, once},
+    late::{CatchUp, LateState, Missed, notified_once},
     mutant::Mutant,
     shared::{Agreement, LeaderLease, Shared},
 };
@@ -689,7 +689,7 @@ impl Ledger {
             return Some(CatchUp::Nothing);
         }
         let writes = inner.pending.calls().get(behind.ran..)?.to_vec();
-        let notified = once(&behind, &writes)?;
+        let notified = notified_once(&behind, &writes)?;
         inner.injecting = true;
         Some(CatchUp::Run(Box::new(Missed {
             behind: behind.state,

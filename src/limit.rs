@@ -13,7 +13,7 @@ const REFILL: Duration = Duration::from_secs(300);
 
 /// Permission to let one event pass, for example to write one log line.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Pass {
+pub(crate) struct Permit {
     /// Number of events left out before this one. `None` if there were none.
     pub(crate) left_out: Option<u64>,
 }
@@ -36,7 +36,7 @@ impl Limit {
     }
 
     /// Permission for an event at `now`. `None` if it must be left out.
-    pub(crate) fn pass(&self, now: Instant) -> Option<Pass> {
+    pub(crate) fn pass(&self, now: Instant) -> Option<Permit> {
         let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         bucket.pass(now)
     }
@@ -49,7 +49,7 @@ impl Bucket {
         left_out: 0,
     };
 
-    fn pass(&mut self, now: Instant) -> Option<Pass> {
+    fn pass(&mut self, now: Instant) -> Option<Permit> {
         let mut filled = *self.filled.get_or_insert(now);
         while self.tokens < BURST && now.duration_since(filled) >= REFILL {
             filled += REFILL;
@@ -65,7 +65,7 @@ impl Bucket {
         };
         self.tokens = left;
         let left_out = std::mem::take(&mut self.left_out);
-        Some(Pass {
+        Some(Permit {
             left_out: (left_out > 0).then_some(left_out),
         })
     }
@@ -95,7 +95,7 @@ impl AlarmLimit {
     }
 
     /// Permission to log an alarm at `now`. `None` if the alarm must be left out.
-    pub(crate) fn alarm(&self, now: Instant) -> Option<Pass> {
+    pub(crate) fn alarm(&self, now: Instant) -> Option<Permit> {
         let mut episode = self.lock();
         let passed = episode.bucket.pass(now);
         episode.alarm_logged = Some(episode.alarm_logged == Some(true) || passed.is_some());
@@ -105,10 +105,10 @@ impl AlarmLimit {
     /// Permission to log the all-clear at `now`. The all-clear is logged if an alarm was logged since the last
     /// all-clear, and left out if all alarms since then were left out. Without an alarm the all-clear is limited like
     /// any other line.
-    pub(crate) fn all_clear(&self, now: Instant) -> Option<Pass> {
+    pub(crate) fn all_clear(&self, now: Instant) -> Option<Permit> {
         let mut episode = self.lock();
         match episode.alarm_logged.take() {
-            Some(told) => told.then_some(Pass { left_out: None }),
+            Some(told) => told.then_some(Permit { left_out: None }),
             None => episode.bucket.pass(now),
         }
     }
@@ -159,8 +159,8 @@ mod tests {
     use super::*;
 
     /// A permission after `left_out` refusals.
-    fn passed(left_out: Option<u64>) -> Option<Pass> {
-        Some(Pass { left_out })
+    fn passed(left_out: Option<u64>) -> Option<Permit> {
+        Some(Permit { left_out })
     }
 
     #[test]

@@ -66,7 +66,7 @@ pub struct LastCalls {
 
 /// A topic registration that was removed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Lost {
+struct RemovedRegistration {
     node: String,
     api: String,
     /// True if the node published the topic, false if it subscribed to the topic.
@@ -103,7 +103,7 @@ pub struct Activity {
     /// Nodes whose process id is not known since they registered, with the time of the registration.
     unidentified: IndexMap<String, Instant>,
     /// The latest topic registrations that any client has removed.
-    lost: VecDeque<Lost>,
+    lost: VecDeque<RemovedRegistration>,
     /// Nodes that a master had to tell to shut down, with the time.
     displaced: Vec<(Instant, Displaced)>,
     /// All nodes that lost their names to other nodes recently, with the time. The next start cannot know whether they
@@ -281,7 +281,7 @@ impl Activity {
                 if self.lost.len() == NOTICES {
                     self.lost.pop_front();
                 }
-                self.lost.push_back(Lost {
+                self.lost.push_back(RemovedRegistration {
                     node: node.to_owned(),
                     api: api.to_owned(),
                     publishes,

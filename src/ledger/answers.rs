@@ -125,17 +125,17 @@ impl Ledger {
     ///
     /// `None` while a master is being brought to the mirror's state (an injection), if another computer has the master,
     /// or if the answers to the reads in a multicall are too large. Then the call has to wait.
-    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
+    pub fn answer_from_mirror(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) =
             self.answer_standing_in(now, call, &concern, &Source::Here, Origin::Rosrescue)?;
         Some((reply, mark))
     }
 
-    /// Like [`Self::stand_in`], for a client's call from `source`. `concern` says which topics, parameters and node
+    /// Like [`Self::answer_from_mirror`], for a client's call from `source`. `concern` says which topics, parameters and node
     /// names the call concerns. The answer counts as on its way to the client until the returned [`Delivery`] is
     /// dropped.
-    pub(crate) fn stand_in_for(
+    pub(crate) fn answer_client_from_mirror(
         self: &Arc<Self>,
         now: Instant,
         call: &Request,

@@ -142,7 +142,7 @@ impl Checkpointer {
 
     /// Waits for the result of `work`, however long the disk takes. Calls `silent` when the disk has been silent for
     /// [`DISK_PATIENCE`].
-    async fn waited_for<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
+    async fn await_disk<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
         let mut work = std::pin::pin!(work);
         match timeout(DISK_PATIENCE, &mut work).await {
             Ok(done) => done,
@@ -159,7 +159,7 @@ impl Checkpointer {
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
     ) -> Option<T> {
         let done = self.ledger.on_store(work);
-        self.waited_for(done, || self.ledger.give_up_disk()).await
+        self.await_disk(done, || self.ledger.give_up_disk()).await
     }
 
     /// Checks the file, and syncs it if `syncs`.
@@ -176,7 +176,7 @@ impl Checkpointer {
         });
         let ledger = &self.ledger;
         let done = self
-            .waited_for(work, || ledger.set_sync_is_late(true))
+            .await_disk(work, || ledger.set_sync_is_late(true))
             .await;
         ledger.set_sync_is_late(false);
         if let Ok((checked, synced, free)) = done {
@@ -219,7 +219,7 @@ impl Checkpointer {
         let ledger = Arc::clone(&self.ledger);
         let begun = ledger
             .on_store_whole(|store, checkpoint| (store.seq(), store.begin_compaction(checkpoint)));
-        let begun = self.waited_for(begun, || ledger.give_up_disk()).await;
+        let begun = self.await_disk(begun, || ledger.give_up_disk()).await;
         let (seq, finished) = match begun {
             None => return,
             Some((seq, Err(error))) => (seq, Some(Err(error))),

@@ -48,7 +48,10 @@ pub(crate) struct Missed {
 
 /// The topics and parameters of which the master notifies nodes when it runs `writes`, each with the number of these
 /// nodes. `None` if a node would have to shut down, or if nodes would be notified of one of them more than once.
-pub(super) fn once(behind: &LateState, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
+pub(super) fn notified_once(
+    behind: &LateState,
+    writes: &[Request],
+) -> Option<Vec<(Subject, usize)>> {
     let mut heard = BySubject::default();
     for subject in &behind.tells {
         heard.add(subject, ());

@@ -177,7 +177,7 @@ mod tests {
 
     /// Answers `call` in place of a master, and returns what must be safe before the answer counts.
     fn answer(ledger: &Ledger, call: &Request) -> Mark {
-        ledger.stand_in(Instant::now(), call).unwrap().1
+        ledger.answer_from_mirror(Instant::now(), call).unwrap().1
     }
 
     fn seqs(ledger: &Ledger) -> Vec<u64> {
@@ -211,7 +211,7 @@ mod tests {
     fn while_another_computer_has_the_master_its_records_are_followed_and_nothing_else_is_taken() {
         let ledger = ledger();
         ledger.leave();
-        assert!(ledger.stand_in(Instant::now(), &set(1)).is_none());
+        assert!(ledger.answer_from_mirror(Instant::now(), &set(1)).is_none());
         let reply = Reply::Value(vec![Value::from(1), "".into(), 0.into()].into());
         let recorded = ledger.record_here(Instant::now(), 0, &[(&set(1), &reply)]);
         assert!(recorded.is_err());

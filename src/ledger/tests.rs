@@ -103,7 +103,7 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
             [Value::from("/n"), "/a".into(), value.into()],
         )
     };
-    let answer = |call: &Request| ledger.stand_in(now, call).unwrap().0;
+    let answer = |call: &Request| ledger.answer_from_mirror(now, call).unwrap().0;
     assert_eq!(answer(&set(1)), answered(&set(1), &mut Master::default()));
     answer(&set(2));
     // A call that changes nothing needs no master, and a refused call has not run.
@@ -130,7 +130,7 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
 fn what_an_older_mirror_cannot_delete_is_pending_until_a_master_was_read() {
     let ledger = ledger();
     let delete = || call("deleteParam", &["/n", "/newer"]);
-    let answer = |call: &Request| ledger.stand_in(Instant::now(), call).unwrap().0;
+    let answer = |call: &Request| ledger.answer_from_mirror(Instant::now(), call).unwrap().0;
     ledger.set_unconfirmed();
     let refused = answered(&delete(), &mut Master::default());
     assert_eq!(answer(&delete()), refused);
@@ -153,7 +153,7 @@ fn too_many_pending_writes_make_another_incarnation_of_their_master() {
         )
     };
     let many = Request::multicall((0..20_000).map(set));
-    assert!(ledger.stand_in(Instant::now(), &many).is_some());
+    assert!(ledger.answer_from_mirror(Instant::now(), &many).is_some());
     assert_eq!(pending(&ledger), []);
     assert_ne!(ledger.token(), before);
 }
@@ -198,12 +198,12 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     let basis = ledger.begin_injection();
     assert_eq!((basis.version, basis.pending), (ledger.version(), vec![]));
     let bye = call("unregisterPublisher", &["/n", "/a", "http://n:1/"]);
-    assert_eq!(ledger.stand_in(now, &bye), None);
+    assert_eq!(ledger.answer_from_mirror(now, &bye), None);
     let publish = publish("/t");
     let reply = answered(&publish, &mut Master::default());
     assert!(ledger.record_here(now, 0, &[(&publish, &reply)]).is_err());
     ledger.end_injection();
-    assert!(ledger.stand_in(now, &bye).is_some());
+    assert!(ledger.answer_from_mirror(now, &bye).is_some());
 }
 
 /// A call in flight when the master goes away may still run when the master is back, even if the call changes nothing
@@ -216,17 +216,17 @@ fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     ledger.abandon_batch();
     assert!(!ledger.resume());
     ledger.settled();
-    assert!(ledger.stand_in(now, &set).is_some());
+    assert!(ledger.answer_from_mirror(now, &set).is_some());
     assert!(!ledger.resume());
     ledger.delivered();
     assert!(ledger.resume());
     assert_eq!(
-        ledger.stand_in(now, &set),
+        ledger.answer_from_mirror(now, &set),
         None,
         "the mirror changed before the gate opened"
     );
     ledger.end_injection();
-    assert!(ledger.stand_in(now, &set).is_some());
+    assert!(ledger.answer_from_mirror(now, &set).is_some());
     ledger.abandon_batch();
     ledger.succeed();
     assert!(ledger.resume());
@@ -238,7 +238,7 @@ fn an_unregistration_without_effect_is_left_to_the_master() {
     let ledger = ledger();
     let now = Instant::now();
     let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
-    ledger.stand_in(now, &watch);
+    ledger.answer_from_mirror(now, &watch);
     let bye = call("unregisterPublisher", &["/n", "/gone", "http://n:1/"]);
     assert!(ledger.answer_if_unchanged(now, &watch).is_some());
     for calls in [vec![bye.clone()], vec![watch.clone(), bye.clone()]] {
@@ -297,13 +297,13 @@ fn what_is_left_to_a_late_master_is_owed_until_the_next_one_serves() {
     let ledger = ledger();
     let now = Instant::now();
     let subscriber = ["/s", "/t", "std_msgs/String", "http://s:1/"];
-    ledger.stand_in(now, &call("registerSubscriber", &subscriber));
+    ledger.answer_from_mirror(now, &call("registerSubscriber", &subscriber));
     ledger.delivered();
     let publish = publish("/t");
     let concern = Concern::of_call(Some(&publish));
     ledger.with_order(|order, _| order.calls_sent(concern.notified_subjects(), Vec::new()));
     // The master is late with the call, so the mirror answers it. Then the master answers, and dies.
-    ledger.stand_in(now, &publish);
+    ledger.answer_from_mirror(now, &publish);
     ledger.fall_behind(now, concern.notified_subjects().to_vec(), true);
     ledger.late_answered(now);
     ledger.abandon_batch();
@@ -317,13 +317,13 @@ fn what_changes_nothing_leaves_no_trace() {
     let now = Instant::now();
     let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
     assert!(ledger.answer_if_unchanged(now, &watch).is_none());
-    ledger.stand_in(now, &watch);
+    ledger.answer_from_mirror(now, &watch);
     let (version, pending_before) = (ledger.version(), pending(&ledger));
     // Without a journal there is no mark.
     let expected = Some((answered(&watch, &mut Master::default()), Mark::default()));
     let (reply, mark, _) = ledger.answer_if_unchanged(now, &watch).unwrap();
     assert_eq!(Some((reply, mark)), expected);
-    assert_eq!(ledger.stand_in(now, &watch), expected);
+    assert_eq!(ledger.answer_from_mirror(now, &watch), expected);
     assert_eq!(
         (ledger.version(), pending(&ledger)),
         (version, pending_before)
@@ -372,18 +372,18 @@ fn what_takes_nothing_away_is_pending_within_limits() {
         )
     };
     for _ in 0..3 {
-        ledger.stand_in(now, &bye(0));
+        ledger.answer_from_mirror(now, &bye(0));
     }
     assert_eq!(pending(&ledger), [bye(0)]);
     for number in 0..2 * UNCHANGED_PENDING_MAX {
-        ledger.stand_in(now, &bye(number));
+        ledger.answer_from_mirror(now, &bye(number));
     }
     assert_eq!(pending(&ledger).len(), UNCHANGED_PENDING_MAX);
     let publish = publish("/late");
     let reply = ledger.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
     ledger.record_here(now, 0, &[(&publish, &reply)]).unwrap();
     let last = call("unregisterPublisher", &["/n", "/late", "http://n:1/"]);
-    ledger.stand_in(now, &last);
+    ledger.answer_from_mirror(now, &last);
     assert_eq!(pending(&ledger).last(), Some(&last));
 }
 
@@ -418,12 +418,12 @@ fn reads_are_answered_together_within_limits() {
     let unregistering = Request::multicall([bye()].into_iter().chain(reads(100_000)));
     assert_eq!(ledger.answer(&many), None);
     assert_eq!(ledger.answer(&nested), None);
-    assert_eq!(ledger.stand_in(now, &unregistering), None);
+    assert_eq!(ledger.answer_from_mirror(now, &unregistering), None);
     assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
     assert!(ledger.answer(&read()).is_some());
     assert!(ledger.answer(&Request::multicall(reads(60))).is_some());
     let unregistering = Request::multicall([bye()].into_iter().chain(reads(60)));
-    assert!(ledger.stand_in(now, &unregistering).is_some());
+    assert!(ledger.answer_from_mirror(now, &unregistering).is_some());
 }
 
 #[test]
@@ -436,7 +436,7 @@ fn a_look_counts_if_nothing_came_between() {
         held
     };
     let (incarnation, version) = (ledger.incarnation(), ledger.version());
-    ledger.stand_in(
+    ledger.answer_from_mirror(
         Instant::now(),
         &call("unregisterPublisher", &["/n", "/t", "http://n:1/"]),
     );
@@ -460,7 +460,7 @@ async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     ledger.follow_state(held.clone()).unwrap();
     ledger.lead(7, &held);
     // A node repeats a write after the previous leader had recorded it and died before the answer.
-    let (_, mark) = ledger.stand_in(Instant::now(), &publish).unwrap();
+    let (_, mark) = ledger.answer_from_mirror(Instant::now(), &publish).unwrap();
     let safe = ledger.durable(ledger.to_await(mark).unwrap());
     let safe = tokio::time::timeout(Duration::from_secs(5), safe).await;
     assert_eq!(safe, Ok(true), "it waits for a record that nobody makes");
@@ -643,7 +643,7 @@ async fn a_write_that_the_mirror_answers_instead_stays_in_the_file() {
     let it = Recorded::new().await;
     let call = Arc::new(publish("/t"));
     it.ledger.record_ahead(&call, Origin::Rosrescue);
-    it.ledger.stand_in(Instant::now(), &call).unwrap();
+    it.ledger.answer_from_mirror(Instant::now(), &call).unwrap();
     it.ledger.withdraw();
     assert!(!it.ledger.checkpoint_due());
     assert_eq!(it.found().await.0.counts().publishers, 1);

@@ -182,7 +182,7 @@ impl Contact for LiveMaster {
 
     async fn inject(&mut self, plan: &Plan) -> Result<RawReply, ExamineError> {
         let (request, answer) = (plan.request().clone(), plan.answer());
-        let reply = self.connection.predicted(request, answer);
+        let reply = self.connection.call_expecting(request, answer);
         match self.catches_up {
             true => within(CATCH_UP_LIMIT, reply).await,
             false => self.reach.while_alive(reply).await,

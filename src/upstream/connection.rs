@@ -165,7 +165,7 @@ impl Connection {
     }
 
     /// Sends a body made by rosrescue. The part of the reply that equals `predicted` is compared without being stored.
-    pub async fn predicted(
+    pub async fn call_expecting(
         &mut self,
         body: Bytes,
         predicted: &Bytes,

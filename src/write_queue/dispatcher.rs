@@ -291,8 +291,8 @@ impl Dispatcher {
             State::Elsewhere => self.send_elsewhere(),
             _ if !view.leads => {}
             State::Open { incarnation } => self.send(view.now, incarnation),
-            State::StandingIn => self.stand_in(view.now),
-            State::Late => self.stand_in_for_late(view.now),
+            State::StandingIn => self.answer_from_mirror(view.now),
+            State::Late => self.answer_for_late_master(view.now),
             State::Injecting | State::Unknown => {}
         }
         self.answer_unchanged(view);
@@ -897,7 +897,7 @@ impl Dispatcher {
     }
 
     /// Answers the batch in flight, then the queue, from the mirror. Calls that only a master can answer wait.
-    fn stand_in(&mut self, now: Instant) {
+    fn answer_from_mirror(&mut self, now: Instant) {
         if let Exchange::InFlight(batch) = &mut self.exchange {
             if now < *batch.grace.get_or_insert(now + GRACE) {
                 return;
@@ -927,7 +927,7 @@ impl Dispatcher {
 
     /// Answers from the mirror the batch that the master is late with, then the queue. The batch continues. When the
     /// master has answered it, the recovery gives the master the writes that it missed.
-    fn stand_in_for_late(&mut self, now: Instant) {
+    fn answer_for_late_master(&mut self, now: Instant) {
         match &mut self.exchange {
             Exchange::InFlight(batch) => {
                 match std::mem::replace(&mut batch.work, Work::AnsweredByMirror) {
@@ -1057,7 +1057,7 @@ impl MirrorAnswers {
         let call = item.answerable();
         let answer = |call| {
             let (concern, source, origin) = (item.concern(), &item.source, item.origin);
-            ledger.stand_in_for(now, call, concern, source, origin)
+            ledger.answer_client_from_mirror(now, call, concern, source, origin)
         };
         let Some((reply, mark, delivery)) = call.and_then(answer) else {
             return Some(item);

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::world::{Counts, Plan, World};
+use self::world::{Counts, ScheduleOptions, World};
 use super::{
     machine::{Commit, WhenAlone},
     member::PROBES,
@@ -31,8 +31,8 @@ fn first() -> u64 {
 }
 
 /// The plan of a seed. With `ROSRESCUE_LOSSES`, etcd loses data in each schedule. Successive seeds go through all combinations of options.
-fn plan(seed: u64) -> Plan {
-    Plan {
+fn plan(seed: u64) -> ScheduleOptions {
+    ScheduleOptions {
         seed,
         commit: match seed % 2 {
             0 => Commit::Always,
@@ -60,7 +60,7 @@ fn play(seed: u64) -> World {
 
 /// Plays the schedule of `seed` in which etcd keeps its data.
 fn play_without_data_loss(seed: u64) -> World {
-    played(Plan {
+    played(ScheduleOptions {
         data_loss: false,
         ..plan(seed)
     })
@@ -68,13 +68,13 @@ fn play_without_data_loss(seed: u64) -> World {
 
 /// Plays the schedule of `seed` in which etcd loses data.
 fn play_with_data_loss(seed: u64) -> World {
-    played(Plan {
+    played(ScheduleOptions {
         data_loss: true,
         ..plan(seed)
     })
 }
 
-fn played(plan: Plan) -> World {
+fn played(plan: ScheduleOptions) -> World {
     let mut world = World::new(plan);
     world.run(Duration::from_secs(12));
     world.heal();
@@ -202,7 +202,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
 
 /// A schedule without random failures, and with delays of at most 20 ms between computers.
 fn calm(seed: u64) -> World {
-    let plan = Plan {
+    let plan = ScheduleOptions {
         faults: false,
         ..plan(seed)
     };
@@ -495,7 +495,7 @@ fn a_power_cut_loses_no_write_although_the_leader_comes_back_first() {
 
 /// A schedule in which two computers have the same name.
 fn twins(seed: u64) -> World {
-    let plan = Plan {
+    let plan = ScheduleOptions {
         faults: false,
         twins: true,
         ..plan(seed)

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::world::Plan;
+use super::world::ScheduleOptions;
 use crate::cluster::{
     cut_off::CutOff,
     journal::Keys,
@@ -146,7 +146,7 @@ pub(super) struct Computer {
     pub(super) watched: u64,
 }
 
-fn member(name: &str, index: usize, life: u64, plan: &Plan, disk: &Disk) -> Member {
+fn member(name: &str, index: usize, life: u64, plan: &ScheduleOptions, disk: &Disk) -> Member {
     let settings = Settings {
         name: name.to_owned(),
         id: format!("{index} {life}"),
@@ -170,7 +170,7 @@ pub(super) fn uri(index: usize) -> String {
 }
 
 impl Computer {
-    pub(super) fn new(index: usize, plan: &Plan, drift: i64) -> Self {
+    pub(super) fn new(index: usize, plan: &ScheduleOptions, drift: i64) -> Self {
         let name = match plan.twins && index == 1 {
             true => "computer0".to_owned(),
             false => format!("computer{index}"),
@@ -213,7 +213,7 @@ impl Computer {
     }
 
     /// Starts a new process. The memory of the previous one is lost.
-    pub(super) fn start(&mut self, index: usize, plan: &Plan) {
+    pub(super) fn start(&mut self, index: usize, plan: &ScheduleOptions) {
         self.life += 1;
         self.seen_unreadable = 0;
         (self.has_read, self.unaware) = (false, false);

@@ -29,7 +29,7 @@ use test_support::dice::Dice;
 mod calls;
 mod faults;
 
-pub(super) use faults::{Counts, Plan};
+pub(super) use faults::{Counts, ScheduleOptions};
 use faults::{Fault, Network};
 
 pub(super) const COMPUTERS: usize = 3;
@@ -85,7 +85,7 @@ enum Event {
 type Told = VecDeque<(usize, Option<i32>)>;
 
 pub(super) struct World {
-    pub(super) plan: Plan,
+    pub(super) plan: ScheduleOptions,
     pub(super) dice: Dice,
     pub(super) now: u64,
     order: u64,
@@ -112,7 +112,7 @@ pub(super) struct World {
 }
 
 impl World {
-    pub(super) fn new(plan: Plan) -> Self {
+    pub(super) fn new(plan: ScheduleOptions) -> Self {
         let mut dice = Dice(plan.seed);
         let computers = (0..COMPUTERS).map(|index| {
             let drift = dice.below(100_000) as i64 - 50_000;

@@ -9,7 +9,7 @@ use crate::cluster::{
 };
 
 #[derive(Clone, Debug)]
-pub(in super::super) struct Plan {
+pub(in super::super) struct ScheduleOptions {
     pub(in super::super) seed: u64,
     pub(in super::super) commit: Commit,
     pub(in super::super) alone: WhenAlone,
