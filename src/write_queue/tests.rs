@@ -787,7 +787,7 @@ impl World {
         let dead = dead.into_iter().map(|node| node.api.as_str()).collect();
         let mistakes = living
             .into_iter()
-            .flat_map(|node| node.mistakes(&mirror, &dead));
+            .flat_map(|node| node.mistakes(&mirror, &dead, &self.abandoned));
         self.broken.extend(mistakes);
         if !self.may_go_back {
             let gone_back = self.nodes.iter().flat_map(|node| node.gone_back.clone());

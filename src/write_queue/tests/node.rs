@@ -237,8 +237,14 @@ impl Node {
     }
 
     /// The node's beliefs that contradict `state`. No master tells subscribers that a publisher at one of the `dead`
-    /// addresses has lost its name to another process.
-    pub(super) fn mistakes(&self, state: &Master, dead: &BTreeSet<&str>) -> Vec<String> {
+    /// addresses has lost its name to another process. The writer of an `abandoned` value has ended before it was
+    /// answered. If rosrescue dies, too, that value is unknown, and subscribers are not told that a parameter is not set.
+    pub(super) fn mistakes(
+        &self,
+        state: &Master,
+        dead: &BTreeSet<&str>,
+        abandoned: &[Request],
+    ) -> Vec<String> {
         let mut mistakes = Vec::new();
         for (topic, list) in &self.topics {
             let truth = state.publishers_of(topic);
@@ -256,7 +262,11 @@ impl Node {
             let truth = truth.params.get(2).unwrap();
             // A parameter that was not set is an empty struct in both.
             let unset = Value::Struct(Struct::new());
-            if value != truth && !(*value == unset && *truth == unset) {
+            let is_abandoned = *truth == unset
+                && abandoned
+                    .iter()
+                    .any(|call| call.text(1) == Some(key) && call.params().get(2) == Some(value));
+            if value != truth && !(*value == unset && *truth == unset) && !is_abandoned {
                 let name = &self.name;
                 mistakes.push(format!("{name} {key}: {value:?} instead of {truth:?}"));
             }
