@@ -33,13 +33,23 @@ fn cut(text: &str) -> &str {
 
 /// The methods for which the mirror has replied differently from a master.
 #[derive(Default)]
-pub(super) struct Divergences(HashSet<Method>);
+pub(super) struct Divergences {
+    logged: HashSet<Method>,
+    /// Those for which only the text of the reply differed.
+    in_words: HashSet<Method>,
+}
 
 impl Divergences {
+    /// Whether the master uses other words than the mirror, and is known to do so for this method. The first time the
+    /// words may be about another state, and the master must be read.
+    pub(super) fn knows_words(&mut self, answered: &Answered<'_>, mirror: &Reply) -> bool {
+        answered.differs_in_words(mirror) && !self.in_words.insert(answered.call.method().clone())
+    }
+
     /// Logs the first divergence of each method.
     pub(super) fn report(&mut self, answered: &Answered<'_>, mirror: &Reply) {
         let method = answered.call.method();
-        if self.0.insert(method.clone()) {
+        if self.logged.insert(method.clone()) {
             let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
             tracing::warn!(
                 method = method.name(),

@@ -79,6 +79,39 @@ fn a_different_answer_of_the_master_puts_the_mirror_in_doubt() {
 }
 
 #[test]
+fn a_master_with_other_words_is_read_once_per_method() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let mut master = Master::default();
+    let mut doubts = |call: &Request, value: Option<Value>| {
+        let Reply::Value(Value::Array(mut answer)) = answered(call, &mut master) else {
+            panic!("{call:?} was answered with a fault")
+        };
+        answer[1] = "done by the vendor's master".into();
+        if let Some(value) = value {
+            answer[2] = value;
+        }
+        let reply = Reply::Value(Value::Array(answer));
+        let recorded = ledger.record_here(now, 0, &[(call, &reply)]).unwrap();
+        recorded.doubtful
+    };
+    assert!(doubts(&publish("/t"), None));
+    assert!(!doubts(&publish("/u"), None));
+    assert!(!doubts(&publish("/t"), None));
+    let set = |value: i32| {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/n"), "/a".into(), value.into()],
+        )
+    };
+    assert!(doubts(&set(1), None));
+    assert!(!doubts(&set(2), None));
+    // Another value is another state, whatever the words.
+    assert!(doubts(&publish("/v"), Some(vec!["http://s:1/"].into())));
+    assert_eq!(ledger.stats.divergences.value(), 3);
+}
+
+#[test]
 fn a_mirror_in_doubt_leaves_reads_to_the_master_until_it_was_read() {
     let ledger = ledger();
     let get = Request::new(Method::GetParam, ["/n", "/unset"]);

@@ -55,6 +55,7 @@ mod master {
     mod stranger;
     mod unreturnable_values;
     mod vendors_roscore;
+    mod worded;
 }
 
 /// A new master gets the state, and the health check examines the nodes.

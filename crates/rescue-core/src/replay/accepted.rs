@@ -37,6 +37,21 @@ impl Answered<'_> {
         };
         same && executed(method, mirror) == Some(self.executed)
     }
+
+    /// Whether only the text of `mirror` differs, as with a patched rosmaster or one of another version.
+    pub fn differs_in_words(&self, mirror: &Reply) -> bool {
+        let parts = [&self.reply, mirror].map(|reply| match reply {
+            Reply::Value(Value::Array(answer)) => match answer.as_slice() {
+                [code, _, value] => Some((code, value)),
+                _ => None,
+            },
+            _ => None,
+        });
+        match parts {
+            [Some(master), Some(mirror)] => master == mirror,
+            _ => false,
+        }
+    }
 }
 
 /// All writes in a request that the master has answered, including those in nested multicalls.

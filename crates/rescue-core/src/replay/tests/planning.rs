@@ -395,7 +395,7 @@ fn a_changed_type_is_corrected_in_a_master_that_is_emptied_first() {
 }
 
 #[test]
-fn a_refusal_with_another_text_counts_as_predicted() {
+fn an_answer_with_another_text_counts_as_predicted() {
     // Some members have slashes in their names, and a node subscribes to one of them.
     let target = after([set("/k", tree([("x/y", 1.into())]))]);
     let found = after([watch("/n", "/k/x/y")]);
@@ -403,11 +403,11 @@ fn a_refusal_with_another_text_counts_as_predicted() {
     let Reply::Value(mut results) = found.clone().apply(&sent(&plan)).reply else {
         panic!("no results")
     };
-    let answer = |results: &mut Value, at: usize, to: Value| {
+    let answer = |results: &mut Value, entry: usize, at: usize, to: Value| {
         let Value::Array(results) = results else {
             return;
         };
-        let Value::Array(one) = &mut results[1] else {
+        let Value::Array(one) = &mut results[entry] else {
             return;
         };
         let Value::Array(answer) = &mut one[0] else {
@@ -416,9 +416,16 @@ fn a_refusal_with_another_text_counts_as_predicted() {
         answer[at] = to;
     };
     // The first entry shows what the `setParam` overwrites.
-    answer(&mut results, 1, "Internal failure: 'x'".into());
-    assert_eq!(plan.verify(&Reply::Value(results.clone())), Ok(()));
-    answer(&mut results, 0, 1.into());
+    answer(&mut results, 1, 1, "Internal failure: 'x'".into());
+    // A vendor's patched master.
+    answer(&mut results, 0, 1, "here it is".into());
+    let reply = Reply::Value(results.clone());
+    assert_eq!(plan.verify(&reply), Ok(()));
+    assert_eq!(plan.verify_in_any_order(&reply), Ok(()));
+    let mut overwritten = results.clone();
+    answer(&mut overwritten, 0, 2, 1.into());
+    assert!(plan.verify(&Reply::Value(overwritten)).is_err());
+    answer(&mut results, 1, 0, 1.into());
     assert!(plan.verify(&Reply::Value(results)).is_err());
 }
 
