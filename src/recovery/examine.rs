@@ -295,7 +295,8 @@ impl Examiner {
     }
 
     /// Brings a late master, which has answered by now, up to date with the writes that the mirror has answered.
-    /// Returns whether the master has run them. If not, the master must be examined.
+    /// Returns whether the master has run them, and holds the mirror's state except for parameters that another program
+    /// has set meanwhile. If not, the master must be examined.
     pub(crate) async fn catch_up(&self, master: &mut impl Contact) -> Result<bool, ExamineError> {
         // From here until the gate opens the mirror must not change, and writes wait.
         self.gate.set(State::Injecting);
@@ -320,11 +321,15 @@ impl Examiner {
         let verdict = verdict(&plan, &raw)?;
         tracing::debug!(writes = count, ?verdict, "the master has caught up");
         if let Err(deviation) = verdict {
-            if !deviation.failed.is_empty() || Mutant::UndoesDirectChange.lives() {
+            let is_param = deviation.failed.is_empty()
+                && !deviation.changed.is_empty()
+                && !deviation.beyond_params;
+            // Its registrations prove that this is not another master, which lacks the state before the missed writes.
+            let is_same = is_param && missed.behind.nodes().next().is_some();
+            if !is_same || Mutant::UndoesDirectChange.lives() {
                 return Ok(false);
             }
-            // The master has run the writes, and another program has changed something directly. An inspection will
-            // show what, and the mirror follows it.
+            // Another program has set a parameter directly. An inspection will show it, and the mirror follows it.
             self.ledger.doubt();
         }
         self.ledger.delivered();

@@ -299,6 +299,7 @@ impl Plan {
                 (results, predicted)
             }
             (Reply::Fault { text, .. }, _) => {
+                deviation.beyond_params = true;
                 match text.contains(CHANGED_MEANWHILE) {
                     true => deviation.changed = whole(text),
                     false => deviation.failed = whole(text),
@@ -325,6 +326,7 @@ impl Plan {
             if calls.get(index + 1).is_some_and(|next| sets_all(next)) {
                 deviation.overwritten = value(result).and_then(Value::as_struct).cloned();
             }
+            deviation.beyond_params |= *call.method() != Method::GetParam;
             // A registration is answered with the other nodes of its topic, which another program may have registered.
             let list = match !call.kind().mutates() || code(result) == code(predicted) {
                 true => &mut deviation.changed,
@@ -376,6 +378,8 @@ pub struct Deviation {
     pub failed: Vec<String>,
     /// A sentence for each answer that shows that another program has changed the master since it was read, at most 20.
     pub changed: Vec<String>,
+    /// Whether more than the reads of parameters was answered differently.
+    pub beyond_params: bool,
     /// The parameters that the plan has overwritten, if they were not those that the master held when it was read.
     pub overwritten: Option<Struct>,
 }

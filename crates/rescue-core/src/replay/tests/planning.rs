@@ -358,6 +358,24 @@ fn verification_finds_every_kind_of_deviation_and_shows_no_values() {
     assert!(plan.verify(&Reply::Value(Value::Array(vec![]))).is_err());
 }
 
+#[test]
+fn the_answer_of_another_master_than_the_late_one_differs_beyond_parameters() {
+    let behind = after([publish("/p", "/t", "a/B"), set("/a", 1)]);
+    let writes = vec![subscribe("/s", "/t", "a/B"), set("/b", 2)];
+    let plan = Plan::run(&behind, writes, &Token::new("m", 0), &token());
+    let deviation =
+        |mut master: Master| plan.verify(&master.apply(&sent(&plan)).reply).unwrap_err();
+    let mut changed = behind.clone();
+    changed.apply(&set("/direct", 3));
+    let differs = deviation(changed);
+    assert!(
+        differs.failed.is_empty() && !differs.beyond_params,
+        "{differs:?}"
+    );
+    assert!(deviation(Master::default()).beyond_params);
+    assert!(deviation(after([set("/a", 1)])).beyond_params);
+}
+
 /// The topic was used only while the master did not answer.
 #[test]
 fn a_type_without_nodes_keeps_its_place_in_a_master_that_is_emptied_first() {
