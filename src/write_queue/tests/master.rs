@@ -200,6 +200,12 @@ impl World {
         self.after(time, Event::Compares);
     }
 
+    /// The connection of an injection ends, and with it the only answer that shows what the injection replaced.
+    pub(super) fn injection_breaks(&mut self) {
+        self.injection_broke = true;
+        self.bypassed = None;
+    }
+
     pub(super) fn breaks(&mut self) {
         if self.master.is_none() {
             return;

@@ -250,10 +250,7 @@ impl World {
                 Step::Disconnect => self.disconnect(),
                 Step::Shut(gate) => self.shut(gate),
                 Step::NotifyAll => self.notify_all(),
-                Step::ReportDeathWhileInjected => {
-                    self.injection_broke = true;
-                    self.bypassed = None;
-                }
+                Step::ReportDeathWhileInjected => self.injection_breaks(),
                 Step::SetPatience(patience) => {
                     self.dispatch(super::Input::Patience(patience));
                 }

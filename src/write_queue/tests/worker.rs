@@ -120,6 +120,9 @@ impl World {
         disk.answers.clear();
         (disk.whole, disk.is_writing, self.is_down) = (None, false, true);
         self.print(|| "rosrescue dies".to_owned());
+        if self.gate() == State::Injecting {
+            self.injection_breaks();
+        }
         self.may_go_back = true;
         self.deaths += 1;
         // Clients send again what was not answered.
