@@ -378,9 +378,8 @@ fn no_rosmaster_installed() {
     let mut rescue = setup.spawn();
     let said = |rescue: &Rescue| rescue.stderr().join("\n");
     eventually("it says that its rosmaster ends", || {
-        rescue.exited().is_some() || said(&rescue).contains("rosmaster")
+        said(&rescue).contains("rosmaster")
     });
-    assert!(said(&rescue).contains("rosmaster"), "{}", said(&rescue));
     if rescue.exited().is_none() {
         assert_eq!(rescue.terminate().code(), Some(0));
     }

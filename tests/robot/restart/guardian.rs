@@ -334,7 +334,7 @@ fn a_clean_stop_ends_everything() {
             signal(worker(&scratch), signals[1]);
         }
         rescue.signal(signals[0]);
-        assert_eq!(rescue.wait().code(), Some(0), "{signals:?}");
+        assert_eq!(rescue.wait_output().code(), Some(0), "{signals:?}");
         assert_eq!(scratch.survivors(), vec![], "{signals:?}");
         let said = rescue.stderr().join("\n");
         assert!(said.contains("stopped cleanly"), "{said}");
