@@ -706,7 +706,7 @@ impl Ledger {
     /// that it has missed, and to notify nodes of them.
     ///
     /// `None` if another incarnation has begun meanwhile.
-    pub(crate) fn send_missed(&self, now: Instant, missed: &Missed) -> Option<Mark> {
+    pub(crate) fn announce_missed(&self, now: Instant, missed: &Missed) -> Option<Mark> {
         let mut inner = self.lock();
         if inner.next_token() != missed.token {
             return None;

@@ -151,7 +151,8 @@ impl Nodes {
     }
 }
 
-/// Watches the nodes as long as it is polled. Reads the socket table every second, and when a node has registered or moved.
+/// Watches the nodes as long as it is polled. Reads the socket table every second, and when a node has registered or
+/// moved.
 pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut looks = interval(LOOK_AGAIN);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -15,6 +15,10 @@ use ros1_master::master::{Master, Request};
 use super::LocalNodes;
 use crate::{ledger::Ledger, limit::rarely, write_queue::MoveJudge};
 
+/// Maximum number of moved names that wait for their report. Reading the evidence of one takes some hundred
+/// microseconds, and only a multicall of a hostile client moves more.
+const UNREPORTED_MAX: usize = 64;
+
 impl MoveJudge for LocalNodes {
     fn first_move(&self, mirror: &Master, calls: &[&Request]) -> Option<usize> {
         calls
@@ -28,13 +32,16 @@ impl MoveJudge for LocalNodes {
             return None;
         }
         if self.reap == Reap::Report {
-            self.lock_unreported().extend(moving);
+            let mut unreported = self.lock_unreported();
+            let room = UNREPORTED_MAX.saturating_sub(unreported.len());
+            unreported.extend(moving.into_iter().take(room));
+            drop(unreported);
             self.moved.notify_one();
             return Some(None);
         }
         let gone: BTreeSet<_> = moving
             .into_iter()
-            .filter(|moving| self.judge(moving))
+            .filter(|moving| self.judge_old_node(moving))
             .map(|moving| moving.node)
             .collect();
         Some(ledger.with_mirror(|mirror| Eviction::for_nodes(mirror, gone)))
@@ -52,7 +59,7 @@ impl LocalNodes {
     pub(in crate::nodes) fn report_moves(&self) {
         let moves = std::mem::take(&mut *self.lock_unreported());
         for moving in moves {
-            self.judge(&moving);
+            self.judge_old_node(&moving);
         }
     }
 
@@ -64,7 +71,7 @@ impl LocalNodes {
 
     /// Reads what the kernel shows about the node at the old address, and reports it. Returns whether that node must be
     /// unregistered before the call.
-    fn judge(&self, moving: &Moving) -> bool {
+    fn judge_old_node(&self, moving: &Moving) -> bool {
         let evidence = self.evidence_now(moving);
         self.note_feud(moving, evidence);
         let is_first = moving.is_unregistered_first(self.reap, evidence);
