@@ -4,7 +4,10 @@
 //! happened and when, and carries out the returned actions. All deadlines are decided here. Each computer uses its own
 //! clock, and only to measure durations. Clocks may differ, and may run up to a tenth too fast or too slow.
 
-use std::time::{Duration, Instant};
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
 
 use crate::cluster::mutant::Mutant;
 
@@ -81,6 +84,8 @@ pub struct Machine {
     unreadable: u64,
     /// The highest [`View::journal_number`] that this computer has heard of.
     journal_number: u64,
+    /// The terms in which this computer has led, as far as it knows, with the claim of this process that began each, or 0.
+    terms: BTreeMap<u64, u64>,
 }
 
 impl Machine {
@@ -109,6 +114,7 @@ impl Machine {
             left: None,
             unreadable: 0,
             journal_number: 0,
+            terms: BTreeMap::new(),
         }
     }
 
@@ -391,6 +397,11 @@ impl Machine {
         self.journal_number = self.journal_number.max(journal_number);
     }
 
+    /// Notes that an earlier process of this computer may have led in this term.
+    pub fn note_term(&mut self, term: u64) {
+        self.terms.entry(term).or_default();
+    }
+
     /// Notes the origin of a journal that cannot be read from its beginning, or 0.
     pub fn set_unreadable(&mut self, origin: u64) {
         self.unreadable = origin;
@@ -452,7 +463,13 @@ impl Machine {
             }
             (Some(_), _) => self.deposed(actions),
             (None, Some(term)) if alive.is_some_and(|alive| alive.released.is_none()) => {
-                self.claimed(term, actions);
+                let claim = leader.map_or(0, |leader| leader.claim);
+                match *self.terms.entry(term).or_insert(claim) == claim {
+                    true => self.claimed(term, actions),
+                    // A restored etcd has given this term out again, and others may take it for the earlier one. The
+                    // next claim gets another term, and is made at once.
+                    false => self.settings.id.push('+'),
+                }
             }
             (None, _) if self.role == Role::Joining && self.view.leader.is_some() => {
                 self.become_role(Role::Following, actions);

@@ -161,6 +161,7 @@ impl Member {
         };
         let mut machine = Machine::new(settings);
         machine.note_journal(local.journal_number);
+        machine.note_term(local.term);
         cut_off.note_seen(&local.state);
         Self {
             keys,

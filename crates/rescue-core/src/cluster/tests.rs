@@ -181,6 +181,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 447756: a leader saw that keys were gone, and then acknowledged writes when a late answer arrived.
 /// 448760: an older copy lacked the parts of a large value that its leader added. The simulated etcd knew no unreadable entry.
 /// 477828: a computer that started while etcd had no data said that it held nothing, so an older state replaced its own.
+/// 629606: an older copy of etcd gave the same term to the same computer again, and a follower took its answers for those of
+/// the earlier term.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -194,7 +196,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
     }
     for seed in [
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
-        400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828,
+        400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606,
     ] {
         play_with_data_loss(seed).check();
     }

@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 
-use super::history::value_of;
 use crate::{
     checkpoint::format::{self, Record, RecordContent as JournalEntry},
     cluster::{
@@ -130,26 +129,6 @@ impl Etcd {
             }),
             Held::State(_) | Held::Damaged => false,
         })
-    }
-
-    /// The value of a parameter before `place` in the log. Each entry of the log has a thousand places.
-    pub(super) fn value_at(&self, number: usize, place: usize) -> Option<i32> {
-        let mut state = Master::default();
-        for (index, (_, held)) in self.log.iter().enumerate() {
-            match held {
-                Held::State(of) if index * 1000 < place => state = (**of).clone(),
-                Held::State(_) | Held::Damaged => {}
-                Held::Records(records) => {
-                    let first = records.iter().take(place.saturating_sub(index * 1000));
-                    for record in first {
-                        if let JournalEntry::Call { call, .. } = &record.entry {
-                            state.apply_telling(call, &mut ());
-                        }
-                    }
-                }
-            }
-        }
-        value_of(&state, number)
     }
 
     /// When the entry at this place of the log was added. 0 if there is none yet.

@@ -43,6 +43,10 @@ pub(super) fn value_of(state: &Master, number: usize) -> Option<i32> {
         .and_then(Value::as_int)
 }
 
+fn values_of(state: &Master) -> [Option<i32>; KEYS] {
+    std::array::from_fn(|number| value_of(state, number))
+}
+
 /// A write of a node, and its fate.
 #[derive(Clone, Debug)]
 pub(super) struct Call {
@@ -355,7 +359,7 @@ impl History {
                     same && places.changed[of].iter().any(|at| *at >= cut * 1000)
                 });
                 let sent = !places.changed[number].is_empty();
-                !sent && (others || etcd.value_at(key, cut * 1000) == Some(call.value))
+                !sent && (others || places.value_at(key, cut * 1000) == Some(call.value))
             });
             let excused = call.reported || call.unsynced || superseded || equalled;
             // The last value may come from a computer that was cut off, and could not see this write.
@@ -365,7 +369,7 @@ impl History {
                 merge.is_some_and(|merge| self.changes_were_hidden(last, merge, places, etcd))
             });
             let mut in_journal = places.of[number].iter();
-            let lost = in_journal.any(|at| self.is_lost_with_etcd(key, *at, places, etcd));
+            let lost = in_journal.any(|at| self.is_lost_with_etcd(key, *at, places));
             let excused = match alone {
                 _ if lost => true,
                 true => excused || unseen && recorded,
@@ -391,7 +395,7 @@ impl History {
 
     /// Whether the write of `key` at this place of the log was lost with etcd's data, as no computer knew it or a later
     /// one that could say so when a new journal began.
-    fn is_lost_with_etcd(&self, key: usize, place: usize, places: &Places, etcd: &Etcd) -> bool {
+    fn is_lost_with_etcd(&self, key: usize, place: usize, places: &Places) -> bool {
         self.beginnings.iter().any(|beginning| {
             let start = beginning.place * 1000;
             if place >= start {
@@ -402,7 +406,8 @@ impl History {
                 last.is_none_or(|last| last < place)
             };
             let knew = beginning.knew.iter().flatten();
-            is_older(etcd.value_at(key, start + 1)) && knew.clone().all(|knew| is_older(knew[key]))
+            is_older(places.value_at(key, start + 1))
+                && knew.clone().all(|knew| is_older(knew[key]))
         })
     }
 
@@ -437,7 +442,7 @@ impl History {
     ) -> bool {
         let call = &self.calls[number];
         let Some(cut) = call.alone else { return false };
-        let before = etcd.value_at(call.key, place);
+        let before = places.value_at(call.key, place);
         let first = places.of_value(self, call.key, before);
         let back = first.is_some_and(|(first, _)| first < cut * 1000);
         let mut own = self.calls.iter();
@@ -469,7 +474,7 @@ impl History {
                 }
                 let first = places.changed[of].first();
                 let first = first.filter(|at| etcd.writers[*at / 1000] != call.computer);
-                let is_lost = |at: &usize| self.is_lost_with_etcd(other.key, *at, places, etcd);
+                let is_lost = |at: &usize| self.is_lost_with_etcd(other.key, *at, places);
                 let first = first.filter(|at| !is_lost(at));
                 if first.is_some_and(|at| *at >= cut * 1000 && *at < merged) {
                     return Err(format!("{call:?} has replaced {other:?} of others"));
@@ -627,7 +632,7 @@ impl History {
                 if floor.since < read.began
                     && last < floor.place
                     && !died
-                    && !self.is_lost_with_etcd(key, floor.place, places, etcd)
+                    && !self.is_lost_with_etcd(key, floor.place, places)
                 {
                     let Floor { place, why, .. } = floor;
                     return Err(format!("{read:?} is older than {why}: {last} < {place}"));
@@ -650,26 +655,31 @@ struct Floor {
     why: String,
 }
 
-/// The places of each write in the log.
+/// The places of each write in the log. Each entry of the log has a thousand places.
 struct Places {
     of: Vec<Vec<usize>>,
     /// The places without those in whole states, which hold earlier writes.
     changed: Vec<Vec<usize>>,
+    /// The values of all parameters after each place, in order.
+    values: Vec<(usize, [Option<i32>; KEYS])>,
 }
 
 impl Places {
     fn of(history: &History, etcd: &Etcd) -> Self {
         let mut of = vec![Vec::new(); history.calls.len()];
         let mut changed = of.clone();
+        let (mut state, mut values) = (Master::default(), Vec::new());
         for (index, (moment, held)) in etcd.log.iter().enumerate() {
             let records = match held {
                 Held::Records(records) => records,
                 Held::Damaged => continue,
-                Held::State(state) => {
+                Held::State(whole) => {
+                    state = (**whole).clone();
+                    values.push((index * 1000, values_of(&state)));
                     let made = history.calls.iter().enumerate();
                     let made = made.filter(|(_, call)| call.made < *moment);
                     for (number, call) in made {
-                        if value_of(state, call.key) == Some(call.value) {
+                        if value_of(&state, call.key) == Some(call.value) {
                             of[number].push(index * 1000);
                         }
                     }
@@ -677,15 +687,29 @@ impl Places {
                 }
             };
             for (part, record) in records.iter().enumerate() {
-                if let JournalEntry::Call { call, .. } = &record.entry
-                    && let Some(call) = history.find(call.params())
-                {
-                    of[call].push(index * 1000 + part);
-                    changed[call].push(index * 1000 + part);
+                let JournalEntry::Call { call, .. } = &record.entry else {
+                    continue;
+                };
+                let place = index * 1000 + part;
+                state.apply_telling(call, &mut ());
+                values.push((place, values_of(&state)));
+                if let Some(call) = history.find(call.params()) {
+                    of[call].push(place);
+                    changed[call].push(place);
                 }
             }
         }
-        Self { of, changed }
+        Self {
+            of,
+            changed,
+            values,
+        }
+    }
+
+    /// The value of a parameter before `place`.
+    fn value_at(&self, key: usize, place: usize) -> Option<i32> {
+        let before = self.values.partition_point(|(at, _)| *at < place);
+        self.values[..before].last().and_then(|(_, of)| of[key])
     }
 
     /// The last place before `end` of any write of this value.
