@@ -6,6 +6,7 @@ use crate::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent},
     cluster::{
         journal::{self, JournalError, Keys, Put},
+        member::WatchedEntry,
         sharing::{Change, Source},
     },
 };
@@ -55,6 +56,17 @@ impl Outgoing {
 
     pub fn changes(&self) -> impl Iterator<Item = &Change> {
         self.changes.iter()
+    }
+
+    /// Whether another computer added `entry` to the journal while this one had changes to add there.
+    pub fn differs(&self, entry: &WatchedEntry) -> bool {
+        match (self.changes.front(), entry) {
+            (None, _) => false,
+            (Some(Change::Call(own, _)), WatchedEntry::Records { records, .. }) => {
+                records.first() != Some(own)
+            }
+            (Some(_), _) => true,
+        }
     }
 
     /// The number of the last change, or 0.

@@ -183,6 +183,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 477828: a computer that started while etcd had no data said that it held nothing, so an older state replaced its own.
 /// 629606: an older copy of etcd gave the same term to the same computer again, and a follower took its answers for those of
 /// the earlier term.
+/// 707429: a leader that was cut off followed entries of the lost journal before it kept its own writes, and took what others
+/// had written for the state on which these were made.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -196,7 +198,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
     }
     for seed in [
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
-        400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606,
+        400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429,
     ] {
         play_with_data_loss(seed).check();
     }

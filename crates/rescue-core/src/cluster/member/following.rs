@@ -155,8 +155,11 @@ impl Member {
             let is_other = ![0, known].contains(&origin);
             entries.retain(|(revision, _)| !is_other || *revision < origin);
             let next = self.journal.progress.seq + 1;
-            let first = entries.first();
-            if first.is_some_and(|(_, first)| first.begins_with(next)) {
+            // Others' entries must not count as the state on which this computer's own writes were made.
+            let first = entries.first().map(|(_, first)| first);
+            let first =
+                first.filter(|first| first.begins_with(next) && !self.outgoing.differs(first));
+            if first.is_some() {
                 self.take_entries(now, entries);
             }
             return;

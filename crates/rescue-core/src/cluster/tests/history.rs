@@ -70,8 +70,8 @@ pub(super) struct Call {
     /// When leaders made the write for a computer that was cut off, and the length of the log then. A leader that loses
     /// leadership before the log has the write leaves that to the next one.
     merged: Vec<(u64, usize)>,
-    /// The leaders that have made the write in any merge.
-    merged_by: Vec<usize>,
+    /// The computers that have made the write, as a leader or in a merge, whether they answered it or not.
+    made_by: Vec<usize>,
 }
 
 /// A read of a node.
@@ -173,7 +173,7 @@ impl History {
             unsynced: false,
             held: false,
             merged: Vec::new(),
-            merged_by: Vec::new(),
+            made_by: Vec::new(),
         });
         number
     }
@@ -243,11 +243,16 @@ impl History {
             return;
         };
         let call = &mut self.calls[number];
-        call.merged_by.push(by);
+        call.made_by.push(by);
         // Only calls by nodes of `from` count. It answered other calls as a leader.
         if call.computer == from {
             call.merged.push(at);
         }
+    }
+
+    /// Notes that the computer `by` has made a write, and may answer it.
+    pub(super) fn made(&mut self, call: usize, by: usize) {
+        self.calls[call].made_by.push(by);
     }
 
     pub(super) fn answered(
@@ -401,9 +406,14 @@ impl History {
             if place >= start {
                 return false;
             }
+            // A value that was written several times may be the oldest of these, or come from a computer that was cut off.
             let is_older = |value: Option<i32>| {
-                let last = places.last_before(self, key, value, start);
-                last.is_none_or(|last| last < place)
+                let first = places.first_before(self, key, value, start);
+                let mut same = self
+                    .calls
+                    .iter()
+                    .filter(|of| of.key == key && Some(of.value) == value);
+                first.is_none_or(|first| first < place) || same.any(|of| of.alone.is_some())
             };
             let knew = beginning.knew.iter().flatten();
             is_older(places.value_at(key, start + 1))
@@ -465,9 +475,8 @@ impl History {
             let (_, merged) = merge;
             for (of, other) in self.calls.iter().enumerate() {
                 let theirs = other.computer != call.computer && other.key == call.key;
-                // Writes that this computer itself answered or merged came before it was cut off.
-                let own =
-                    other.by == Some(call.computer) || other.merged_by.contains(&call.computer);
+                // Writes that this computer itself made came before it was cut off.
+                let own = other.made_by.contains(&call.computer);
                 let counts = other.heard.is_some() && other.alone.is_none() && !own;
                 if !theirs || !counts || other.value == call.value {
                     continue;
@@ -712,8 +721,8 @@ impl Places {
         self.values[..before].last().and_then(|(_, of)| of[key])
     }
 
-    /// The last place before `end` of any write of this value.
-    fn last_before(
+    /// The first place of any write of this value, if it is before `end`.
+    fn first_before(
         &self,
         history: &History,
         key: usize,
@@ -723,7 +732,7 @@ impl Places {
         let calls = history.calls.iter().enumerate();
         let calls = calls.filter(|(_, call)| call.key == key && Some(call.value) == value);
         let places = calls.flat_map(|(call, _)| &self.of[call]);
-        places.filter(|at| **at < end).max().copied()
+        places.filter(|at| **at < end).min().copied()
     }
 
     /// The first and the last place of any write of this value. `None` if the log has no such write.

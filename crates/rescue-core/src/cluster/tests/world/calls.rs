@@ -73,6 +73,7 @@ impl World {
         let Some((seq, notices)) = computer.ledger.run(&request, &source) else {
             return;
         };
+        self.history.made(call, at);
         computer
             .ledger
             .unanswered
