@@ -3,18 +3,29 @@
 //!
 //! Production ([`Driver`](super::Driver)) and the simulation of the write queue carry out the steps.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use rescue_core::lifecycle::{
     Action, Cause, Input, Lifecycle, Patience, Probing, Supervision, evidence::Sample,
 };
 
-use crate::{gate::State, ledger::owed::Telling, status::report::RecoveryOutcome};
+use crate::{
+    gate::State,
+    ledger::owed::{BACKLOG, Telling},
+    status::report::RecoveryOutcome,
+};
+
+/// How long after a living master was found the nodes may wait for what an earlier process owed them. The health check
+/// sends it after [`BACKLOG`], and needs some time itself.
+const NEWS_WITHIN: Duration = BACKLOG.saturating_mul(2);
 
 /// The notifications that an earlier rosrescue of this session may have owed to nodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum News {
     Owed,
+    /// A living master has been found, and the health check sends them before this time. If that master is lost before,
+    /// they are still owed.
+    Expected(Instant),
     /// Sent by this rosrescue before any master.
     SentFirst,
     /// There were none, or a master has been found since.
@@ -85,7 +96,7 @@ impl Course {
             steps: Vec::new(),
         };
         if matches!(input, Input::Refused | Input::Unreachable) {
-            self.send_news(&mut steps);
+            self.send_news(now, &mut steps);
         }
         if ends_contact(input) {
             if gate == State::Injecting && input != Input::NotAMaster {
@@ -105,7 +116,7 @@ impl Course {
         for action in actions {
             match action {
                 Action::Connect | Action::Kill => self.disconnect(&mut steps),
-                Action::Spawn => self.send_news(&mut steps),
+                Action::Spawn => self.send_news(now, &mut steps),
                 Action::ShutGate(_) => self.shut(&mut steps),
                 Action::StandIn => steps.gate = State::Late,
                 _ => {}
@@ -118,9 +129,13 @@ impl Course {
         steps.steps
     }
 
-    /// Notes that a master was examined with this `outcome`. Returns what nodes are told.
-    pub(crate) fn examined(&mut self, outcome: RecoveryOutcome) -> NewsAfter {
-        let news = std::mem::replace(&mut self.news, News::Sent);
+    /// Notes that a master was examined at `now` with this `outcome`. Returns what nodes are told.
+    pub(crate) fn examined(&mut self, now: Instant, outcome: RecoveryOutcome) -> NewsAfter {
+        let news = self.news;
+        self.news = match (news, outcome) {
+            (News::Owed, RecoveryOutcome::Adopted) => News::Expected(now + NEWS_WITHIN),
+            _ => News::Sent,
+        };
         let sent = news == News::SentFirst && outcome == RecoveryOutcome::Injected;
         NewsAfter {
             all: !self.lifecycle.has_served() && !sent,
@@ -128,8 +143,13 @@ impl Course {
         }
     }
 
-    fn send_news(&mut self, steps: &mut Steps) {
-        if self.news == News::Owed {
+    fn send_news(&mut self, now: Instant, steps: &mut Steps) {
+        let is_owed = match self.news {
+            News::Owed => true,
+            News::Expected(by) => now < by,
+            News::SentFirst | News::Sent => false,
+        };
+        if is_owed {
             self.news = News::SentFirst;
             steps.add(Step::NotifyAll);
         }

@@ -151,7 +151,7 @@ impl Driver {
         }
         let is_restored = report.outcome == RecoveryOutcome::Injected && report.is_rescue();
         self.restored = is_restored.then_some(report.number);
-        let news = self.course.examined(report.outcome);
+        let news = self.course.examined(Instant::now(), report.outcome);
         if news.all {
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());

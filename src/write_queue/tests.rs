@@ -882,6 +882,14 @@ fn late_masters_are_given_what_they_missed() {
     assert!(caught_up > 3);
 }
 
+/// rosrescue dies with a notification on its way, the next one finds a living master, and that dies before the health
+/// check has told the state again.
+#[test]
+fn what_a_dead_process_owed_is_told_again_if_the_next_master_dies_soon() {
+    let broken = mistake(None, 719_532, 1);
+    assert!(broken.is_none(), "{broken:?}");
+}
+
 #[test]
 fn each_rule_is_needed() {
     // Each begins a little before the first schedule that notices it, to save time.

@@ -445,7 +445,7 @@ impl World {
                     self.broken.push(mistake);
                 }
                 let outcome = examination.outcome;
-                let news = self.recovery.course.examined(outcome);
+                let news = self.recovery.course.examined(self.instant(), outcome);
                 if news.all {
                     let now = self.instant();
                     self.ledger
