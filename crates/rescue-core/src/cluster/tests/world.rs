@@ -2,8 +2,7 @@
 //! carries out the members' actions, as `app::cluster` does.
 
 use std::{
-    cmp::Reverse,
-    collections::{BinaryHeap, HashMap, VecDeque},
+    collections::{BTreeMap, HashMap, VecDeque},
     time::Duration,
 };
 
@@ -89,8 +88,8 @@ pub(super) struct World {
     pub(super) dice: Dice,
     pub(super) now: u64,
     order: u64,
-    events: BinaryHeap<Reverse<(u64, u64)>>,
-    what: HashMap<u64, Event>,
+    /// By their moment, and in the order in which they were added.
+    events: BTreeMap<(u64, u64), Box<Event>>,
     pub(super) etcd: Etcd,
     network: Network,
     pub(super) computers: Vec<Computer>,
@@ -124,8 +123,7 @@ impl World {
             dice,
             now: 0,
             order: 0,
-            events: BinaryHeap::new(),
-            what: HashMap::new(),
+            events: BTreeMap::new(),
             etcd: Etcd::new(),
             network: Network::default(),
             history: History::default(),
@@ -161,9 +159,8 @@ impl World {
 
     fn at(&mut self, moment: u64, event: Event) {
         self.order += 1;
-        self.events
-            .push(Reverse((moment.max(self.now), self.order)));
-        self.what.insert(self.order, event);
+        let moment = moment.max(self.now);
+        self.events.insert((moment, self.order), Box::new(event));
     }
 
     fn after(&mut self, delay: u64, event: Event) {
@@ -183,16 +180,13 @@ impl World {
     }
 
     pub(super) fn step(&mut self, end: u64) -> bool {
-        let Some(Reverse((moment, order))) = self.events.peek().copied() else {
+        let next = self.events.first_entry();
+        let Some(next) = next.filter(|next| next.key().0 <= end) else {
             return false;
         };
-        if moment > end {
-            return false;
-        }
-        self.events.pop();
+        let ((moment, order), event) = next.remove_entry();
         self.now = moment;
-        let event = self.what.remove(&order).unwrap();
-        let at = match &event {
+        let at = match &*event {
             Event::Wake(at)
             | Event::Poll(at)
             | Event::Input(at, ..)
@@ -213,10 +207,9 @@ impl World {
         match at.map(|at| self.computers[at].hangs_until) {
             Some(until) if until > self.now => {
                 // Events of a hanging computer keep their order.
-                self.events.push(Reverse((until, order)));
-                self.what.insert(order, event);
+                self.events.insert((until, order), event);
             }
-            _ => self.happen(event),
+            _ => self.happen(*event),
         }
         true
     }
