@@ -30,6 +30,8 @@ pub(super) struct Api {
 /// An answer, with how long it took.
 struct Answer {
     value: Result<Value, String>,
+    /// Whether the answer says that the call failed, as for a name that does not exist.
+    is_refused: bool,
     took: Duration,
     /// Whether the connection broke and the call was repeated, as rospy and roscpp do.
     again: bool,
@@ -44,6 +46,7 @@ impl Api {
         loop {
             let (sign, value) = client::call_for_value(&self.uri, &call, LIMIT).await;
             let took = start.elapsed();
+            let is_refused = (sign, &value) == (Reaction::Alive, &None);
             let value = match (sign, value) {
                 (_, Some(value)) => Ok(value),
                 (Reaction::Alive, None) => Err("was refused".to_owned()),
@@ -61,12 +64,27 @@ impl Api {
                 let first = params.first().and_then(Value::as_str).unwrap_or_default();
                 format!("{method}({first}) {why}")
             });
-            return Answer { value, took, again };
+            return Answer {
+                value,
+                is_refused,
+                took,
+                again,
+            };
         }
     }
 
     pub(super) async fn call(&self, method: &str, params: &[Value]) -> Result<Value, String> {
         self.timed_call(method, params).await.value
+    }
+
+    /// The address of a node. `None` if no node has this name.
+    pub(super) async fn lookup_node(&self, name: &str) -> Result<Option<String>, String> {
+        let answer = self.timed_call("lookupNode", &[name.into()]).await;
+        match answer.value {
+            Ok(api) => Ok(Some(api.as_str().unwrap_or_default().to_owned())),
+            Err(_) if answer.is_refused => Ok(None),
+            Err(why) => Err(why),
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use ros1_master::{master, xmlrpc::Value};
@@ -13,6 +13,9 @@ use crate::nodes::client::{self, Reaction};
 
 /// Longest time for a node to report its process id.
 const NODE_LIMIT: Duration = Duration::from_secs(5);
+
+/// How long the state is read again because nodes unregister meanwhile.
+const STEADY_LIMIT: Duration = Duration::from_secs(8);
 
 /// Names of facts about parameters begin with this.
 const PARAMETER: &str = "the parameter ";
@@ -59,7 +62,24 @@ pub(super) struct DrillDifference {
 }
 
 impl RobotState {
+    /// Reads the state. A node that unregisters meanwhile has it read again.
     pub(super) async fn read(api: &Api) -> Result<Self, String> {
+        let start = Instant::now();
+        loop {
+            if let Some(state) = Self::read_once(api).await? {
+                return Ok(state);
+            }
+            if start.elapsed() > STEADY_LIMIT {
+                let limit = STEADY_LIMIT.as_secs();
+                return Err(format!(
+                    "for {limit} s, nodes unregistered while it was read"
+                ));
+            }
+        }
+    }
+
+    /// `None` if a node unregistered between two calls.
+    async fn read_once(api: &Api) -> Result<Option<Self>, String> {
         let state = api.call("getSystemState", &[]).await?;
         let types = api.call("getTopicTypes", &[]).await?;
         // A master may hold a parameter that it can never return, so this call may fail.
@@ -68,15 +88,16 @@ impl RobotState {
         let (facts, names) = facts(&state, &types, &params);
         let mut questions = JoinSet::new();
         for name in names {
-            let found = api.call("lookupNode", &[name.as_str().into()]).await?;
+            let Some(api) = api.lookup_node(&name).await? else {
+                return Ok(None);
+            };
             questions.spawn(async move {
-                let api = found.as_str().unwrap_or_default().to_owned();
                 let pid = pid_at(&api).await;
                 (name, RobotNode { api, pid })
             });
         }
         let nodes = questions.join_all().await.into_iter().collect();
-        Ok(Self { facts, nodes })
+        Ok(Some(Self { facts, nodes }))
     }
 
     /// Number of registrations, types and parameters.

@@ -2,13 +2,15 @@
 
 use std::fs;
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
 
 use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::support::{
     FakeNode, LIBRARIES, Library, Mode, Netns, Node, Process, Robot, Scratch, Setup, alive,
-    eventually, eventually_some, find_program, free_port, ros_command,
+    eventually, eventually_some, find_program, free_port, params, ros_command,
 };
 
 /// A drill at `port`.
@@ -198,6 +200,38 @@ fn it_fails_when_a_node_dies_and_its_stream_is_cut() {
     let found = verdict(drill);
     assert_failed(&found, "the node /talker_py");
     assert_failed(&found, "was lost");
+}
+
+/// The drill asks who is registered, and then each node's address, which a node that unregisters meanwhile has no more.
+#[test]
+fn nodes_that_come_and_go_while_the_state_is_read_are_no_damage() {
+    let robot = Robot::start(Mode::Core);
+    let drill = drill(
+        &robot.scratch,
+        robot.port(),
+        &["--no-kill", "--seconds", "1"],
+    );
+    let is_over = AtomicBool::new(false);
+    let found = std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let client = robot.client();
+            // Bounded, so that a failed test ends.
+            for number in 0..1_500 {
+                if is_over.load(Relaxed) {
+                    break;
+                }
+                let (node, api) = (format!("/brief_{number}"), "http://127.0.0.1:9/");
+                client.ok("registerPublisher", params![&*node, "/brief", "x/Y", api]);
+                std::thread::sleep(Duration::from_millis(4));
+                client.ok("unregisterPublisher", params![&*node, "/brief", api]);
+                std::thread::sleep(Duration::from_millis(4));
+            }
+        });
+        let found = verdict(drill);
+        is_over.store(true, Relaxed);
+        found
+    });
+    assert_passed(&found);
 }
 
 /// One node is stopped and started again, as `respawn` does, one is killed and started again, and one is stopped.
