@@ -483,7 +483,9 @@ impl World {
             return self.after(time, Event::Broken(number, Failure::NotConnected));
         };
         master.running += 1;
-        if self.dice.one_in(12) && !self.is_calm {
+        // At the end the master must have time to recover.
+        let is_over = self.calls_left == 0 && self.waiting.is_empty();
+        if self.dice.one_in(12) && !self.is_calm && !is_over {
             // The master is stopped, or busy.
             let time = match self.dice.below(8) {
                 0 => self.dice.below(40 * PATIENCE),
