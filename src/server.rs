@@ -1,7 +1,6 @@
 //! The side of rosrescue that clients talk to: listener, admission, calls and pages.
 
 pub(crate) mod access;
-pub(crate) mod admission;
 pub(crate) mod answers;
 pub(crate) mod body;
 pub(crate) mod calls;

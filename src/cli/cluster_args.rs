@@ -3,7 +3,7 @@
 use std::{path::PathBuf, time::Duration};
 
 use clap::{Args, ValueEnum};
-use hyper::http::uri::Authority;
+use http::uri::Authority;
 
 /// Heading of the options for several computers.
 const COMPUTERS: &str = "Options with --cluster";

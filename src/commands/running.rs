@@ -116,7 +116,7 @@ impl Running {
 
     async fn exchange(
         &self,
-        request: hyper::http::Result<Request<Full<Bytes>>>,
+        request: http::Result<Request<Full<Bytes>>>,
         limit: Duration,
     ) -> Result<(StatusCode, Bytes), CommandFailure> {
         let deadline = Instant::now() + limit;
@@ -144,7 +144,7 @@ impl Running {
 
 async fn try_exchange(
     stream: TcpStream,
-    request: hyper::http::Result<Request<Full<Bytes>>>,
+    request: http::Result<Request<Full<Bytes>>>,
 ) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
     let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
     crate::task::spawn(connection);

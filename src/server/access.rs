@@ -9,9 +9,8 @@ use std::{
 
 use hyper::StatusCode;
 use ipnet::IpNet;
+use rescue_core::admission::Rejection;
 use ros1_master::master::Kind;
-
-use super::admission::Rejection;
 
 /// Pause between two log lines about the same address. A refused node calls again up to 20 times per second.
 const SAY_AGAIN: Duration = Duration::from_secs(60);

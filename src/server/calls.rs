@@ -7,7 +7,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use rescue_core::{checkpoint::format::Origin, cluster::sharing::Source};
+use rescue_core::{admission, checkpoint::format::Origin, cluster::sharing::Source};
 use ros1_master::{
     master::{Kind, Master, Method, Request},
     xmlrpc::{self, ListWriter, Reply, Value},
@@ -16,7 +16,6 @@ use thiserror::Error;
 use tokio::sync::Mutex;
 
 use super::{
-    admission,
     body::SMALL,
     compare::Comparisons,
     hold::Hold,

@@ -5,6 +5,8 @@
 
 use std::{fs, net::IpAddr};
 
+use rescue_core::admission::without_dot;
+
 use crate::resolver;
 
 /// The names of this computer: those in `configured`, and the names that `/etc/hosts` and `/etc/resolv.conf` add.
@@ -53,11 +55,6 @@ fn with_files(
     names.sort_unstable();
     names.dedup();
     names
-}
-
-/// The name without the dot that ends an absolute one.
-pub(super) fn without_dot(name: &str) -> &str {
-    name.strip_suffix('.').unwrap_or(name)
 }
 
 /// The words of a line without its comment.

@@ -12,6 +12,7 @@ use hyper::{
     body::Incoming,
     header::{CONNECTION, CONTENT_ENCODING, HeaderValue},
 };
+use rescue_core::admission::{self, Rejection};
 use ros1_master::{
     master::{self, Kind, Master},
     xmlrpc::{Python, Reply},
@@ -20,7 +21,6 @@ use ros1_master::{
 use super::{
     Server,
     access::Grant,
-    admission::{self, Rejection},
     answers,
     body::{self, BodyError, Room},
     calls::Closed,

@@ -5,6 +5,8 @@
 mod checkpoint;
 #[path = "../../fuzz/checks/cluster.rs"]
 mod cluster;
+#[path = "../../fuzz/checks/headers.rs"]
+mod headers;
 #[path = "../../fuzz/checks/history.rs"]
 mod history;
 #[path = "../../fuzz/checks/seal.rs"]
@@ -48,4 +50,9 @@ fn the_seeds_of_the_history_fuzz_target_pass() {
 #[test]
 fn the_seeds_of_the_cluster_fuzz_target_pass() {
     each_seed("cluster", cluster::check);
+}
+
+#[test]
+fn the_seeds_of_the_headers_fuzz_target_pass() {
+    each_seed("headers", headers::check);
 }

@@ -1,6 +1,7 @@
 //! What rosrescue decides, without a runtime, sockets, files or a clock: time is an argument, and work is
 //! returned as values.
 //!
+//! * [`admission`]: which requests are refused by their headers.
 //! * [`hide`]: which values of parameters are not shown.
 //! * [`replay`]: recognising a master, reading its state, and the one call that restores a state in it.
 //! * [`lifecycle`]: when a master is started, examined, probed and killed, and when calls pass to it.
@@ -18,6 +19,7 @@
     )
 )]
 
+pub mod admission;
 pub mod checkpoint;
 pub mod cluster;
 pub mod health;

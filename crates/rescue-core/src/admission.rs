@@ -3,19 +3,17 @@
 //! ROS 1 has no authentication. Two requests can be refused without any ROS client noticing: a call that a web page
 //! makes through a browser, and a `shutdown` from another computer.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv6Addr};
 
-use hyper::{
+use http::{
     HeaderMap, StatusCode,
     header::{HOST, ORIGIN},
 };
 use ros1_master::master::{MASTER, Request};
 
-use super::hosts::without_dot;
-
 /// A refused request.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Rejection {
+pub struct Rejection {
     /// The HTTP status to answer.
     pub status: StatusCode,
     /// The reason, for the log and the answer.
@@ -30,7 +28,7 @@ const SEC_FETCH_SITE: &str = "sec-fetch-site";
 /// Every browser since 2020 sends the page's origin with each POST, or `null` if it hides the origin. No ROS client
 /// sends an origin. The content type tells nothing: boards send the same ones as web pages, and a page can send a POST
 /// without one.
-pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
+pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
         check_origin(headers)?;
@@ -40,7 +38,7 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
 
 /// Whether a GET with these headers may have a page. Browsers never show the answer to pages of other sites, but a page
 /// of another site could occupy `/events`, which allows few connections.
-pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
+pub fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Rejection> {
     check_name(headers, |name| is_own(name, names))?;
     check_origin(headers)
 }
@@ -78,6 +76,11 @@ fn check_site(headers: &HeaderMap) -> Result<(), Rejection> {
     }
 }
 
+/// The name without the dot that ends an absolute one.
+pub fn without_dot(name: &str) -> &str {
+    name.strip_suffix('.').unwrap_or(name)
+}
+
 /// Whether `name` is an address, or exactly one of `names`. After DNS rebinding, a foreign page sends its own name, which
 /// leads to this computer.
 fn is_own(name: &str, names: &[String]) -> bool {
@@ -92,13 +95,18 @@ fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<()
         return Ok(());
     };
     let host = String::from_utf8_lossy(host.as_bytes());
-    let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split(']').next().unwrap_or_default(),
-        None => host.split(':').next().unwrap_or_default(),
+    // Only an IPv6 address has brackets.
+    let name = match host.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((address, port)) if port.is_empty() || port.starts_with(':') => {
+            Some(address).filter(|address| address.parse::<Ipv6Addr>().is_ok())
+        }
+        Some(_) => None,
+        None => host.split(':').next(),
     };
-    if is_known(name) {
+    if name.is_some_and(is_known) {
         return Ok(());
     }
+    let name = name.unwrap_or(&host);
     Err(Rejection {
         status: StatusCode::FORBIDDEN,
         reason: format!("`{name:.100}` is not a name of this computer; use its address"),
@@ -106,19 +114,19 @@ fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<()
 }
 
 /// Whether a call from `peer` may shut the master down.
-pub(crate) fn may_shut_down(peer: IpAddr) -> bool {
+pub fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
 }
 
 /// Whether this `shutdown` was meant for a node. A master sends one to a node whose name was taken. It arrives here if
 /// a client has registered rosrescue's address as a node's.
-pub(crate) fn is_for_a_node(call: &Request) -> bool {
+pub fn is_for_a_node(call: &Request) -> bool {
     call.caller() == Some(MASTER)
 }
 
 #[cfg(test)]
 mod tests {
-    use hyper::header::HeaderValue;
+    use http::header::HeaderValue;
 
     use super::*;
 
@@ -220,6 +228,8 @@ mod tests {
             ("10.evil.example", &["10.0.0.5"]),
             (".evil.example", &["robot"]),
             ("", &["robot"]),
+            ("[robot]:11311", &["robot"]),
+            ("[::1]evil.example", &["robot"]),
         ] {
             assert!(!check(host, own), "{host} {own:?}");
         }
