@@ -22,6 +22,7 @@ mod shared;
 mod summary;
 
 use std::{
+    collections::BTreeSet,
     sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
     time::Instant,
 };
@@ -345,6 +346,11 @@ impl Ledger {
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         replay::may_hold(&inner.mirror, inner.pending.calls())
+    }
+
+    /// The nodes that pending writes register, each with its address.
+    pub fn pending_registrants(&self) -> BTreeSet<(String, String)> {
+        replay::registrants(self.lock().pending.calls())
     }
 
     /// Notes that the present master may differ from the mirror and must be read again.

@@ -28,6 +28,8 @@ pub(crate) enum Mutant {
     ReadsBeforeRun,
     /// The mirror wins over what another program has set in a late master while it caught up.
     UndoesDirectChange,
+    /// A pending registration of a node that has ended displaces the one that took its name.
+    ReturnsEndedNodes,
     /// The master is read although it has not run all writes that the mirror has answered first.
     ReadsTooEarly,
 }

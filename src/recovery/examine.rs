@@ -2,6 +2,7 @@
 //! [`Contact`]: in production a connection, in the simulation of the write queue a simulated master.
 
 use std::{
+    collections::BTreeSet,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
@@ -366,6 +367,7 @@ impl Examiner {
         };
         self.remove_dead_rosout(master, may_be_roscores, bears, &found)
             .await;
+        let ended = self.ended(master, bears, &found).await?;
         examination.inspection = master.now() - start;
         // From here until the gate opens the mirror must not change, because the master is compared
         // with the mirror.
@@ -375,6 +377,7 @@ impl Examiner {
             version,
             pending,
         } = self.ledger.begin_injection();
+        let pending = replay::without_ended(pending, &ended);
         let before = self.ledger.token();
         let treatment = replay::treatment(bears, manner.known, mirror.is_empty(), found.is_empty());
         let withheld = withheld_run_id(may_be_roscores, treatment, &mirror, &found);
@@ -468,6 +471,44 @@ impl Examiner {
                 self.ledger.seed(&call);
             }
         }
+    }
+
+    /// The addresses of ended nodes that pending writes would register again in a master with the state `found`, although
+    /// it has these nodes elsewhere: they have started again, and only the master was told.
+    async fn ended(
+        &self,
+        master: &mut impl Contact,
+        bears: TokenState,
+        found: &Master,
+    ) -> Result<BTreeSet<String>, ExamineError> {
+        let mut ended = BTreeSet::new();
+        if bears == TokenState::Nothing || Mutant::ReturnsEndedNodes.lives() {
+            return Ok(ended);
+        }
+        let mut elsewhere = Vec::new();
+        let mut hidden = Vec::new();
+        for (node, api) in self.ledger.pending_registrants() {
+            match found.api_of(&node) {
+                Some(now) if now == api => {}
+                Some(_) => elsewhere.push(api),
+                None => hidden.push((node, api)),
+            }
+        }
+        // No inspection shows nodes that only subscribe to parameters.
+        if !hidden.is_empty() {
+            let call = Inspection::ask_addresses(hidden.iter().map(|(node, _)| &**node));
+            let reply = master.call(call).await?;
+            let now = Inspection::read_addresses(&reply);
+            let moved = hidden.into_iter().zip(now);
+            let moved = moved.filter(|((_, api), now)| now.as_ref().is_some_and(|now| now != api));
+            elsewhere.extend(moved.map(|((_, api), _)| api));
+        }
+        for api in elsewhere {
+            if master.is_dead(port_of(&api)).await {
+                ended.insert(api);
+            }
+        }
+        Ok(ended)
     }
 
     /// Brings the master to `target`, reads it back, and sets `token` in it.

@@ -908,6 +908,7 @@ fn each_rule_is_needed() {
         (Mutant::AnnouncesNothing, 32_200),
         (Mutant::UndoesDirectChange, 190_870),
         (Mutant::ReadsBeforeRun, 800),
+        (Mutant::ReturnsEndedNodes, 783_250),
     ] {
         let found = mistake(Some(mutant), from, 10_000);
         let (seed, broken) = found.unwrap_or_else(|| panic!("{mutant:?} goes unnoticed"));

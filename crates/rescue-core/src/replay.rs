@@ -27,7 +27,7 @@ pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Deviation, Plan, Skipped};
-pub use reconcile::{Authority, may_hold, reconcile};
+pub use reconcile::{Authority, may_hold, reconcile, registrants, without_ended};
 pub use roscore::{
     ROSOUT, RUN_ID_AFTER, has_run_id, is_run_id_set, rosout_to_ask, withheld_run_id,
 };

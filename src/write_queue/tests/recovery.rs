@@ -1,12 +1,14 @@
 //! Carries out what the lifecycle of production decides, as `recovery::Driver` does, with the examination of production.
 
 use std::{
+    collections::HashSet,
     pin::Pin,
     sync::Mutex,
     task::{Context, Poll, Waker},
 };
 
 use rescue_core::{
+    health::port_of,
     lifecycle::{Action, Cause, Input, Probing, Supervision},
     replay::{Inspection, Plan, Token},
 };
@@ -75,6 +77,8 @@ enum Question {
 #[derive(Default)]
 struct Line {
     now: Option<Instant>,
+    /// The ports of nodes that have ended.
+    dead: HashSet<String>,
     question: Option<Question>,
     answer: Option<Result<Reply, ExamineError>>,
 }
@@ -132,8 +136,8 @@ impl Contact for SimulatedMaster {
         }
     }
 
-    async fn is_dead(&mut self, _: &str) -> bool {
-        false
+    async fn is_dead(&mut self, port: &str) -> bool {
+        self.0.lock().unwrap().dead.contains(port)
     }
 
     async fn may_be_of_roscore(&mut self, _: i32) -> bool {
@@ -363,7 +367,12 @@ impl World {
         let Some(examination) = &mut self.recovery.examination else {
             return;
         };
-        self.recovery.line.lock().unwrap().now = Some(now);
+        let dead = self.nodes.iter().filter(|node| node.is_dead);
+        let dead = dead.map(|node| port_of(&node.api).to_owned()).collect();
+        {
+            let mut line = self.recovery.line.lock().unwrap();
+            (line.now, line.dead) = (Some(now), dead);
+        }
         let context = &mut Context::from_waker(Waker::noop());
         if let Poll::Ready(outcome) = examination.as_mut().poll(context) {
             self.recovery.examination = None;

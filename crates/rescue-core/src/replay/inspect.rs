@@ -200,6 +200,23 @@ impl Inspection {
         Some(Request::multicall(calls))
     }
 
+    /// The request that asks for the addresses of these nodes.
+    pub fn ask_addresses<'a>(nodes: impl IntoIterator<Item = &'a str>) -> Request {
+        let ask = |node| Request::new(Method::LookupNode, [CALLER_ID, node]);
+        Request::multicall(nodes.into_iter().map(ask))
+    }
+
+    /// The addresses in the reply to [`Self::ask_addresses`], in the order of the nodes. `None` for a node that the master
+    /// does not know.
+    pub fn read_addresses(reply: &Reply) -> Vec<Option<String>> {
+        let results = results(reply).unwrap_or_default().iter();
+        let address = |result| match answer(result) {
+            Some((1, Value::String(api))) => Some(api.clone()),
+            _ => None,
+        };
+        results.map(address).collect()
+    }
+
     /// Builds a model of the master's state.
     ///
     /// Takes what a master does not show from `previous`, for nodes whose address is the same: parameter subscriptions,

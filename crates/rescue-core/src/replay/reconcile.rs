@@ -1,6 +1,8 @@
 //! Computes the state for a master that could not be reached for a while and has missed writes. That master has the
 //! latest token: the one with the highest number that rosrescue knows.
 
+use std::collections::BTreeSet;
+
 use super::{Token, restore};
 use ros1_master::master::{Effect, Master, Method, Request, Write, names};
 use ros1_master::xmlrpc::Value;
@@ -36,6 +38,30 @@ pub fn reconcile(
         target.apply_telling(&call, &mut ());
     }
     target
+}
+
+/// The nodes that `pending` registers, each with its address.
+pub fn registrants(pending: &[Request]) -> BTreeSet<(String, String)> {
+    let calls = pending.iter().flat_map(Request::calls);
+    let registrants = calls.filter_map(registrant);
+    registrants
+        .map(|(node, api)| (node.to_owned(), api.to_owned()))
+        .collect()
+}
+
+/// The writes in `pending` without registrations at these addresses. They would displace the nodes that took the names
+/// of those that ended.
+pub fn without_ended(pending: Vec<Request>, ended: &BTreeSet<String>) -> Vec<Request> {
+    let has_ended = |call: &Request| registrant(call).is_some_and(|(_, api)| ended.contains(api));
+    if !pending.iter().flat_map(Request::calls).any(has_ended) {
+        return pending;
+    }
+    let calls = pending.iter().flat_map(Request::calls);
+    calls.filter(|call| !has_ended(call)).cloned().collect()
+}
+
+fn registrant(call: &Request) -> Option<(&str, &str)> {
+    Write::parse(call)?.registrant()
 }
 
 /// What a master with the latest [`Token`] may hold although no read shows it: the parameter subscriptions in `mirror`,
@@ -205,6 +231,22 @@ mod tests {
         assert_eq!(target, mirror);
         let moved = master_after(&[watch("http://n:2/")]);
         assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
+    }
+
+    /// A node starts again at another address. rosrescue dies before it has recorded that, and before it knows that the
+    /// master has run an earlier registration.
+    #[test]
+    fn a_pending_registration_of_an_ended_node_displaces_no_living_one() {
+        let publish = |api: &str| call("registerPublisher", &["/n", "/t", "x/Y", api]);
+        let pending = vec![publish("http://n:1/"), set("/a", 1)];
+        let registrants = registrants(&pending);
+        let expected = ("/n".to_owned(), "http://n:1/".to_owned());
+        assert!(registrants.iter().eq([&expected]));
+        let ended = BTreeSet::from([expected.1]);
+        let left = without_ended(pending.clone(), &ended);
+        assert_eq!(left, [set("/a", 1)]);
+        let inner = Request::multicall(pending);
+        assert_eq!(without_ended(vec![inner], &ended), [set("/a", 1)]);
     }
 
     /// If a call is said to change nothing, the state is equal afterwards.
