@@ -87,6 +87,32 @@ fn unregistrations_while_rosrescue_starts_reach_the_adopted_master() {
     after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
+/// rosrescue has answered the registration of a node without the master, and dies. The node starts again at another port,
+/// and only the master hears of that. It must not get the older registration, or it would shut the living node down.
+#[test]
+fn an_ended_node_does_not_displace_the_one_that_has_taken_its_name() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    crate::support::stop(master);
+    robot.rescue.start_again();
+    eventually("rosrescue listens", || client.connect().is_ok());
+    let ended = FakeNode::start("/node");
+    ended.publish(&client, "/topic", "std_msgs/String");
+    robot.rescue.kill();
+    drop(ended);
+    signal(master, Signal::CONT);
+    let living = FakeNode::start("/node");
+    living.publish(&robot.bare(), "/other", "std_msgs/String");
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(robot.state().publishers_of("/other"), ["/node"]);
+    assert_eq!(robot.state().publishers_of("/topic"), [""; 0]);
+    assert!(living.received("shutdown").is_empty());
+}
+
 in_both_modes!(nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master);
 
 fn nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master(mode: Mode) {
