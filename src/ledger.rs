@@ -284,10 +284,11 @@ impl Ledger {
         Ok(recorded)
     }
 
-    /// Writes `call` to the journal before the master has answered it, so that the disk and the master work at the same
+    /// Adds `call` to the journal before the master has answered it, so that the disk and the master work at the same
     /// time. Does nothing unless the master surely accepts the call, and with several computers, whose journal holds
-    /// only answered calls. The caller must pass the answer to [`Self::record`], or call [`Self::withdraw`].
-    pub(crate) fn record_ahead(&self, call: &Arc<Request>, origin: Origin) {
+    /// only answered calls. Returns whether the call was added. Then the caller must call [`Self::write`], and pass the
+    /// answer to [`Self::record`] or call [`Self::withdraw`].
+    pub(crate) fn record_ahead(&self, call: &Arc<Request>, origin: Origin) -> bool {
         let mut inner = self.lock();
         let is_certain = !inner.injecting
             && !inner.doubted
@@ -295,7 +296,7 @@ impl Ledger {
             && inner.journal.is_some()
             && Write::parse(call).is_some_and(|write| inner.mirror.accepts(&write));
         if !is_certain {
-            return;
+            return false;
         }
         let at = clock::wall_millis();
         let entry = RecordContent::labelled(Request::clone(call), Label { at, origin });
@@ -305,10 +306,10 @@ impl Ledger {
         inner.append(vec![entry]);
         inner.ahead = Some(call.clone());
         drop(inner);
-        self.write();
         if self.sync == SyncPolicy::Always {
             self.work.notify_one();
         }
+        true
     }
 
     /// Notes that no answer of the master to the call of [`Self::record_ahead`] will be recorded. A complete checkpoint

@@ -89,7 +89,7 @@ impl Ledger {
     }
 
     /// Writes the queued records to the checkpoint, in another thread.
-    pub(super) fn write(&self) {
+    pub(crate) fn write(&self) {
         #[cfg(test)]
         if self.writes_by_hand.load(Ordering::Relaxed) {
             return;

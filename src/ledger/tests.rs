@@ -630,7 +630,8 @@ impl Recorded {
 async fn a_write_on_its_way_to_the_master_is_in_the_file_once() {
     let it = Recorded::new().await;
     let call = Arc::new(publish("/t"));
-    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    assert!(it.ledger.record_ahead(&call, Origin::Rosrescue));
+    it.ledger.write();
     // Nothing shows the write before the master has answered.
     assert!(it.ledger.with_mirror(Master::is_empty));
     let (found, before) = it.found().await;
@@ -645,7 +646,8 @@ async fn a_write_on_its_way_to_the_master_is_in_the_file_once() {
 async fn a_write_whose_record_a_checkpoint_has_replaced_is_recorded_again() {
     let it = Recorded::new().await;
     let call = Arc::new(publish("/t"));
-    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    assert!(it.ledger.record_ahead(&call, Origin::Rosrescue));
+    it.ledger.write();
     it.checkpoint().await;
     assert!(it.found().await.0.is_empty());
     it.answer(&call, &answered(&call, &mut Master::default()));
@@ -658,7 +660,8 @@ async fn a_recorded_write_that_is_refused_or_never_answered_leaves_the_file() {
     for reply in [Some(refused), None] {
         let it = Recorded::new().await;
         let call = Arc::new(publish("/t"));
-        it.ledger.record_ahead(&call, Origin::Rosrescue);
+        assert!(it.ledger.record_ahead(&call, Origin::Rosrescue));
+        it.ledger.write();
         match reply {
             Some(reply) => it.answer(&call, &reply),
             None => it.ledger.withdraw(),
@@ -675,7 +678,8 @@ async fn a_recorded_write_that_is_refused_or_never_answered_leaves_the_file() {
 async fn a_write_that_the_mirror_answers_instead_stays_in_the_file() {
     let it = Recorded::new().await;
     let call = Arc::new(publish("/t"));
-    it.ledger.record_ahead(&call, Origin::Rosrescue);
+    assert!(it.ledger.record_ahead(&call, Origin::Rosrescue));
+    it.ledger.write();
     it.ledger.answer_from_mirror(Instant::now(), &call).unwrap();
     it.ledger.withdraw();
     assert!(!it.ledger.checkpoint_due());
@@ -693,10 +697,12 @@ async fn only_a_write_that_the_master_surely_accepts_is_recorded_before_its_answ
         call("getParam", &["/n", "/a"]),
         Request::multicall([publish("/t")]),
     ] {
-        it.ledger.record_ahead(&Arc::new(call), Origin::Rosrescue);
+        let call = Arc::new(call);
+        assert!(!it.ledger.record_ahead(&call, Origin::Rosrescue));
     }
     let (_, before) = it.found().await;
-    it.ledger
-        .record_ahead(&Arc::new(publish("/t")), Origin::Rosrescue);
+    let call = Arc::new(publish("/t"));
+    assert!(it.ledger.record_ahead(&call, Origin::Rosrescue));
+    it.ledger.write();
     assert_eq!(it.found().await.1, before + 1);
 }

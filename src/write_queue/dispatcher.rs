@@ -93,6 +93,8 @@ pub(super) enum Action {
     Inspect {
         incarnation: u64,
     },
+    /// Have the disk write the record of the call that was just sent.
+    Write,
     /// Drop the request in flight and the connection to the master.
     Disconnect,
     /// Give callers their answers.
@@ -601,11 +603,12 @@ impl Dispatcher {
             let answers = items.iter().filter_map(|item| item.delivery.as_ref());
             order.calls_sent(tells, answers.map(Delivery::number).collect());
         });
+        let mut is_recorded = false;
         if let [item] = items.as_slice()
             && !item.is_answered_first()
             && let Some(call) = item.call.as_ref().filter(|_| item.raw.is_some())
         {
-            self.ledger.record_ahead(call, item.origin);
+            is_recorded = self.ledger.record_ahead(call, item.origin);
         }
         self.actions.push(match inspects {
             true => Action::Inspect { incarnation },
@@ -614,6 +617,9 @@ impl Dispatcher {
                 request: batch::outbound(&items),
             },
         });
+        if is_recorded {
+            self.actions.push(Action::Write);
+        }
         self.exchange = Exchange::InFlight(InFlight {
             incarnation,
             version: self.ledger.version(),

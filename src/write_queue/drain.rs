@@ -3,6 +3,7 @@
 use std::{
     pin::Pin,
     sync::Arc,
+    task::Poll,
     time::{Duration, Instant},
 };
 
@@ -108,6 +109,9 @@ impl Drain {
                 silent_since: self.link.upstream.silent_since(),
             };
             for action in self.dispatcher.on(&view, input) {
+                if matches!(action, Action::Write) {
+                    self.begin_request().await;
+                }
                 self.carry_out(action);
             }
             let sent = self.dispatcher.unanswered_since();
@@ -131,6 +135,7 @@ impl Drain {
                 request,
             } => self.exchange(incarnation, Some(request)),
             Action::Inspect { incarnation } => self.exchange(incarnation, None),
+            Action::Write => self.link.ledger.write(),
             Action::Disconnect => (self.in_flight, self.connection) = (None, None),
             Action::Answer(answers) => self.answer(answers),
             Action::Report(report) => match report {
@@ -150,6 +155,18 @@ impl Drain {
         let span = tracing::debug_span!("request", incarnation);
         let done = round_trip(self.link.clone(), incarnation, connection, request);
         self.in_flight = Some(Box::pin(done.instrument(span)));
+    }
+
+    /// Sends as much of the request in flight as can be sent without waiting. So the master works on it before the disk's
+    /// thread is woken.
+    async fn begin_request(&mut self) {
+        let Some(in_flight) = self.in_flight.as_mut() else {
+            return;
+        };
+        let begun = std::future::poll_fn(|context| Poll::Ready(in_flight.as_mut().poll(context)));
+        if let Poll::Ready(done) = begun.await {
+            self.in_flight = Some(Box::pin(std::future::ready(done)));
+        }
     }
 
     /// Gives the answers once the effects of their calls are safe.

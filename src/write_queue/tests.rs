@@ -454,6 +454,8 @@ impl World {
                     self.send(incarnation, Some(call));
                 }
                 Action::Inspect { incarnation } => self.send(incarnation, None),
+                // The simulated disk looks for records after each step.
+                Action::Write => {}
                 Action::Disconnect => self.in_flight = None,
                 Action::Answer(answers) => self.give(answers),
                 Action::Report(report) => {
