@@ -79,6 +79,11 @@ impl CutOff {
         self.periods.is_empty()
     }
 
+    /// Whether the writes of all periods but the present one have reached a leader.
+    pub fn is_last_period(&self) -> bool {
+        self.periods.len() == 1
+    }
+
     /// Begins a period of being cut off, in the state `base`.
     pub fn begin(&mut self, base: Master) {
         // The writes of earlier periods may still be on their way.

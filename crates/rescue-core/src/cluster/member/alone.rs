@@ -31,6 +31,7 @@ impl Member {
             let changes = self.outgoing.changes();
             let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
             let kept = self.cut_off.add(kept, true);
+            self.also_send(&kept);
             self.store_writes(kept);
             self.serve_alone();
         } else {
@@ -97,6 +98,7 @@ impl Member {
             let base = self.journal.state.clone();
             self.begin_cut_off(base);
             let kept = self.cut_off.add(answered, true);
+            self.also_send(&kept);
             self.store_writes(kept);
         }
     }

@@ -161,6 +161,8 @@ impl Member {
                 first.filter(|first| first.begins_with(next) && !self.outgoing.differs(first));
             if first.is_some() {
                 self.take_entries(now, entries);
+                // This computer's own entries need no merge.
+                self.outgoing.committed(self.journal.progress.seq);
             }
             return;
         }
@@ -284,10 +286,12 @@ impl Member {
             return;
         };
         let before = std::mem::take(&mut self.reading.before);
-        // Another journal has begun since. What was read of the earlier one is no loss.
+        // Another journal has begun since, or an older copy has replaced the one that was read. What was read of the earlier
+        // one is no loss.
         let known = self.view();
         let is_late = (before.revision..known.revision).contains(&read.view.revision);
-        if is_late && read.view.origin != known.origin {
+        let is_other = read.view.origin != known.origin || read.view.seq() > known.seq();
+        if is_late && is_other {
             self.reading.load_at = Some(now);
             self.reading.check_due |= checks;
             return;

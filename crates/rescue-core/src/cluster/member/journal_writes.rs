@@ -55,6 +55,7 @@ impl Member {
         if self.keeps_writes() {
             let ours = changes.iter().filter(|of| is_ours(of));
             let kept = self.cut_off.add(ours, leads_on);
+            self.also_send(&kept);
             self.store_writes(kept);
         }
         self.outgoing.add(changes);

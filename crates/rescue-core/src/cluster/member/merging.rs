@@ -154,6 +154,16 @@ impl Member {
         }
     }
 
+    /// Notes that these writes were kept. If the period that they belong to is being merged already, they are sent with
+    /// what is left of it.
+    pub(super) fn also_send(&mut self, kept: &[Request]) {
+        if let Some(unsent) = &mut self.merging.unsent
+            && self.cut_off.is_last_period()
+        {
+            unsent.extend_from_slice(kept);
+        }
+    }
+
     fn find_conflicts_again(&mut self, now: Instant) {
         self.merging.step = Step::Reading;
         self.reading.refresh(now);

@@ -31,11 +31,12 @@ impl Notifying {
     /// Notes the entry of another computer. Returns whether that computer has stopped notifying nodes since its last
     /// entry.
     pub(super) fn note_entry(&mut self, change: &MemberEntryChange) -> bool {
-        let marker = change.entry.as_ref().map(|entry| &entry.notifies);
-        let Some(marker) = marker.filter(|marker| !marker.is_empty()) else {
+        let Some(entry) = &change.entry else {
             return false;
         };
+        let marker = &entry.notifies;
+        // A first marker counts, too, if the entry had none while the leader lacked writes of that computer.
         let before = self.markers.insert(change.name.clone(), marker.clone());
-        before.is_some_and(|before| before != *marker)
+        !marker.is_empty() && before.is_some_and(|before| before != *marker)
     }
 }
