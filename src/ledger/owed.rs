@@ -17,8 +17,8 @@ pub(crate) const BACKLOG: Duration = Duration::from_secs(1);
 pub(crate) enum Telling {
     /// Now. The master that may not have sent them is dead.
     Now,
-    /// Now, and once more after [`BACKLOG`]. The master that may not have sent them lives, or an earlier rosrescue was
-    /// sending some, so nodes may read older notifications after these.
+    /// Now, and once more after [`BACKLOG`]. The master that may not have sent them lives, or was just killed, or an earlier
+    /// rosrescue was sending some, so nodes may read older notifications after these.
     Twice,
     /// After [`BACKLOG`]. A living master is probably sending them.
     Later,
@@ -26,9 +26,9 @@ pub(crate) enum Telling {
 
 impl Telling {
     /// When nodes get the notifications that they may lack after a recovery with this outcome. `None` if they lack none,
-    /// because the same master has gone on. `restarted` says whether an earlier rosrescue of this session may still have
-    /// notifications on their way.
-    pub(crate) fn after(outcome: RecoveryOutcome, restarted: bool) -> Option<Self> {
+    /// because the same master has gone on. `may_be_late` says whether notifications of an earlier rosrescue of this
+    /// session, or of a living master that was killed, may still arrive.
+    pub(crate) fn after(outcome: RecoveryOutcome, may_be_late: bool) -> Option<Self> {
         match outcome {
             RecoveryOutcome::Resumed => None,
             // This master notifies nodes itself, but the previous rosrescue may have died while it stood in for another
@@ -37,7 +37,7 @@ impl Telling {
             // The master may send outdated notifications now.
             RecoveryOutcome::Reconciled => Some(Self::Twice),
             RecoveryOutcome::Begun | RecoveryOutcome::Injected => {
-                let is_late = restarted && !Mutant::ForgetsLastProcess.lives();
+                let is_late = may_be_late && !Mutant::ForgetsLastProcess.lives();
                 Some(if is_late { Self::Twice } else { Self::Now })
             }
         }

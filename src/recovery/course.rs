@@ -64,6 +64,8 @@ pub(crate) struct NewsAfter {
 pub(crate) struct Course {
     lifecycle: Lifecycle,
     news: News,
+    /// Whether a living master was killed since the last one was examined. Until then it may have sent old notifications.
+    has_killed: bool,
 }
 
 impl Course {
@@ -71,6 +73,7 @@ impl Course {
         Self {
             lifecycle: Lifecycle::new(supervision, probing),
             news: News::Sent,
+            has_killed: false,
         }
     }
 
@@ -115,7 +118,11 @@ impl Course {
         }
         for action in actions {
             match action {
-                Action::Connect | Action::Kill => self.disconnect(&mut steps),
+                Action::Connect => self.disconnect(&mut steps),
+                Action::Kill => {
+                    self.has_killed = true;
+                    self.disconnect(&mut steps);
+                }
                 Action::Spawn => self.send_news(now, &mut steps),
                 Action::ShutGate(_) => self.shut(&mut steps),
                 Action::StandIn => steps.gate = State::Late,
@@ -136,10 +143,11 @@ impl Course {
             (News::Owed, RecoveryOutcome::Adopted) => News::Expected(now + NEWS_WITHIN),
             _ => News::Sent,
         };
+        let has_killed = std::mem::take(&mut self.has_killed);
         let sent = news == News::SentFirst && outcome == RecoveryOutcome::Injected;
         NewsAfter {
             all: !self.lifecycle.has_served() && !sent,
-            telling: Telling::after(outcome, news == News::Owed),
+            telling: Telling::after(outcome, news == News::Owed || has_killed),
         }
     }
 

@@ -886,12 +886,16 @@ fn late_masters_are_given_what_they_missed() {
     assert!(caught_up > 3);
 }
 
-/// rosrescue dies with a notification on its way, the next one finds a living master, and that dies before the health
-/// check has told the state again.
+/// * 719532: rosrescue dies with a notification on its way, the next one finds a living master, and that dies before the
+///   health check has told the state again.
+/// * 817847: a master that was stopped goes on, sends an old notification, and is killed. Subscribers were told the present
+///   state before.
 #[test]
-fn what_a_dead_process_owed_is_told_again_if_the_next_master_dies_soon() {
-    let broken = mistake(None, 719_532, 1);
-    assert!(broken.is_none(), "{broken:?}");
+fn what_was_sent_before_a_death_is_not_what_nodes_hear_last() {
+    for seed in [719_532, 817_847] {
+        let broken = mistake(None, seed, 1);
+        assert!(broken.is_none(), "{broken:?}");
+    }
 }
 
 #[test]
