@@ -33,6 +33,9 @@ use crate::{
 /// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 
+/// Maximum number of addresses that are asked whether a node listens there, because calls wait meanwhile.
+const ASKED_MOST: usize = 32;
+
 /// Why a master could not be examined.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -485,12 +488,14 @@ impl Examiner {
         if bears == TokenState::Nothing || Mutant::ReturnsEndedNodes.lives() {
             return Ok(ended);
         }
-        let mut elsewhere = Vec::new();
+        let mut elsewhere = BTreeSet::new();
         let mut hidden = Vec::new();
         for (node, api) in self.ledger.pending_registrants() {
             match found.api_of(&node) {
                 Some(now) if now == api => {}
-                Some(_) => elsewhere.push(api),
+                Some(_) => {
+                    elsewhere.insert(api);
+                }
                 None => hidden.push((node, api)),
             }
         }
@@ -503,7 +508,7 @@ impl Examiner {
             let moved = moved.filter(|((_, api), now)| now.as_ref().is_some_and(|now| now != api));
             elsewhere.extend(moved.map(|((_, api), _)| api));
         }
-        for api in elsewhere {
+        for api in elsewhere.into_iter().take(ASKED_MOST) {
             if master.is_dead(port_of(&api)).await {
                 ended.insert(api);
             }
