@@ -66,20 +66,21 @@ impl RobotState {
     pub(super) async fn read(api: &Api) -> Result<Self, String> {
         let start = Instant::now();
         loop {
-            if let Some(state) = Self::read_once(api).await? {
-                return Ok(state);
-            }
+            let gone = match Self::read_once(api).await? {
+                Ok(state) => return Ok(state),
+                Err(gone) => gone,
+            };
             if start.elapsed() > STEADY_LIMIT {
                 let limit = STEADY_LIMIT.as_secs();
                 return Err(format!(
-                    "for {limit} s, nodes unregistered while it was read"
+                    "for {limit} s, a node was listed and its address was not known, {gone} last"
                 ));
             }
         }
     }
 
-    /// `None` if a node unregistered between two calls.
-    async fn read_once(api: &Api) -> Result<Option<Self>, String> {
+    /// The name of a node instead, if it unregistered between two calls.
+    async fn read_once(api: &Api) -> Result<Result<Self, String>, String> {
         let state = api.call("getSystemState", &[]).await?;
         let types = api.call("getTopicTypes", &[]).await?;
         // A master may hold a parameter that it can never return, so this call may fail.
@@ -89,7 +90,7 @@ impl RobotState {
         let mut questions = JoinSet::new();
         for name in names {
             let Some(api) = api.lookup_node(&name).await? else {
-                return Ok(None);
+                return Ok(Err(name));
             };
             questions.spawn(async move {
                 let pid = pid_at(&api).await;
@@ -97,7 +98,7 @@ impl RobotState {
             });
         }
         let nodes = questions.join_all().await.into_iter().collect();
-        Ok(Some(Self { facts, nodes }))
+        Ok(Ok(Self { facts, nodes }))
     }
 
     /// Number of registrations, types and parameters.
