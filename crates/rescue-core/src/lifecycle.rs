@@ -40,19 +40,56 @@ const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
 /// Pause before the next connection attempt if the server at the master's address is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
+/// What is being done with the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
+    /// Nothing: not started yet, or stopped.
+    Stopped,
     /// No master is connected.
-    Seeking,
+    Seeking {
+        /// Since when no master serves.
+        since: Instant,
+    },
     /// A master is connected. It is not yet known to have the mirror's state.
-    Examining,
-    /// Calls pass to the master.
-    Serving,
+    Examining {
+        /// Since when no master serves.
+        since: Instant,
+    },
+    /// Calls pass to the master, or would if it was not late.
+    Serving { since: Instant, lateness: Lateness },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Lateness {
+    InTime,
     /// The master is late, and the mirror answers in its place.
     Late,
     /// The late master gets the writes that the mirror has answered.
     CatchingUp,
-    Stopped,
+}
+
+/// Where the mirror's state comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum StateFrom {
+    /// From nowhere yet: a master may be running, and its state has to be read.
+    Nowhere,
+    /// This is a new session with a new master, so the state is empty.
+    NewMaster,
+    /// From a checkpoint whose session continues.
+    Checkpoint,
+    /// From a master that has served.
+    Master,
+}
+
+/// Whether an external master, which another program starts, has died.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum TheirDeath {
+    #[default]
+    No,
+    /// It has closed its connection, and may have died.
+    Suspected,
+    /// It was counted as dead. Since then its port has not refused a connection, and no master was examined there.
+    Counted,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -77,29 +114,17 @@ pub struct Lifecycle {
     supervision: Supervision,
     probing: Probing,
     phase: Phase,
-    served: bool,
-    /// Whether the mirror comes from a checkpoint whose session continues.
-    restored: bool,
-    /// Whether the mirror is known to equal the state of a master.
-    known: bool,
+    state_from: StateFrom,
     /// When the child, a master that rosrescue has started, began. For an orphan, a master left by an earlier
     /// rosrescue, when this rosrescue began. `None` if there is no child and no orphan.
     child: Option<Instant>,
-    /// Since when no master has been connected.
-    seeking_since: Option<Instant>,
     /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
     deaths: VecDeque<Instant>,
     total_deaths: u64,
     /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`], and no master has
     /// served for [`CALM`] since.
     crash_loop: bool,
-    /// Since when calls pass to the master. `None` while they do not.
-    serving_since: Option<Instant>,
-    /// Whether an external master, which another program starts, has closed its connection and may have died.
-    lost: bool,
-    /// Whether an external master was counted as dead, and since then its port has not refused a connection and no
-    /// master was examined there.
-    dying: bool,
+    their_death: TheirDeath,
     missed: u32,
     patience: Patience,
     /// The samples of a child that does not answer.
@@ -116,18 +141,13 @@ impl Lifecycle {
         Self {
             supervision,
             probing,
-            phase: Phase::Seeking,
-            served: false,
-            restored: false,
-            known: false,
+            phase: Phase::Stopped,
+            state_from: StateFrom::Nowhere,
             child: None,
-            seeking_since: None,
             deaths: VecDeque::new(),
             total_deaths: 0,
             crash_loop: false,
-            serving_since: None,
-            lost: false,
-            dying: false,
+            their_death: TheirDeath::No,
             missed: 0,
             patience: Patience::new(probing.patience),
             evidence: Evidence::default(),
@@ -145,8 +165,10 @@ impl Lifecycle {
 
     /// When the crash loop ends, unless the master dies before that.
     fn calm_at(&self) -> Option<Instant> {
-        let since = self.serving_since.filter(|_| self.crash_loop)?;
-        Some(since + CALM)
+        match self.phase {
+            Phase::Serving { since, .. } if self.crash_loop => Some(since + CALM),
+            _ => None,
+        }
     }
 
     /// Number of masters that died since the start.
@@ -157,12 +179,12 @@ impl Lifecycle {
     /// Whether the mirror may answer while no calls pass to the master, because it is known to equal the state of a
     /// master.
     pub fn may_stand_in(&self) -> bool {
-        self.known
+        self.state_from != StateFrom::Nowhere
     }
 
     /// Whether a master has served since the start.
     pub fn has_served(&self) -> bool {
-        self.served
+        self.state_from == StateFrom::Master
     }
 
     /// How long a write waits for the master before the mirror answers it.
@@ -190,7 +212,7 @@ impl Lifecycle {
 
     /// Whether this is a new session in which no master has served yet.
     pub fn is_new_session(&self) -> bool {
-        !self.served && !self.restored
+        matches!(self.state_from, StateFrom::Nowhere | StateFrom::NewMaster)
     }
 
     /// Takes an input at `now`. Returns the actions, in order.
@@ -215,17 +237,19 @@ impl Lifecycle {
     /// assert_eq!(lifecycle.on(now, Input::ConnectionLost), [shut, Action::Connect]);
     /// ```
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
-        if self.phase == Phase::Stopped {
-            return Vec::new();
-        }
+        let is_examining = matches!(self.phase, Phase::Examining { .. });
         match input {
             Input::Start { left, restored } => self.start(now, left, restored),
+            _ if self.phase == Phase::Stopped => Vec::new(),
             Input::Answered => {
-                self.dying = false;
+                if self.their_death == TheirDeath::Counted {
+                    self.their_death = TheirDeath::No;
+                }
                 Vec::new()
             }
             Input::Connected => {
-                self.phase = Phase::Examining;
+                let since = self.away_since().unwrap_or(now);
+                self.phase = Phase::Examining { since };
                 self.timer = None;
                 vec![Action::Examine]
             }
@@ -236,12 +260,10 @@ impl Lifecycle {
                 self.give_up(now)
             }
             Input::Unreachable => self.unreachable(now),
-            Input::NotAMaster if self.phase == Phase::Examining && self.is_hopeless(now) => {
-                self.give_up(now)
-            }
+            Input::NotAMaster if is_examining && self.is_hopeless(now) => self.give_up(now),
             // rosmaster closes connections that carry nothing for a few seconds, so a connection also ends if rosmaster
             // or rosrescue gets too little processor time.
-            Input::ConnectionLost if self.phase == Phase::Examining && self.is_hopeless(now) => {
+            Input::ConnectionLost if is_examining && self.is_hopeless(now) => {
                 self.give_up_if_hung(now, BUSY_LIMIT, true)
             }
             Input::NotAMaster => {
@@ -251,40 +273,25 @@ impl Lifecycle {
             }
             // The master died during the examination, or closes every connection. In both cases, wait before the next
             // connection.
-            Input::ConnectionLost if self.phase == Phase::Examining => {
+            Input::ConnectionLost if is_examining => {
                 let mut actions = self.connect_later(now, false);
-                let again = std::mem::replace(&mut self.dying, true);
-                if self.supervision == Supervision::Theirs && !again {
-                    actions.extend(self.their_death(now));
+                let before = std::mem::replace(&mut self.their_death, TheirDeath::Counted);
+                if self.supervision == Supervision::Theirs && before != TheirDeath::Counted {
+                    actions.extend(self.count_their_death(now));
                 }
                 actions
             }
-            Input::Late if self.phase == Phase::Serving => {
-                self.phase = Phase::Late;
-                let probe = self.probe_now();
-                [Action::StandIn].into_iter().chain(probe).collect()
+            Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => {
+                self.late(now, input)
             }
-            Input::LateAnswered if self.phase == Phase::Late => {
-                self.phase = Phase::CatchingUp;
-                self.patience.was_late(now);
-                self.timer = None;
-                vec![Action::CatchUp]
-            }
-            Input::CaughtUp if self.phase == Phase::CatchingUp => {
-                self.phase = Phase::Serving;
-                self.note_answer(now);
-                vec![Action::OpenGate]
-            }
-            Input::NotCaughtUp if self.phase == Phase::CatchingUp => {
-                self.lose_master(now, Cause::Late, vec![Action::Connect])
-            }
-            Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
             Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
             Input::Slow => self.probe_now().into_iter().collect(),
             // If the master was killed, the other signs of its end follow within milliseconds. If it lives, the next
             // connection shows that.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
-                self.lost = self.supervision == Supervision::Theirs;
+                if self.supervision == Supervision::Theirs {
+                    self.their_death = TheirDeath::Suspected;
+                }
                 let cause = match input {
                     Input::ThreadEnded => Cause::ThreadEnded,
                     _ => Cause::ConnectionLost,
@@ -292,14 +299,18 @@ impl Lifecycle {
                 self.lose_master(now, cause, vec![Action::Connect])
             }
             Input::Examined { new } => {
-                let died = std::mem::take(&mut self.lost) && new;
-                (self.dying, self.taken_ports.count) = (false, 0);
-                self.phase = Phase::Serving;
-                (self.served, self.known) = (true, true);
-                self.seeking_since = None;
-                self.serving_since = Some(now);
+                let before = std::mem::take(&mut self.their_death);
+                self.taken_ports.count = 0;
+                self.state_from = StateFrom::Master;
+                self.phase = Phase::Serving {
+                    since: now,
+                    lateness: Lateness::InTime,
+                };
                 self.note_answer(now);
-                let report = if died { self.their_death(now) } else { None };
+                let report = match before == TheirDeath::Suspected && new {
+                    true => self.count_their_death(now),
+                    false => None,
+                };
                 std::iter::once(Action::OpenGate).chain(report).collect()
             }
             Input::ProbeAnswered => {
@@ -311,7 +322,7 @@ impl Lifecycle {
                 self.evidence.clear();
                 self.child = Some(now);
                 self.failed_spawns = 0;
-                self.seeking_since = Some(now);
+                self.phase = Phase::Seeking { since: now };
                 vec![Action::Connect]
             }
             Input::SpawnFailed { pending: false } if self.is_new_session() => vec![Action::GiveUp],
@@ -353,19 +364,60 @@ impl Lifecycle {
 
     fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
-        self.restored = restored;
-        // A new master has no state, so the mirror is right. The state of an orphan must be read first.
-        self.known = restored || (self.supervision == Supervision::Ours && !left);
-        if self.supervision == Supervision::Ours && !left {
+        let is_new = self.supervision == Supervision::Ours && !left;
+        self.state_from = match restored {
+            true => StateFrom::Checkpoint,
+            false if is_new => StateFrom::NewMaster,
+            // The state of an orphan or of an external master.
+            false => StateFrom::Nowhere,
+        };
+        if is_new {
             return vec![Action::Spawn];
         }
         self.child = left.then_some(now);
         vec![Action::Connect]
     }
 
+    /// Handles what is said about a master that is late.
+    fn late(&mut self, now: Instant, input: Input) -> Vec<Action> {
+        let Phase::Serving { lateness, .. } = &mut self.phase else {
+            return Vec::new();
+        };
+        match (*lateness, input) {
+            (Lateness::InTime, Input::Late) => {
+                *lateness = Lateness::Late;
+                let probe = self.probe_now();
+                [Action::StandIn].into_iter().chain(probe).collect()
+            }
+            (Lateness::Late, Input::LateAnswered) => {
+                *lateness = Lateness::CatchingUp;
+                self.patience.was_late(now);
+                self.timer = None;
+                vec![Action::CatchUp]
+            }
+            (Lateness::CatchingUp, Input::CaughtUp) => {
+                *lateness = Lateness::InTime;
+                self.note_answer(now);
+                vec![Action::OpenGate]
+            }
+            (Lateness::CatchingUp, Input::NotCaughtUp) => {
+                self.lose_master(now, Cause::Late, vec![Action::Connect])
+            }
+            _ => Vec::new(),
+        }
+    }
+
     /// Whether calls pass to the master, or would if it was not late.
     fn is_serving(&self) -> bool {
-        matches!(self.phase, Phase::Serving | Phase::Late | Phase::CatchingUp)
+        matches!(self.phase, Phase::Serving { .. })
+    }
+
+    /// Since when no master serves.
+    fn away_since(&self) -> Option<Instant> {
+        match self.phase {
+            Phase::Seeking { since } | Phase::Examining { since } => Some(since),
+            Phase::Serving { .. } | Phase::Stopped => None,
+        }
     }
 
     /// Notes that the master has answered.
@@ -382,10 +434,9 @@ impl Lifecycle {
     }
 
     fn seek(&mut self, now: Instant) {
-        self.phase = Phase::Seeking;
-        self.serving_since = None;
+        let since = self.away_since().unwrap_or(now);
+        self.phase = Phase::Seeking { since };
         self.timer = None;
-        self.seeking_since.get_or_insert(now);
     }
 
     /// Handles the loss of the master: lets no more calls pass to it, then takes the actions `then`.
@@ -402,15 +453,15 @@ impl Lifecycle {
     }
 
     fn refused(&mut self, now: Instant) -> Vec<Action> {
-        self.dying = false;
+        let before = std::mem::take(&mut self.their_death);
         if self.is_slow_to_start(now) {
             let limit = self.probing.start_limit.saturating_mul(STARTS_AT_MOST);
             return self.give_up_if_hung(now, limit, false);
         }
         let mut actions = self.connect_later(now, false);
-        if std::mem::take(&mut self.lost) {
+        if before == TheirDeath::Suspected {
             // The process that closed the connection no longer listens.
-            actions.extend(self.their_death(now));
+            actions.extend(self.count_their_death(now));
         }
         actions
     }
@@ -425,7 +476,7 @@ impl Lifecycle {
 
     /// Whether the child has had more than [`Probing::start_limit`], and still no master answers at its port.
     fn is_hopeless(&self, now: Instant) -> bool {
-        let since = self.seeking_since.filter(|_| self.child.is_some());
+        let since = self.away_since().filter(|_| self.child.is_some());
         since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
     }
 
@@ -449,7 +500,7 @@ impl Lifecycle {
 
     fn unreachable(&mut self, now: Instant) -> Vec<Action> {
         match self.supervision {
-            Supervision::Ours if self.phase == Phase::Examining => {
+            Supervision::Ours if matches!(self.phase, Phase::Examining { .. }) => {
                 let actions = self.give_up_if_hung(now, BUSY_LIMIT, true);
                 if actions.contains(&Action::Kill) {
                     self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
@@ -465,7 +516,7 @@ impl Lifecycle {
     fn connect_later(&mut self, now: Instant, far: bool) -> Vec<Action> {
         self.seek(now);
         let waited = self
-            .seeking_since
+            .away_since()
             .map_or(Duration::ZERO, |since| now.duration_since(since));
         self.timer = Some((now + pause_before_connect(waited, far), Timer::Connect));
         Vec::new()
@@ -514,8 +565,7 @@ impl Lifecycle {
 
     /// Counts the death of a master that another program starts. rosrescue cannot slow down that program's restarts,
     /// but reports a crash loop once.
-    fn their_death(&mut self, now: Instant) -> Option<Action> {
-        self.lost = false;
+    fn count_their_death(&mut self, now: Instant) -> Option<Action> {
         let said = self.crash_loop;
         self.count_death(now);
         (self.crash_loop && !said).then_some(Action::ReportCrashLoop(self.deaths.len()))
