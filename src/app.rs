@@ -235,7 +235,7 @@ impl Runs {
         let (Some(cluster), Some(supervised)) = (&config.cluster, &supervised) else {
             if restored {
                 // The mirror answers while masters that an earlier rosrescue left are still being looked for.
-                context.gate_tx.set(State::StandingIn);
+                context.ledger.shut_gate(State::StandingIn);
             }
             return Ok((None, Self::Single(supervised)));
         };

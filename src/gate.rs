@@ -1,10 +1,10 @@
-//! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. The start, the recovery
-//! and, with several computers, `app::cluster` change the gate, through the [`Tx`].
+//! The gate: whether calls pass to the master. Any task may read the gate and wait for a change. Only the
+//! [ledger](crate::ledger::Ledger) sets it, under its lock, so that the mirror and the gate always fit together.
 //!
-//! `recovery::course` decides when [`State::StandingIn`] or [`State::Unknown`] is set, the driver sets [`State::Late`],
-//! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets
-//! [`State::Open`]. A start with a checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does
-//! not lead, `app::cluster` sets [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].
+//! `recovery::course` decides when it is [`State::StandingIn`] or [`State::Unknown`], the lifecycle when it is
+//! [`State::Late`] or [`State::Open`]. An examination shuts it for an [injection](State::Injecting). A start with a
+//! checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does not lead, `app::cluster` sets
+//! [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].
 
 use tokio::{sync::watch, time::Instant};
 
@@ -44,17 +44,17 @@ struct Gate {
     since: Instant,
 }
 
-/// Creates a [gate](self) that lets no calls pass, and returns its writing and its reading half.
-pub(crate) fn gate() -> (Tx, Rx) {
-    let (tx, rx) = watch::channel(Gate {
+/// Creates a [gate](self) that lets no calls pass.
+pub(crate) fn gate() -> Tx {
+    let (tx, _) = watch::channel(Gate {
         state: State::Unknown,
         since: Instant::now(),
     });
-    (Tx(tx), Rx(rx))
+    Tx(tx)
 }
 
 /// The writing half of the [gate](self), which sets whether calls pass to the master.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub(crate) struct Tx(watch::Sender<Gate>);
 
 impl Tx {
@@ -75,6 +75,10 @@ impl Tx {
 
     pub(crate) fn state(&self) -> State {
         self.0.borrow().state
+    }
+
+    pub(crate) fn subscribe(&self) -> Rx {
+        Rx(self.0.subscribe())
     }
 }
 
@@ -134,7 +138,8 @@ mod tests {
 
     #[tokio::test]
     async fn an_observation_reports_a_change_that_was_not_waited_for() {
-        let (tx, mut rx) = gate();
+        let tx = gate();
+        let mut rx = tx.subscribe();
         tx.set(State::StandingIn);
         assert_eq!(rx.observe_change(), (State::StandingIn, true));
         assert_eq!(rx.observe_change(), (State::StandingIn, false));

@@ -46,12 +46,17 @@ use tokio::sync::{Notify, watch};
 use self::activity::Activity;
 pub(crate) use self::durability::Mark;
 use self::{
-    inner::{Inner, Notifier},
-    late::{CatchUp, LateState, Missed, notified_once},
+    inner::{Inner, Notifier, StateFrom},
+    late::{CatchUp, LateState, Missed, Outstanding, notified_once},
     mutant::Mutant,
     shared::{Agreement, LeaderLease, Shared},
 };
-use crate::{cli::SyncPolicy, clock, status::stats::Stats};
+use crate::{
+    cli::SyncPolicy,
+    clock,
+    gate::{self, State},
+    status::stats::Stats,
+};
 
 /// Refuses an outdated result: another incarnation (see [`Token`]) has begun, the mirror has changed since, or the
 /// master is on another computer than the caller assumed.
@@ -153,7 +158,7 @@ impl Ledger {
 
     /// Notes that the mirror comes from a checkpoint, which may be older than a living master.
     pub fn set_unconfirmed(&self) {
-        self.lock().unconfirmed = true;
+        self.lock().state_from = StateFrom::Checkpoint;
     }
 
     /// Sets the answers to `getPid` and `getUri`.
@@ -217,7 +222,8 @@ impl Ledger {
         batch: &[(&Request, &Reply, &Source, Origin)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
-        if inner.session.incarnation != incarnation || inner.injecting || inner.is_elsewhere() {
+        if inner.session.incarnation != incarnation || inner.is_injecting() || inner.is_elsewhere()
+        {
             return Err(Superseded);
         }
         let mut recorded = Recorded::default();
@@ -290,7 +296,7 @@ impl Ledger {
     /// answer to [`Self::record`] or call [`Self::withdraw`].
     pub(crate) fn record_ahead(&self, call: &Arc<Request>, origin: Origin) -> bool {
         let mut inner = self.lock();
-        let is_certain = !inner.injecting
+        let is_certain = !inner.is_injecting()
             && !inner.doubted
             && matches!(inner.shared, Shared::Nobody)
             && inner.journal.is_some()
@@ -391,7 +397,7 @@ impl Ledger {
         state: Master,
     ) -> Result<Vec<String>, Superseded> {
         let mut inner = self.lock();
-        if inner.injecting
+        if inner.is_injecting()
             || inner.is_elsewhere()
             // The master has not run these when it was read.
             || !inner.pending.calls().is_empty() && !Mutant::ReadsTooEarly.lives()
@@ -516,17 +522,29 @@ impl Ledger {
         }
         inner.pending.clear();
         inner.activity = Default::default();
-        (inner.doubted, inner.abandoned) = (false, false);
+        inner.note_equal();
         inner.adopt(state);
         drop(inner);
         self.work.notify_one();
         Ok(())
     }
 
-    /// Freezes the mirror until [`Self::end_injection`]. Returns the state from which the injection is planned.
+    /// The [gate], which tells whether calls pass to the master.
+    pub fn gate(&self) -> gate::Rx {
+        self.lock().gate.subscribe()
+    }
+
+    /// Sets the gate, so that the mirror may change again. [`Self::open_gate`] sets [`State::Open`], and
+    /// [`Self::begin_injection`], [`Self::resume`] and [`Self::begin_catch_up`] set [`State::Injecting`].
+    pub fn shut_gate(&self, state: State) {
+        self.lock().gate.set(state);
+    }
+
+    /// Shuts the gate for an injection: the mirror must not change until the gate is set again. Returns the state from
+    /// which the injection is planned.
     pub fn begin_injection(&self) -> Basis {
-        let mut inner = self.lock();
-        inner.injecting = true;
+        let inner = self.lock();
+        inner.gate.set(State::Injecting);
         Basis {
             mirror: inner.mirror.clone(),
             version: inner.version,
@@ -578,7 +596,7 @@ impl Ledger {
         let mut inner = self.lock();
         let announced = inner.announce();
         // The injection makes both sides equal, so no doubt remains.
-        (inner.doubted, inner.abandoned) = (false, false);
+        inner.note_equal();
         let token = inner.token();
         drop(inner);
         self.write();
@@ -600,48 +618,46 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// Lets calls pass to the present master and allows the mirror to change again. Returns the number in the master's
-    /// [`Token`].
-    pub fn serve(&self) -> u64 {
+    /// Lets calls pass to the present master. Returns the number in its [`Token`].
+    pub fn open_gate(&self) -> u64 {
         let mut inner = self.lock();
-        inner.injecting = false;
-        inner.unconfirmed = false;
         inner.order.lateness_is_over();
         let incarnation = inner.session.incarnation;
-        inner.served = Some(incarnation);
+        inner.state_from = StateFrom::Master { incarnation };
+        inner.gate.set(State::Open { incarnation });
         incarnation
     }
 
     /// Whether calls have passed to the present master. `None` if calls have never passed to a master.
     pub fn has_served_present(&self) -> Option<bool> {
         let inner = self.lock();
-        inner.served.map(|of| of == inner.session.incarnation)
-    }
-
-    /// Ends the freeze of [`Self::begin_injection`] and [`Self::resume`]: the mirror may change again.
-    pub fn end_injection(&self) {
-        self.lock().injecting = false;
+        match inner.state_from {
+            StateFrom::Master { incarnation } => Some(incarnation == inner.session.incarnation),
+            StateFrom::ThisProcess | StateFrom::Checkpoint => None,
+        }
     }
 
     /// Notes that the connection to the present master ended before the answer to a batch. The master may still run
     /// that batch.
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
-        (inner.abandoned, inner.behind) = (true, None);
+        inner.outstanding = Outstanding::Abandoned;
         inner.order.lateness_is_over();
     }
 
     /// Notes that the present master can no longer be running a batch of an ended connection.
     pub fn settled(&self) {
-        self.lock().abandoned = false;
+        self.lock().outstanding = Outstanding::Awaited;
     }
 
     /// Whether the present master can continue unchanged: no write is pending, and it runs no batch of an ended
-    /// connection. If so, the mirror is frozen until [`Self::end_injection`].
+    /// connection. If so, shuts the gate as [`Self::begin_injection`] does.
     pub fn resume(&self) -> bool {
-        let mut inner = self.lock();
-        let whole = inner.pending.calls().is_empty() && !inner.abandoned;
-        inner.injecting |= whole;
+        let inner = self.lock();
+        let whole = inner.pending.calls().is_empty() && !inner.outstanding.is_abandoned();
+        if whole {
+            inner.gate.set(State::Injecting);
+        }
         whole
     }
 
@@ -650,14 +666,17 @@ impl Ledger {
     /// whether the mirror has answered no later calls: otherwise the master must be examined when it answers.
     pub(crate) fn fall_behind(&self, now: Instant, tells: Vec<Subject>, is_exact: bool) {
         let mut inner = self.lock();
+        if inner.outstanding.is_abandoned() {
+            return;
+        }
         inner.order.master_is_late(now);
-        inner.behind = Some(LateState {
+        inner.outstanding = Outstanding::Late(Box::new(LateState {
             is_exact,
             state: inner.mirror.clone(),
             ran: inner.pending.calls().len(),
             tells,
             answered: false,
-        });
+        }));
     }
 
     /// Notes that the late master has answered its outstanding calls. It may notify nodes of the changes by these calls
@@ -665,7 +684,7 @@ impl Ledger {
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
         let Inner {
-            behind: Some(behind),
+            outstanding: Outstanding::Late(late),
             mirror,
             order,
             ..
@@ -673,34 +692,33 @@ impl Ledger {
         else {
             return;
         };
-        behind.answered = true;
+        late.answered = true;
         order.late_answered(now);
-        note_master_notifications(now, order, mirror, &behind.tells);
+        note_master_notifications(now, order, mirror, &late.tells);
         drop(inner);
         self.outbox_changed.notify_one();
     }
 
-    /// Decides what the present master needs after it was late and has answered. Freezes the mirror until
-    /// [`Self::end_injection`] or [`Self::serve`].
+    /// Decides what the present master needs after it was late and has answered. Shuts the gate as
+    /// [`Self::begin_injection`] does.
     ///
     /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
     /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
     pub(crate) fn begin_catch_up(&self) -> Option<CatchUp> {
         let mut inner = self.lock();
-        let behind = inner.behind.take();
-        let behind = behind.filter(|behind| behind.answered && behind.is_exact)?;
-        if inner.doubted || inner.abandoned || inner.mirror.is_inexact() {
+        inner.gate.set(State::Injecting);
+        let late = inner.outstanding.take_late();
+        let late = late.filter(|late| late.answered && late.is_exact)?;
+        if inner.doubted || inner.mirror.is_inexact() {
             return None;
         }
         if inner.pending.calls().is_empty() {
-            inner.injecting = true;
             return Some(CatchUp::Nothing);
         }
-        let writes = inner.pending.calls().get(behind.ran..)?.to_vec();
-        let notified = notified_once(&behind, &writes)?;
-        inner.injecting = true;
+        let writes = inner.pending.calls().get(late.ran..)?.to_vec();
+        let notified = notified_once(&late, &writes)?;
         Some(CatchUp::Run(Box::new(Missed {
-            behind: behind.state,
+            behind: late.state,
             writes,
             notified,
             mirror: inner.mirror.clone(),

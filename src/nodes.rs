@@ -96,7 +96,6 @@ impl Nodes {
     /// computer.
     pub(crate) fn new(
         ledger: Arc<Ledger>,
-        gate: gate::Rx,
         write_queue: WriteQueue,
         stats: &'static Stats,
         timeout: Duration,
@@ -104,8 +103,8 @@ impl Nodes {
         local: Arc<LocalNodes>,
     ) -> Self {
         Self {
+            gate: ledger.gate(),
             ledger,
-            gate,
             write_queue,
             stats,
             timeout,

@@ -31,7 +31,7 @@ use self::{
     reporting::{LastMessage, Outage},
 };
 use crate::{
-    gate::State,
+    gate::{self, State},
     ledger::history::Rescues,
     limit::{AlarmLimit, alarm, all_clear, rarely},
     nodes::{self, Nodes},
@@ -84,6 +84,7 @@ type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 /// Carries out what the [lifecycle](rescue_core::lifecycle) decides: starts and watches the master, gives it its state, and
 /// lets calls pass to it.
 pub(crate) struct Driver {
+    gate: gate::Rx,
     examiner: Examiner,
     reach: Reach,
     write_queue: WriteQueue,
@@ -129,6 +130,7 @@ impl Driver {
         Self {
             course: Course::new(supervision, reach.probing),
             outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
+            gate: examiner.ledger.gate(),
             examiner,
             reach,
             write_queue,
@@ -165,12 +167,12 @@ impl Driver {
     /// says whether the mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Step> {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
-        let gate = self.examiner.gate.state();
+        let gate = self.gate.state();
         let input = Input::Start { left, restored };
         let mut steps = self.course.on(Instant::now(), gate, input);
         steps.retain(|step| match step {
             Step::Shut(gate) => {
-                self.shut(*gate);
+                self.examiner.ledger.shut_gate(*gate);
                 false
             }
             _ => true,
@@ -219,7 +221,7 @@ impl Driver {
                 None => self.next_input(&stop).await,
             };
             self.sample_for(now).await;
-            let gate = self.examiner.gate.state();
+            let gate = self.gate.state();
             steps = self.course.on(Instant::now(), gate, now);
             let deaths = self.course.lifecycle().deaths();
             self.board.update(|facts| facts.set_deaths(deaths));
@@ -253,7 +255,7 @@ impl Driver {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
                 () = wait::for_some(self.ended.as_mut()) => {
-                    if !self.examiner.gate.state().is_open() {
+                    if !self.gate.state().is_open() {
                         let master = self.reach.upstream.address();
                         self.log_waiting(&format!("{master} closes the connection without a reason"), false);
                     }
@@ -288,12 +290,12 @@ impl Driver {
     async fn carry_out(&mut self, step: Step) -> Option<Input> {
         match step {
             Step::Disconnect => self.disconnect(),
-            Step::Shut(gate) => self.shut(gate),
+            Step::Shut(gate) => self.examiner.ledger.shut_gate(gate),
             Step::NotifyAll => nodes::notify_after_restart(&self.nodes),
             Step::ReportDeathWhileInjected => alarm!(
                 warn,
                 AWAY,
-                "the new master died while its state was being restored; the next master gets the state"
+                "the master died before calls could pass to it; the next master gets the state"
             ),
             Step::SetPatience(patience) => self.write_queue.set_patience(patience),
             Step::Act(action) => return self.act(action).await,
@@ -360,7 +362,7 @@ impl Driver {
                     info,
                     "the master is slow to answer; rosrescue answers in its place until the master answers again"
                 );
-                self.examiner.gate.set(State::Late);
+                self.examiner.ledger.shut_gate(State::Late);
             }
             Action::CatchUp => {
                 self.probe_deadline = None;
@@ -513,12 +515,6 @@ impl Driver {
         self.probe_deadline = None;
     }
 
-    /// Ends an injection that is in progress, and sets the gate.
-    fn shut(&self, gate: State) {
-        self.examiner.ledger.end_injection();
-        self.examiner.gate.set(gate);
-    }
-
     /// Notes that calls have ceased to pass to the master, and reports it.
     fn begin_outage(&mut self, cause: Cause) {
         self.outage = Outage::begin(Instant::now(), cause.as_str(), self.examiner.stats);
@@ -554,7 +550,7 @@ impl Driver {
 
     fn open_gate(&mut self) {
         self.last_message = None;
-        self.examiner.open_gate();
+        self.examiner.ledger.open_gate();
         self.set_run_id_later();
         if let Some(number) = self.restored.take() {
             // This comes last, so that calls do not wait while the state is copied.

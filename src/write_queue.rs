@@ -33,7 +33,7 @@ use self::{
     dispatcher::Dispatcher,
 };
 pub(crate) use self::{dispatcher::PATIENCE, drain::Drain, evict::MoveJudge};
-use crate::{cli::Writes, gate, ledger::Ledger, status::stats::Stats, upstream::Upstream};
+use crate::{cli::Writes, ledger::Ledger, status::stats::Stats, upstream::Upstream};
 
 /// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
 const CHANNEL: usize = 64;
@@ -144,7 +144,6 @@ struct Signals {
 /// answers writes, and `patience` how long they wait for the master.
 pub(crate) fn write_queue(
     link: Link,
-    gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
     judge: Arc<dyn MoveJudge>,
@@ -165,7 +164,6 @@ pub(crate) fn write_queue(
         dispatcher,
         rx,
         link,
-        gate,
         resync_interval,
         signals.clone(),
         tell_sent,

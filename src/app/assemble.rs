@@ -14,7 +14,6 @@ use super::{context::Context, startup::Beginning};
 use crate::{
     clock,
     config::{Config, MasterConfig},
-    gate,
     guardian::handover,
     ledger::Ledger,
     nodes::{Nodes, local::LocalNodes, served::Served},
@@ -97,7 +96,6 @@ pub(super) async fn assemble(
     let stats: &'static Stats = Box::leak(Box::default());
     let uri = config.advertised.to_string();
     let ledger = Arc::new(ledger(config, beginning, &uri, stats));
-    let (gate_tx, gate) = gate::gate();
     let upstream = Arc::new(Upstream::new(
         address,
         config.probe_timeout,
@@ -109,7 +107,6 @@ pub(super) async fn assemble(
             ledger: ledger.clone(),
             upstream: upstream.clone(),
         },
-        gate.clone(),
         stats,
         config.resync_interval,
         local.clone(),
@@ -119,7 +116,6 @@ pub(super) async fn assemble(
     let served = Served::default();
     let nodes = Arc::new(Nodes::new(
         ledger.clone(),
-        gate.clone(),
         write_queue.clone(),
         stats,
         config.node_timeout,
@@ -130,10 +126,9 @@ pub(super) async fn assemble(
         nodes.removed.add(&node, at);
     }
     let context = Context {
+        gate: ledger.gate(),
         ledger,
         upstream,
-        gate_tx,
-        gate,
         write_queue,
         nodes,
         served,
@@ -199,7 +194,6 @@ pub(super) fn server(
         config.master_connections,
         context.upstream.clone(),
         context.ledger.clone(),
-        context.gate.clone(),
     );
     let access = AccessRules::new(config.allow.clone(), config.allow_write.clone());
     if !config.allow.is_empty() || !config.allow_write.is_empty() {

@@ -137,7 +137,7 @@ impl ClusterDriver {
         };
         self.setup.context.ledger.leave();
         self.end_master().await;
-        self.setup.context.gate_tx.set(State::Elsewhere);
+        self.setup.context.ledger.shut_gate(State::Elsewhere);
         self.setup.halt.cancel();
         while self.endings.join_next().await.is_some() {}
         result.map(|()| None)
@@ -278,8 +278,8 @@ impl ClusterDriver {
                 self.duties = Some(context.begin(process, Some(self.setup.rosout), cause));
             }
             Action::EndMaster => self.end_master().await,
-            Action::AnswerFromMirror => context.gate_tx.set(State::StandingIn),
-            Action::AnswerNothing => context.gate_tx.set(State::Elsewhere),
+            Action::AnswerFromMirror => ledger.shut_gate(State::StandingIn),
+            Action::AnswerNothing => ledger.shut_gate(State::Elsewhere),
             Action::NotifyOwnOnly(own_only) => context.nodes.set_alone(own_only),
             Action::ReplacePartitionWrites { base, calls } => {
                 self.partition_writes
@@ -447,7 +447,6 @@ impl ClusterDriver {
             let ending = duties.stop_and_kill_master().await;
             self.endings.spawn(ending);
         }
-        self.setup.context.ledger.end_injection();
     }
 
     /// Turns what the watch on etcd delivered, or its end, into an input for the [`Member`].

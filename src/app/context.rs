@@ -28,7 +28,6 @@ use crate::{
 pub(super) struct Context {
     pub(super) ledger: Arc<Ledger>,
     pub(super) upstream: Arc<Upstream>,
-    pub(super) gate_tx: gate::Tx,
     pub(super) gate: gate::Rx,
     pub(super) write_queue: WriteQueue,
     pub(super) nodes: Arc<Nodes>,
@@ -50,7 +49,6 @@ impl Context {
         Driver::new(
             Examiner {
                 ledger: self.ledger.clone(),
-                gate: self.gate_tx.clone(),
                 supervision: self.supervision,
                 run_id: Arc::default(),
                 stats: self.stats,

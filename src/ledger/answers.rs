@@ -64,7 +64,7 @@ impl Ledger {
         let is_replicated = inner.is_replicated();
         let counts = |call| is_unregistration(call) || is_replicated && sets_parameter(call);
         let idle = !inner.doubted
-            && !inner.unconfirmed
+            && !inner.is_unconfirmed()
             && !inner.is_elsewhere()
             && !write.calls().into_iter().any(counts)
             && !inner.mirror.would_change(write)
@@ -157,7 +157,7 @@ impl Ledger {
         origin: Origin,
     ) -> Option<(Reply, Mark, Option<u64>)> {
         let mut inner = self.lock();
-        if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
+        if inner.is_injecting() || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
         // The answer is begun before the call is applied, because the call may notify its own caller.
@@ -183,8 +183,9 @@ impl Ledger {
                 let before = before.as_ref().unwrap_or(&inner.mirror);
                 let accepted = replay::accepted(before, call, &reply).calls;
                 // A master that is newer than the mirror may hold parameters that the mirror lacks.
-                let may_be_set =
-                    |call: &Request| inner.unconfirmed && *call.method() == Method::DeleteParam;
+                let may_be_set = |call: &Request| {
+                    inner.is_unconfirmed() && *call.method() == Method::DeleteParam
+                };
                 let counts = accepted
                     .into_iter()
                     .filter(|of| of.executed || may_be_set(of.call));
@@ -200,7 +201,7 @@ impl Ledger {
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             let unsure = |call: &Request| {
                 is_unregistration(call)
-                    || (inner.unconfirmed && *call.method() != Method::SubscribeParam)
+                    || (inner.is_unconfirmed() && *call.method() != Method::SubscribeParam)
             };
             let is_pending =
                 |call: &&Request| room && unsure(call) && !inner.pending.contains(call);

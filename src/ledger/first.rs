@@ -58,10 +58,10 @@ impl Ledger {
         let mut inner = self.lock();
         let write = Write::parse(call)?;
         let heard = concern.recipients();
-        let is_certain = !inner.injecting
+        let is_certain = !inner.is_injecting()
             && !inner.doubted
-            && !inner.unconfirmed
-            && !inner.abandoned
+            && !inner.is_unconfirmed()
+            && !inner.outstanding.is_abandoned()
             && matches!(inner.shared, Shared::Nobody)
             && (inner.journal.as_ref().is_some_and(|it| it.protects())
                 || Mutant::AnswersUnprotected.lives())
@@ -107,7 +107,7 @@ impl Ledger {
         writes: &[Acknowledged<'_>],
     ) -> Result<(), Superseded> {
         let inner = &mut *self.lock();
-        if inner.session.incarnation != incarnation || inner.injecting {
+        if inner.session.incarnation != incarnation || inner.is_injecting() {
             return Err(Superseded);
         }
         let mut awaited = false;

@@ -19,13 +19,16 @@ use super::{
     activity::{Activity, Noticed},
     disk_jobs::Journal,
     durability::{Mark, Whole},
-    late::LateState,
+    late::Outstanding,
     mutant::Mutant,
     pending::{PendingWrites, TooMany},
     shared::Shared,
     summary::Divergences,
 };
-use crate::clock;
+use crate::{
+    clock,
+    gate::{self, State},
+};
 
 /// The mirror, the journal, and what keeps them consistent.
 pub(super) struct Inner {
@@ -48,21 +51,25 @@ pub(super) struct Inner {
     pub(super) activity: Activity,
     pub(super) order: Order,
     pub(super) diverged: Divergences,
-    /// Whether a master is being brought to the mirror's state (an injection), so that the mirror must not change.
-    pub(super) injecting: bool,
+    /// Whether calls pass to the master. While it shows an injection, the mirror must not change.
+    pub(super) gate: gate::Tx,
     /// Whether the present master may differ from the mirror and must be read again.
     pub(super) doubted: bool,
-    /// Whether the present master may still run a batch whose reply is no longer awaited.
-    pub(super) abandoned: bool,
-    /// The state that a late master will have once it has answered its outstanding calls.
-    pub(super) behind: Option<LateState>,
-    /// The number of the last master to which calls have passed.
-    pub(super) served: Option<u64>,
-    /// Whether the mirror comes from a checkpoint and has not been compared with a master yet. Then a living master may
-    /// be newer than the mirror.
-    pub(super) unconfirmed: bool,
+    pub(super) outstanding: Outstanding,
+    pub(super) state_from: StateFrom,
     /// Whether the session has changed and the change is not in the journal yet.
     pub(super) session_unwritten: bool,
+}
+
+/// Where the mirror's state comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum StateFrom {
+    /// From calls since the start of this process. No master has served.
+    ThisProcess,
+    /// From a checkpoint. It has not been compared with a master yet, and a living one may be newer.
+    Checkpoint,
+    /// From a master. The last one to which calls have passed has this number.
+    Master { incarnation: u64 },
 }
 
 /// Who notifies nodes of a call's effects.
@@ -98,12 +105,10 @@ impl Inner {
             activity: Activity::default(),
             order: Order::default(),
             diverged: Divergences::default(),
-            injecting: false,
+            gate: gate::gate(),
             doubted: false,
-            abandoned: false,
-            behind: None,
-            served: None,
-            unconfirmed: false,
+            outstanding: Outstanding::default(),
+            state_from: StateFrom::ThisProcess,
             session_unwritten: false,
         };
         if too_many {
@@ -158,6 +163,22 @@ impl Inner {
             outbox_changed.notify_one();
         }
         reply
+    }
+
+    /// Whether a master is being brought to the mirror's state, so that the mirror must not change.
+    pub(super) fn is_injecting(&self) -> bool {
+        self.gate.state() == State::Injecting
+    }
+
+    /// Whether a living master may be newer than the mirror.
+    pub(super) fn is_unconfirmed(&self) -> bool {
+        self.state_from == StateFrom::Checkpoint
+    }
+
+    /// Notes that the present master holds the mirror's state, and runs no calls.
+    pub(super) fn note_equal(&mut self) {
+        self.doubted = false;
+        self.outstanding = Outstanding::Awaited;
     }
 
     pub(super) fn set_identity(&mut self, identity: (i32, String)) {
@@ -236,7 +257,9 @@ impl Inner {
     }
 
     pub(super) fn raise_incarnation(&mut self) {
-        self.behind = None;
+        if self.outstanding.take_late().is_some() {
+            self.outstanding = Outstanding::Abandoned;
+        }
         self.pending.clear();
         self.acknowledged = 0;
         self.session.incarnation = self.next_incarnation();

@@ -1,4 +1,5 @@
-//! The writes that a late master has missed because the mirror answered them.
+//! The calls that the master has not answered, and the writes that a late master has missed because the mirror answered
+//! them.
 
 use rescue_core::{
     order::{BySubject, Subject},
@@ -8,6 +9,36 @@ use ros1_master::{
     master::{Master, NoticeSink, Request},
     xmlrpc::Value,
 };
+
+/// The calls that the present master was given and has not answered.
+#[derive(Default)]
+pub(super) enum Outstanding {
+    /// Their answers are awaited, or there are none.
+    #[default]
+    Awaited,
+    /// The mirror has answered them, because the master is late. What the master holds once it has answered them, too.
+    Late(Box<LateState>),
+    /// Their answers are no longer awaited. The master may still run them.
+    Abandoned,
+}
+
+impl Outstanding {
+    /// Whether the present master may still run calls whose answers are no longer awaited.
+    pub(super) fn is_abandoned(&self) -> bool {
+        matches!(self, Self::Abandoned)
+    }
+
+    /// Takes what is known of a late master. It cannot catch up any more.
+    pub(super) fn take_late(&mut self) -> Option<LateState> {
+        match std::mem::take(self) {
+            Self::Late(late) => Some(*late),
+            other => {
+                *self = other;
+                None
+            }
+        }
+    }
+}
 
 /// The state of a late master once it has answered its outstanding calls.
 pub(super) struct LateState {

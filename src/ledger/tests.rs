@@ -170,7 +170,7 @@ fn what_an_older_mirror_cannot_delete_is_pending_until_a_master_was_read() {
     answer(&delete());
     assert_eq!(pending(&ledger), [delete()]);
     ledger.delivered();
-    ledger.serve();
+    ledger.open_gate();
     answer(&delete());
     assert_eq!(pending(&ledger), []);
 }
@@ -235,7 +235,7 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     let publish = publish("/t");
     let reply = answered(&publish, &mut Master::default());
     assert!(ledger.record_here(now, 0, &[(&publish, &reply)]).is_err());
-    ledger.end_injection();
+    ledger.shut_gate(State::StandingIn);
     assert!(ledger.answer_from_mirror(now, &bye).is_some());
 }
 
@@ -258,7 +258,7 @@ fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
         None,
         "the mirror changed before the gate opened"
     );
-    ledger.end_injection();
+    ledger.shut_gate(State::StandingIn);
     assert!(ledger.answer_from_mirror(now, &set).is_some());
     ledger.abandon_batch();
     ledger.succeed();

@@ -37,11 +37,11 @@ enum News {
 pub(crate) enum Step {
     /// Drop the connection to the master, and what is under way on it.
     Disconnect,
-    /// End an injection that is in progress, and set the gate.
+    /// Set the gate, which ends an injection that is in progress.
     Shut(State),
     /// Notify all nodes of the present state, because no master is sending them an older one.
     NotifyAll,
-    /// Report that a master died while it was getting its state.
+    /// Report that a master died after the gate was shut for its injection, and before it opened.
     ReportDeathWhileInjected,
     /// Tell the write queue how long writes wait for the master.
     SetPatience(Patience),

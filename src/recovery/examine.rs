@@ -23,7 +23,6 @@ use thiserror::Error;
 use tokio::task::JoinHandle;
 
 use crate::{
-    gate::{State, Tx},
     ledger::{Basis, Ledger, durability::Mark, late::CatchUp, mutant::Mutant},
     limit::rarely,
     status::{report::RecoveryOutcome, stats::Stats},
@@ -203,7 +202,6 @@ impl Change {
 #[derive(Clone)]
 pub(crate) struct Examiner {
     pub ledger: Arc<Ledger>,
-    pub gate: Tx,
     pub supervision: Supervision,
     /// The call that sets `/run_id` in the present master, if the master gets it later ([`withheld_run_id`]).
     pub run_id: Arc<Mutex<Option<Request>>>,
@@ -229,12 +227,6 @@ impl Examiner {
     /// Takes the call that sets the run id that the present master has not been given.
     pub(super) fn take_run_id(&self) -> Option<Request> {
         self.lock_run_id().take()
-    }
-
-    /// Lets calls pass to the present master.
-    pub(crate) fn open_gate(&self) {
-        let incarnation = self.ledger.serve();
-        self.gate.set(State::Open { incarnation });
     }
 
     /// Examines the master that `master` reaches, and brings it to the mirror's state, or the mirror to its state.
@@ -302,8 +294,6 @@ impl Examiner {
     /// Returns whether the master has run them, and holds the mirror's state except for parameters that another program
     /// has set meanwhile. If not, the master must be examined.
     pub(crate) async fn catch_up(&self, master: &mut impl Contact) -> Result<bool, ExamineError> {
-        // From here until the gate opens the mirror must not change, and writes wait.
-        self.gate.set(State::Injecting);
         let mut missed = match self.ledger.begin_catch_up() {
             None => return Ok(false),
             Some(CatchUp::Nothing) => return Ok(true),
@@ -374,7 +364,6 @@ impl Examiner {
         examination.inspection = master.now() - start;
         // From here until the gate opens the mirror must not change, because the master is compared
         // with the mirror.
-        self.gate.set(State::Injecting);
         let Basis {
             mut mirror,
             version,

@@ -75,7 +75,8 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn the_clock_stands_still_while_calls_pass_to_a_master() {
-        let (tx, mut rx) = gate();
+        let tx = gate();
+        let mut rx = tx.subscribe();
         let start = Instant::now();
         let opener = async {
             tokio::time::sleep(7 * SECOND).await;
@@ -110,7 +111,8 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_gate_that_opens_in_time_is_not_taken_for_one_that_stays_shut() {
         for _ in 0..50 {
-            let (tx, mut rx) = gate();
+            let tx = gate();
+            let mut rx = tx.subscribe();
             let mut hold = Hold::new(SECOND);
             let mut spent = std::pin::pin!(hold.wait_until_spent_while_shut(&mut rx));
             let mut context = Context::from_waker(Waker::noop());

@@ -57,11 +57,11 @@ impl Drop for Stalled<'_> {
 impl Pool {
     /// Creates a pool of at most `size` connections to `upstream`, each verified to reach the master that holds the
     /// state of `ledger`.
-    pub fn new(size: usize, upstream: Arc<Upstream>, ledger: Arc<Ledger>, gate: gate::Rx) -> Self {
+    pub fn new(size: usize, upstream: Arc<Upstream>, ledger: Arc<Ledger>) -> Self {
         Self {
             upstream,
+            gate: ledger.gate(),
             ledger,
-            gate,
             permits: Semaphore::new(size),
             idle: Mutex::new(Vec::with_capacity(size)),
             stalled: AtomicUsize::new(0),

@@ -44,15 +44,14 @@ impl Drain {
         dispatcher: Dispatcher,
         items: mpsc::Receiver<Item>,
         link: Link,
-        gate: gate::Rx,
         resync_interval: Option<Duration>,
         signals: Arc<Signals>,
         tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     ) -> Self {
         Self {
             dispatcher,
+            gate: link.ledger.gate(),
             link,
-            gate,
             items,
             signals,
             resync_interval,

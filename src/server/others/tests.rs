@@ -31,7 +31,6 @@ const TERM: u64 = 7;
 /// A following computer, and what the test controls.
 struct Computer {
     calls: Calls,
-    gate: gate::Tx,
     standing: watch::Sender<Standing>,
     /// How much of the journal this computer's mirror holds.
     followed: watch::Sender<JournalPosition>,
@@ -62,8 +61,6 @@ fn handover() -> Request {
 impl Computer {
     /// Creates a computer whose mirror holds one parameter.
     fn new(standing: Standing) -> Self {
-        let (gate_tx, gate) = gate::gate();
-        gate_tx.set(gate::State::Elsewhere);
         let stats = Box::leak(Box::default());
         let mut mirror = Master::default();
         mirror.apply(&set(1));
@@ -72,6 +69,7 @@ impl Computer {
         let ledger = Arc::new(ledger);
         ledger.set_identity(42, OWN.to_owned());
         ledger.leave();
+        ledger.shut_gate(gate::State::Elsewhere);
         let second = Duration::from_secs(1);
         let nobody = MasterUri::parse("http://127.0.0.1:1/").unwrap();
         let upstream = Arc::new(Upstream::new(nobody, second, 3));
@@ -80,7 +78,6 @@ impl Computer {
                 ledger: ledger.clone(),
                 upstream: upstream.clone(),
             },
-            gate.clone(),
             stats,
             None,
             Arc::new(()),
@@ -91,8 +88,8 @@ impl Computer {
         let (handovers_tx, handovers) = mpsc::channel(1);
         let (tell_followed, followed) = watch::channel(JournalPosition::at_start());
         let calls = Calls {
-            pool: Arc::new(Pool::new(1, upstream, ledger.clone(), gate.clone())),
-            gate,
+            pool: Arc::new(Pool::new(1, upstream, ledger.clone())),
+            gate: ledger.gate(),
             ledger,
             reads: Reads::Mirror,
             last_large: Default::default(),
@@ -116,7 +113,6 @@ impl Computer {
         };
         Self {
             calls,
-            gate: gate_tx,
             standing,
             followed: tell_followed,
             handovers,
@@ -443,7 +439,7 @@ async fn a_read_waits_for_a_silent_leader_only_until_this_computer_is_alone() {
     let get = get();
     let alone = async {
         calls.wait_for(|count| *count > 0).await.unwrap();
-        computer.gate.set(gate::State::StandingIn);
+        computer.calls.ledger.shut_gate(gate::State::StandingIn);
         computer.standing.send_replace(Standing::Alone);
     };
     let answer = async { tokio::join!(computer.ask("/RPC2", &get), alone).0 };

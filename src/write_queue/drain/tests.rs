@@ -18,7 +18,7 @@ use tokio::sync::oneshot;
 use super::*;
 use crate::{
     cli::{SyncPolicy, Writes},
-    gate::{State, gate},
+    gate::State,
     ledger::Ledger,
     upstream::{Head, sentinel::Sentinel, test_master, verify::Verification},
     write_queue::{
@@ -48,7 +48,6 @@ fn notified_value(ledger: &Ledger) -> Option<Value> {
 struct Served {
     ledger: Arc<Ledger>,
     queue: WriteQueue,
-    gate: gate::Tx,
     listener: TcpListener,
     _sentinel: (TcpStream, Arc<Sentinel>),
 }
@@ -60,12 +59,10 @@ impl Served {
         let ledger = Ledger::new(mirror, session, Vec::new(), None, sync, stats);
         let ledger = Arc::new(ledger);
         ledger.succeed();
-        let incarnation = ledger.serve();
+        ledger.open_gate();
 
         let (listener, accepted, upstream, sentinel) = test_master().await;
         upstream.set_verification(Some(Verification::Sentinel(sentinel.clone())));
-        let (gate, gate_rx) = gate();
-        gate.set(State::Open { incarnation });
         let patience = Patience::new(Duration::from_secs(60));
         let judge = Arc::new(());
         let (queue, drain) = write_queue(
@@ -73,7 +70,6 @@ impl Served {
                 ledger: ledger.clone(),
                 upstream,
             },
-            gate_rx,
             stats,
             None,
             judge,
@@ -84,7 +80,6 @@ impl Served {
         Self {
             ledger,
             queue,
-            gate,
             listener,
             _sentinel: (accepted, sentinel),
         }
@@ -122,7 +117,7 @@ async fn nodes_are_not_told_the_state_before_a_lost_call() {
     let topic = Subject::Topic("/t".to_owned());
     ledger.with_order(|order, _| order.notify_of_state(port_of(SUBSCRIBER), topic));
     assert_eq!(notified_value(ledger), None);
-    served.gate.set(State::StandingIn);
+    served.ledger.shut_gate(State::StandingIn);
     answered.await.unwrap();
     ledger.with_order(|order, _| order.queue_due_repeats(Instant::now() + REPEAT_AFTER));
     assert_eq!(notified_value(ledger), Some(Value::Array(Vec::new())));
@@ -152,7 +147,7 @@ async fn a_fault_is_answered_when_what_ran_is_known_or_the_master_is_gone() {
     answered.try_recv().unwrap_err();
 
     drop(connection);
-    served.gate.set(State::StandingIn);
+    served.ledger.shut_gate(State::StandingIn);
     let (answer, _) = answered.await.unwrap();
     let CallAnswer::Made(Reply::Value(Value::Array(results))) = answer else {
         panic!("{answer:?}");

@@ -220,7 +220,7 @@ impl Recovery {
     }
 
     pub(super) fn set_gate(&self, state: State) {
-        self.examiner.gate.set(state);
+        self.examiner.ledger.shut_gate(state);
     }
 
     /// A new connection for an examination.
@@ -319,7 +319,7 @@ impl World {
                 });
             }
             Action::OpenGate => {
-                self.recovery.examiner.open_gate();
+                self.ledger.open_gate();
                 self.recovery.owed_told = false;
                 self.injection_broke = false;
             }
@@ -484,7 +484,6 @@ impl World {
     }
 
     fn shut(&mut self, gate: State) {
-        self.ledger.end_injection();
         self.set_gate(gate);
         if gate == State::StandingIn && !self.recovery.owed_told {
             self.then(OWED_AFTER, Event::OwesInOutage);

@@ -79,18 +79,16 @@ impl Parts {
             ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
         }
         let patience = Patience::new(Duration::from_micros(PATIENCE));
-        let (gate_tx, gate) = gate::gate();
         let examiner = Examiner {
             ledger: ledger.clone(),
-            gate: gate_tx,
             supervision,
             run_id: Arc::default(),
             stats,
         };
         Self {
             dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, writes, patience),
+            gate: ledger.gate(),
             ledger,
-            gate,
             recovery: Recovery::new(examiner, is_restored),
             is_restored,
         }
