@@ -17,7 +17,7 @@ use crate::cluster::{
     standing::JournalPosition,
 };
 
-/// How long a computer that holds less of the lost journal waits for the one that holds the most, in times to live.
+/// How long a computer waits for each one that holds more of the lost journal, in times to live.
 const PATIENCE: u32 = 3;
 
 /// A loss that no new journal has made good yet.
@@ -40,8 +40,8 @@ pub(super) struct DataLoss {
     present: Option<Loss>,
     /// How much of the lost journal the other computers hold, by their names.
     others: BTreeMap<String, Holdings>,
-    /// Whether another computer is known to hold more of the lost journal.
-    is_second: bool,
+    /// How many computers are known to hold more of the lost journal.
+    ahead: u32,
     /// How often etcd has lost data.
     pub(super) times: u64,
     /// The origin of a journal that this computer could not read from its beginning.
@@ -219,7 +219,7 @@ impl Member {
             origin,
             left,
         });
-        self.data_loss.is_second = false;
+        self.data_loss.ahead = 0;
         self.act(Action::PublishMemberEntry);
     }
 
@@ -251,7 +251,9 @@ impl Member {
             None => self.data_loss.others.remove(&change.name),
         };
         // Another computer may have lost a later journal, which this one has not seen.
-        self.data_loss.is_second &= holds == before;
+        if holds != before {
+            self.data_loss.ahead = 0;
+        }
         let (leads, view) = (self.published.role == Role::Leading, self.view());
         let shown = Holdings {
             journal_number: view.journal_number,
@@ -271,7 +273,8 @@ impl Member {
         self.machine.note_journal(journal_number);
     }
 
-    /// Lets a computer that holds more of the lost journal claim leadership first.
+    /// Lets computers that hold more of the lost journal claim leadership first, one after the other: the one that holds
+    /// the most may be unable to.
     pub(super) fn update_data_loss(&mut self, now: Instant) {
         let Some(Loss { holds, .. }) = self.data_loss.present else {
             return;
@@ -283,10 +286,11 @@ impl Member {
         let name = &self.settings().name;
         let mine = (holds, name);
         let others = self.data_loss.others.iter();
-        let mut others = others.map(|(name, holds)| (*holds, name));
-        if !self.data_loss.is_second && others.any(|other| other > mine) {
-            self.data_loss.is_second = true;
-            let until = now + self.settings().ttl * PATIENCE;
+        let others = others.map(|(name, holds)| (*holds, name));
+        let ahead = others.map(|other| u32::from(other > mine)).sum();
+        if ahead > self.data_loss.ahead {
+            self.data_loss.ahead = ahead;
+            let until = now + self.settings().ttl * PATIENCE * ahead;
             self.machine.hold_claims(until);
         }
         // A request of this computer may have succeeded since.
