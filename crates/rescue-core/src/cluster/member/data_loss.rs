@@ -27,8 +27,6 @@ struct Loss {
     since: Instant,
     /// How much of the lost journal this computer holds.
     holds: Holdings,
-    /// The origin that etcd showed when the loss was noticed.
-    origin: u64,
     /// The keys as etcd showed them then. A living leader changes them. `None` if they are of a later journal than the lost
     /// one.
     left: Option<RevisionGuard>,
@@ -122,23 +120,15 @@ impl Member {
         doubts
     }
 
-    /// What a later view of etcd must continue. After a loss, only etcd's revision counts.
-    pub(super) fn view_to_continue(&self) -> View {
-        let view = self.view();
-        let revision = view.revision;
-        match self.data_loss.present {
-            None => view.clone(),
-            Some(_) => View {
-                revision,
-                ..View::default()
-            },
-        }
-    }
-
     fn contradicts(&self, view: &View, before: &View) -> bool {
-        // After a loss, a new journal does not continue the lost one.
-        let is_lost = self.data_loss.present.is_some();
-        !is_lost && !view.continues(before) && !trusts()
+        let continues = match self.data_loss.present {
+            // A new journal does not continue the lost one. Any other is an older copy.
+            Some(loss) if ![0, before.origin].contains(&view.origin) => {
+                view.journal_number > before.journal_number.max(loss.holds.journal_number)
+            }
+            _ => view.continues(before),
+        };
+        !continues && !trusts()
     }
 
     /// Whether etcd has lost data, if a read that began when etcd had shown `before` shows `view`.
@@ -151,25 +141,21 @@ impl Member {
         let floor = before.revision.max(known);
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
         let is_without_end = self.data_loss.without_end == Some(view.guard());
+        // A read that began after an earlier loss shows a later one only by what has been seen since.
+        let seen = self.view();
+        let contradicts_seen = view.revision >= seen.revision && self.contradicts(view, seen);
+        let contradicts = self.contradicts(view, before) || contradicts_seen;
         if let Some(loss) = self.data_loss.present {
             let is_torn = view.is_torn() && loss.left != Some(view.guard());
-            // The journal that was lost, or an earlier one.
-            let is_old = view.origin > 0
-                && view.origin != loss.origin
-                && view.journal_number <= loss.holds.journal_number;
-            let is_lost_again = is_torn || is_old || is_without_end;
             // No other computer can repair a journal that this one is to continue.
             let is_unreadable = !is_readable && self.machine.role() == Role::CatchingUp;
-            return older || is_lost_again && !trusts() || is_unreadable;
+            let torn = (is_torn || is_without_end) && !trusts();
+            return older || contradicts || torn || is_unreadable;
         }
         let is_old = !self.reading.loaded && view.journal_number < self.local.journal_number;
         let is_old = is_old || view.term() < known;
         let torn = view.is_torn() || is_old || !is_readable || is_without_end;
-        let torn = torn && !trusts();
-        // A read that began after an earlier loss shows a later one only by what has been seen since.
-        let known = self.view();
-        let contradicts_known = view.revision >= known.revision && self.contradicts(view, known);
-        older || torn || self.contradicts(view, before) || contradicts_known
+        older || contradicts || torn && !trusts()
     }
 
     /// Starts over with the etcd that shows `view`, and with this computer's state.
@@ -188,8 +174,7 @@ impl Member {
         let until = now + wait;
         let view = view.clone();
         self.reading.forget(&view);
-        let (origin, is_whole) = (view.origin, !view.is_torn());
-        let is_later = is_whole && view.journal_number > holds.journal_number;
+        let is_later = !view.is_torn() && view.journal_number > holds.journal_number;
         let left = (!is_later).then(|| view.guard());
         self.drive(now, machine::Input::Lost { view, left, until });
         self.machine.hold_claims(until);
@@ -213,12 +198,7 @@ impl Member {
         (self.local.term, self.local.journal_number) = (0, 0);
         self.reading.load_by(now);
         let since = now;
-        self.data_loss.present = Some(Loss {
-            since,
-            holds,
-            origin,
-            left,
-        });
+        self.data_loss.present = Some(Loss { since, holds, left });
         self.data_loss.ahead = 0;
         self.act(Action::PublishMemberEntry);
     }

@@ -107,7 +107,7 @@ impl Member {
         }
         if self.reading.due().is_some_and(|at| at <= now) {
             (self.reading.load_at, self.reading.loading) = (None, true);
-            self.reading.before = self.view_to_continue();
+            self.reading.before = self.view().clone();
             self.reading.checks = std::mem::take(&mut self.reading.check_due);
             let after = match self.reading.checks {
                 true => Progress::default(),
