@@ -152,7 +152,7 @@ impl Robot<'_> {
             settled: true,
         };
         let answer = replica
-            .run(settings, &claim, None)
+            .run(settings, &claim, None, None)
             .await
             .expect("an answer");
         let EtcdAnswer::Applied { revision, .. } = answer else {

@@ -24,7 +24,8 @@ use rescue_core::{
         journal::{self, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
         member::{
-            Action, Input, Member, MemberEntry, MemberEntryChange, PROBES, Read, WatchedEntry,
+            Action, Evidence, Input, Member, MemberEntry, MemberEntryChange, PROBES, Read,
+            WatchedEntry,
         },
         merge::wire::{self, Ask},
         standing::{JournalPosition, Standing},
@@ -181,8 +182,7 @@ impl ClusterDriver {
                 parts,
                 requires,
             } => {
-                let entry = entry.or_else(|| Some(self.member_put(&requires?)));
-                self.send(number, op, entry, term, parts);
+                self.send(number, op, entry, requires, (term, parts));
             }
             Action::Load(known) => {
                 let replica = self.replica.clone();
@@ -325,8 +325,8 @@ impl ClusterDriver {
                     Input::Probed { number, leads }
                 });
             }
-            Action::PublishMemberEntry => {
-                let put = self.member_put(&self.member.member_entry());
+            Action::PublishMemberEntry(entry) => {
+                let put = self.member_put(&entry);
                 self.beside
                     .spawn(publish_member_entry(self.replica.client.clone(), put));
             }
@@ -393,7 +393,14 @@ impl ClusterDriver {
         }
     }
 
-    fn send(&mut self, number: u64, op: Op, entry: Option<Put>, term: u64, parts: Vec<Put>) {
+    fn send(
+        &mut self,
+        number: u64,
+        op: Op,
+        entry: Option<Put>,
+        requires: Option<Evidence>,
+        (term, parts): (u64, Vec<Put>),
+    ) {
         let (replica, settings) = (self.replica.clone(), self.member.settings().clone());
         let trouble = self.trouble.clone();
         let answer = EtcdAnswer::Silence;
@@ -403,7 +410,8 @@ impl ClusterDriver {
                 if !parts.is_empty() {
                     replica.prepare(term, &parts).await?;
                 }
-                replica.run(&settings, &op, entry.as_ref()).await
+                let (entry, requires) = (entry.as_ref(), requires.as_ref());
+                replica.run(&settings, &op, entry, requires).await
             };
             let answer = trouble
                 .note_result(run.await)

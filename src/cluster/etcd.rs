@@ -14,6 +14,7 @@ pub use etcd_kv::{
 use rescue_core::cluster::{
     journal::{Keys, Put},
     machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
+    member::Evidence,
 };
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -44,8 +45,8 @@ impl Etcd {
         Client::new(options).map(Self)
     }
 
-    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal, or what a claim requires
-    /// to be in etcd.
+    /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal, and `requires` a condition
+    /// of a claim.
     ///
     /// # Errors
     ///
@@ -56,9 +57,10 @@ impl Etcd {
         settings: &Settings,
         op: &Op,
         entry: Option<&Put>,
+        requires: Option<&Evidence>,
         limit: Duration,
     ) -> Result<EtcdAnswer, EtcdError> {
-        let (txn, seq) = transaction(keys, settings, op, entry);
+        let (txn, seq) = transaction(keys, settings, op, entry, requires);
         let done = self.txn(&txn, limit).await?;
         if done.succeeded && done.gets.is_empty() {
             let revision = done.revision;
@@ -286,7 +288,13 @@ fn unchanged(keys: &Keys, guard: &RevisionGuard) -> Vec<Compare> {
 }
 
 /// Builds the transaction of `op`. Also returns the number of the journal's last record after it.
-fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -> (Txn, u64) {
+fn transaction(
+    keys: &Keys,
+    settings: &Settings,
+    op: &Op,
+    entry: Option<&Put>,
+    requires: Option<&Evidence>,
+) -> (Txn, u64) {
     let alive = |beat, seq, released: &Option<String>, settled| {
         let released = released.clone();
         let value = AliveValue {
@@ -331,11 +339,11 @@ fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -
                 changes.extend(keys.of_journal().map(TxnOp::Delete));
             }
             let mut compare = unchanged(keys, guard);
-            compare.extend(
-                entry
-                    .cloned()
-                    .map(|Put { key, value }| Compare::Is { key, value }),
-            );
+            if let Some(Evidence { own, read_up_to }) = requires {
+                let (key, value) = (keys.member(&settings.name), json(own));
+                compare.push(Compare::Is { key, value });
+                compare.push(Compare::Unchanged(keys.members(), *read_up_to));
+            }
             (txn(compare, changes), *seq)
         }
         Op::Beat {

@@ -7,6 +7,7 @@ use rescue_core::{
     cluster::{
         journal::{self, JournalError, Keys, Manifest, Progress, Put},
         machine::{EtcdAnswer, Op, Settings, View},
+        member::Evidence,
     },
 };
 use thiserror::Error;
@@ -183,7 +184,7 @@ impl Replica {
     }
 
     /// Carries out a request of the state machine. `entry` is what a heartbeat adds to the journal; its parts are
-    /// already written. For a claim it is what must be in etcd.
+    /// already written. `requires` is a condition of a claim.
     ///
     /// # Errors
     ///
@@ -193,10 +194,11 @@ impl Replica {
         settings: &Settings,
         op: &Op,
         entry: Option<&Put>,
+        requires: Option<&Evidence>,
     ) -> Result<EtcdAnswer, ReplicaError> {
         Ok(self
             .client
-            .run(&self.keys, settings, op, entry, self.limit)
+            .run(&self.keys, settings, op, entry, requires, self.limit)
             .await?)
     }
 

@@ -57,7 +57,10 @@ impl Leader {
             seq,
             settled: true,
         };
-        let answer = replica.run(&settings("a"), &claim, None).await.unwrap();
+        let answer = replica
+            .run(&settings("a"), &claim, None, None)
+            .await
+            .unwrap();
         let EtcdAnswer::Applied { revision, .. } = answer else {
             panic!("{answer:?}");
         };
@@ -95,7 +98,7 @@ impl Leader {
             };
             let entry = journal::pack(&self.replica.keys, rest).unwrap().entry;
             let settings = settings("a");
-            let answer = self.replica.run(&settings, &beat, entry.as_ref());
+            let answer = self.replica.run(&settings, &beat, entry.as_ref(), None);
             let answer = answer.await.unwrap();
             let EtcdAnswer::Applied { revision, seq } = answer else {
                 panic!("{answer:?}");
@@ -321,7 +324,7 @@ async fn no_transaction_of_the_leader_succeeds_once_a_key_that_makes_the_journal
             released: None,
             settled: true,
         };
-        let answer = leader.replica.run(&settings("a"), &beat, None).await;
+        let answer = leader.replica.run(&settings("a"), &beat, None, None).await;
         let EtcdAnswer::Is(view) = answer.unwrap() else {
             panic!("{gone} is gone, and the leader goes on");
         };
@@ -347,11 +350,14 @@ async fn a_transaction_of_another_claim_does_not_succeed_at_the_same_revisions()
     for (name, claim) in [("b", 1), ("a", 2)] {
         let answer = leader
             .replica
-            .run(&settings(name), &beat(claim), None)
+            .run(&settings(name), &beat(claim), None, None)
             .await;
         assert!(matches!(answer, Ok(EtcdAnswer::Is(_))), "{answer:?}");
     }
-    let answer = leader.replica.run(&settings("a"), &beat(1), None).await;
+    let answer = leader
+        .replica
+        .run(&settings("a"), &beat(1), None, None)
+        .await;
     assert!(
         matches!(answer, Ok(EtcdAnswer::Applied { .. })),
         "{answer:?}"
@@ -384,7 +390,7 @@ async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
         released: None,
         settled: true,
     };
-    let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
+    let answer = replica.run(&settings("a"), &beat, Some(&entry), None).await;
     let EtcdAnswer::Applied { revision, seq: 3 } = answer.unwrap() else {
         panic!("no journal holds the state");
     };

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use rescue_core::cluster::{
     journal::{Keys, Put},
     machine::{EtcdAnswer, Op, RevisionGuard},
+    member::{Evidence, MemberEntry},
 };
 use rosrescue::cluster::etcd::{Credentials, Etcd, EtcdError, Options};
 use serde_json::json;
@@ -42,7 +43,10 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
         settled: false,
     };
     let a = settings("a");
-    let first = client.run(&keys, &a, &claim(1), None, LIMIT).await.unwrap();
+    let first = client
+        .run(&keys, &a, &claim(1), None, None, LIMIT)
+        .await
+        .unwrap();
     let EtcdAnswer::Applied {
         revision: term,
         seq: 0,
@@ -52,7 +56,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     };
     // The answer to the second claim names the present leader.
     let second = client
-        .run(&keys, &settings("b"), &claim(1), None, LIMIT)
+        .run(&keys, &settings("b"), &claim(1), None, None, LIMIT)
         .await
         .unwrap();
     let EtcdAnswer::Is(view) = second else {
@@ -71,7 +75,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     // The same heartbeat is sent twice.
     let op = beat(view.guard(), 1, 7);
     let made = client
-        .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
+        .run(&keys, &a, &op, Some(&entry(7)), None, LIMIT)
         .await
         .unwrap();
     assert!(
@@ -79,7 +83,7 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
         "{made:?}"
     );
     let again = client
-        .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
+        .run(&keys, &a, &op, Some(&entry(7)), None, LIMIT)
         .await
         .unwrap();
     let EtcdAnswer::Is(view) = again else {
@@ -90,7 +94,10 @@ async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
         Some((1, 7))
     );
     assert_eq!(
-        client.run(&keys, &a, &Op::Read, None, LIMIT).await.unwrap(),
+        client
+            .run(&keys, &a, &Op::Read, None, None, LIMIT)
+            .await
+            .unwrap(),
         EtcdAnswer::Is(view.clone())
     );
     // Only the leader may write parts and delete.
@@ -322,7 +329,7 @@ async fn each_endpoint_is_tried_separately_and_a_wrong_one_is_named() {
 
 /// etcd has lost data again since the entry was written, perhaps a journal that this computer has not seen.
 #[tokio::test]
-async fn a_claim_does_not_succeed_without_the_entry_that_it_requires() {
+async fn a_claim_does_not_succeed_without_the_member_entries_that_it_requires() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let claim = Op::Claim {
@@ -332,26 +339,37 @@ async fn a_claim_does_not_succeed_without_the_entry_that_it_requires() {
         seq: 0,
         settled: true,
     };
-    let [earlier, entry] = [&b"earlier"[..], b"since the loss"].map(|value| Put {
-        key: keys.member("a"),
-        value: value.to_vec(),
+    let [earlier, own] = ["following", "alone"].map(|role| MemberEntry {
+        uri: String::new(),
+        version: String::new(),
+        role: role.to_owned(),
+        seq: 0,
+        boot: String::new(),
+        holds: None,
+        unreadable: 0,
+        notifies: String::new(),
     });
-    let run = || async {
-        let a = settings("a");
-        client.run(&keys, &a, &claim, Some(&entry), LIMIT).await
+    let put = async |name: &str, entry: &MemberEntry| {
+        let (key, value) = (keys.member(name), serde_json::to_vec(entry).unwrap());
+        let lease = client.grant(Duration::from_secs(60), LIMIT).await.unwrap();
+        let put = Put { key, value };
+        client.put_with_lease(&put, lease, LIMIT).await.unwrap();
+        client.view(&keys, LIMIT).await.unwrap().revision
     };
-    for put in [None, Some(&earlier), Some(&entry)] {
-        if let Some(put) = put {
-            let lease = client.grant(Duration::from_secs(60), LIMIT).await.unwrap();
-            client.put_with_lease(put, lease, LIMIT).await.unwrap();
-        }
-        let is_there = put == Some(&entry);
-        match run().await.unwrap() {
-            EtcdAnswer::Applied { seq: 0, .. } => assert!(is_there),
-            EtcdAnswer::Is(view) => assert!(!is_there && view.origin == 0),
-            other => panic!("{other:?}"),
-        }
-    }
+    let succeeds = async |read_up_to| {
+        let own = own.clone();
+        let requires = Some(&Evidence { own, read_up_to });
+        let a = settings("a");
+        let answer = client.run(&keys, &a, &claim, None, requires, LIMIT).await;
+        matches!(answer.unwrap(), EtcdAnswer::Applied { seq: 0, .. })
+    };
+    assert!(!succeeds(u64::from(u32::MAX)).await);
+    let revision = put("a", &earlier).await;
+    assert!(!succeeds(revision).await);
+    let revision = put("a", &own).await;
+    let after = put("b", &earlier).await;
+    assert!(!succeeds(revision).await);
+    assert!(succeeds(after).await);
     let view = client.view(&keys, LIMIT).await.unwrap();
     assert_eq!(view.journal_number, 3);
 }
@@ -371,7 +389,7 @@ async fn the_robots_in_etcd_are_listed_without_keys_of_other_programs() {
     for robot in ["arm", "arm-2", "leg"] {
         let keys = Keys::new(robot);
         client
-            .run(&keys, &settings("a"), &claim, None, LIMIT)
+            .run(&keys, &settings("a"), &claim, None, None, LIMIT)
             .await
             .unwrap();
     }

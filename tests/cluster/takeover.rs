@@ -46,8 +46,9 @@ fn run(
                             inward.clone(),
                         );
                         requests.spawn(async move {
-                            let answer =
-                                client.run(&keys, &settings, &op, None, ANSWER_LIMIT).await;
+                            let answer = client
+                                .run(&keys, &settings, &op, None, None, ANSWER_LIMIT)
+                                .await;
                             let answer = answer.unwrap_or(EtcdAnswer::Silence);
                             let _ = inward.try_send(Input::Answer { number, answer });
                         });

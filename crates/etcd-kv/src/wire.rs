@@ -37,6 +37,8 @@ pub enum Compare {
     Exists(String),
     /// The key has this value.
     Is { key: String, value: Vec<u8> },
+    /// No key in the range was changed after this revision.
+    Unchanged(Range<String>, u64),
 }
 
 /// An operation of a transaction.
@@ -127,6 +129,10 @@ impl Compare {
             }),
             Self::Is { key, value } => json!({
                 "key": base64(key), "target": "VALUE", "result": "EQUAL", "value": base64(value),
+            }),
+            Self::Unchanged(range, revision) => json!({
+                "key": base64(&range.start), "range_end": base64(&range.end),
+                "target": "MOD", "result": "LESS", "mod_revision": revision.saturating_add(1).to_string(),
             }),
         }
     }

@@ -96,6 +96,12 @@ impl Keys {
         format!("{}members/{name}", self.0)
     }
 
+    /// The entries of all computers.
+    pub fn members(&self) -> Range<String> {
+        // `0` follows `/` in ASCII.
+        self.member("")..format!("{}members0", self.0)
+    }
+
     pub fn journal(&self, seq: u64) -> String {
         format!("{}journal/{seq:020}", self.0)
     }

@@ -54,7 +54,7 @@ pub use self::{
     chores::PUBLISH_EVERY,
     probes::PROBES,
     types::{
-        Action, Cause, ForwardedWrites, Holdings, Input, LocalCheckpoint, MemberEntry,
+        Action, Cause, Evidence, ForwardedWrites, Holdings, Input, LocalCheckpoint, MemberEntry,
         MemberEntryChange, News, Read, WatchedEntry,
     },
 };

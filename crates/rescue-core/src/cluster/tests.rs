@@ -189,6 +189,7 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// its writes, because it knew more records than it had written.
 /// 815060 and 878245: the computer that held the most could not claim, and one that held less than another claimed.
 /// 823187: a leader that was cut off merged records that the lost journal had, as if they were not in any.
+/// 855335: a computer that had been paused claimed at once, and had not read that another one held a later journal.
 /// 858456 and 1006696: a computer that had noticed a loss took an older copy for the journal that went on.
 /// 857396: a leader that had just started did not notice that another computer no longer notified its nodes.
 /// 900690: a computer was cut off again while it sent its writes and had not read the new journal. What it answered then was
@@ -207,7 +208,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
     for seed in [
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
         400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429, 807_731,
-        815_060, 823_187, 857_396, 858_456, 878_245, 900_690, 1_006_696,
+        815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696,
     ] {
         play_with_data_loss(seed).check();
     }

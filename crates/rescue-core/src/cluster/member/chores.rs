@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{Action, Member, notifying::Notifying};
+use super::{Action, Member, MemberEntry, notifying::Notifying};
 use crate::cluster::{journal::Progress, machine::Role};
 
 /// How often a computer updates its entry among the members.
@@ -17,6 +17,8 @@ const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 pub(super) struct Chores {
     /// When to write this computer's entry among the members.
     pub(super) publish_at: Option<Instant>,
+    /// That entry as it was written last.
+    pub(super) published: Option<MemberEntry>,
     /// Whether a snapshot is being written.
     pub(super) snapshot: bool,
     /// The last record that a snapshot of this computer holds or will hold. Its entry and those before are deleted.
@@ -64,7 +66,7 @@ impl Member {
         if self.chores.publish_at.is_none_or(|at| at <= now) {
             self.chores.publish_at = Some(now + PUBLISH_EVERY);
             if may_say {
-                self.act(Action::PublishMemberEntry);
+                self.publish_entry();
             }
         }
         if let Some(seq) = self.chores.kept_until {
@@ -100,6 +102,12 @@ impl Member {
             None => self.chores.forget = Some((now + FORGET, revision)),
             Some(_) => {}
         }
+    }
+
+    pub(super) fn publish_entry(&mut self) {
+        let entry = self.member_entry();
+        self.chores.published = Some(entry.clone());
+        self.act(Action::PublishMemberEntry(entry));
     }
 
     pub(super) fn snapshot_written(&mut self, now: Instant, written: Option<(Progress, usize)>) {

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Action, Holdings, Member, MemberEntry, MemberEntryChange, News};
+use super::{Evidence, Holdings, Member, MemberEntryChange, News};
 use crate::cluster::{
     machine::{self, EtcdAnswer, RevisionGuard, Role, View},
     mutant::Mutant,
@@ -200,16 +200,17 @@ impl Member {
         let since = now;
         self.data_loss.present = Some(Loss { since, holds, left });
         self.data_loss.ahead = 0;
-        self.act(Action::PublishMemberEntry);
+        self.publish_entry();
     }
 
-    /// This computer's member entry, which it has written since it noticed a loss. If it is gone when the claim reaches
-    /// etcd, etcd has lost data again, perhaps a journal that this computer has not seen.
-    pub(super) fn evidence(&self, now: Instant) -> Option<MemberEntry> {
+    /// What a claim that begins a new journal requires of the entries among the members, after a loss.
+    pub(super) fn evidence(&self, now: Instant) -> Option<Evidence> {
         let loss = self.data_loss.present?;
         // A leader claims at once.
         let is_written = loss.since + self.settings().ttl <= now;
-        is_written.then(|| self.member_entry())
+        let own = self.chores.published.clone().filter(|_| is_written)?;
+        let read_up_to = self.reading.view().revision;
+        Some(Evidence { own, read_up_to })
     }
 
     /// Notes whether the journal with this `origin` could be read from its beginning.
@@ -217,7 +218,7 @@ impl Member {
         let unreadable = if is_readable { 0 } else { origin };
         if std::mem::replace(&mut self.data_loss.unreadable, unreadable) != unreadable {
             self.machine.set_unreadable(unreadable);
-            self.act(Action::PublishMemberEntry);
+            self.publish_entry();
         }
     }
 

@@ -71,6 +71,16 @@ pub struct Holdings {
     pub seq: u64,
 }
 
+/// What a claim requires of the entries among the members if it begins a new journal after a loss. Otherwise etcd has lost
+/// data again since, perhaps a journal that this computer has not seen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Evidence {
+    /// The entry that this computer has written last, which it has done since it noticed the loss.
+    pub own: MemberEntry,
+    /// The revision up to which this computer has read the entries. None may have been written since.
+    pub read_up_to: u64,
+}
+
 /// What a computer has written about itself: its entry among the members.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MemberEntryChange {
@@ -265,15 +275,14 @@ pub enum News {
 pub enum Action {
     /// Write to etcd what the machine has decided. First the `parts` of a change that is too large for one transaction,
     /// provided that this computer still leads in `term`; then, in one transaction on the conditions of `op`, the keys of
-    /// `op` and the journal's next `entry`. If `requires` is set, this succeeds only if this computer's entry among the members is that one. Ends
-    /// with [`Input::Answer`].
+    /// `op` and the journal's next `entry`. A claim also has the condition `requires`. Ends with [`Input::Answer`].
     Send {
         number: u64,
         op: Op,
         entry: Option<Put>,
         term: u64,
         parts: Vec<Put>,
-        requires: Option<MemberEntry>,
+        requires: Option<Evidence>,
     },
     /// Read the journal after the last record in this progress.
     Load(Progress),
@@ -361,7 +370,7 @@ pub enum Action {
         term: u64,
     },
     /// Write this computer's entry among the members to etcd.
-    PublishMemberEntry,
+    PublishMemberEntry(MemberEntry),
     WriteSnapshot {
         term: u64,
         progress: Progress,

@@ -8,7 +8,7 @@ use crate::{
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
         machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
-        member::{MemberEntry, MemberEntryChange, Read, WatchedEntry},
+        member::{Evidence, MemberEntry, MemberEntryChange, Read, WatchedEntry},
     },
 };
 use ros1_master::master::{Displaced, Master, Request};
@@ -24,7 +24,7 @@ pub(super) struct Sent {
     pub(super) op: Op,
     pub(super) entry: Option<Put>,
     pub(super) parts: Vec<Put>,
-    pub(super) requires: Option<MemberEntry>,
+    pub(super) requires: Option<Evidence>,
     pub(super) sent_at: u64,
     /// When the sender gives up.
     pub(super) until: u64,
@@ -264,9 +264,12 @@ impl Etcd {
             seq: expected.seq,
             ..self.view.guard()
         };
-        let member = self.members.get(&sent.settings.name);
-        let member = member.map(|(entry, _)| entry);
-        let has_evidence = sent.requires.is_none() || member == sent.requires.as_ref();
+        let has_evidence = sent.requires.as_ref().is_none_or(|required| {
+            let own = self.members.get(&sent.settings.name);
+            let mut members = self.members.values();
+            own.is_some_and(|(entry, _)| *entry == required.own)
+                && members.all(|(_, revision)| *revision <= required.read_up_to)
+        });
         if guard != expected || !has_last || !leads || !has_evidence {
             return EtcdAnswer::Is(self.view.clone());
         }

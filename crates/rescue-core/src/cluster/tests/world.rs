@@ -703,11 +703,9 @@ impl World {
                     }
                 }
             }
-            Action::PublishMemberEntry => {
-                let computer = &self.computers[at];
-                let entry = computer.member.member_entry();
+            Action::PublishMemberEntry(entry) => {
                 if self.network.reaches_etcd(at) {
-                    let name = computer.name.clone();
+                    let name = self.computers[at].name.clone();
                     self.etcd.put_member_entry(&name, entry);
                     self.show_watches();
                 }
