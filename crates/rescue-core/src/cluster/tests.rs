@@ -194,6 +194,7 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 857396: a leader that had just started did not notice that another computer no longer notified its nodes.
 /// 900690: a computer was cut off again while it sent its writes and had not read the new journal. What it answered then was
 /// forgotten.
+/// 1007191: a computer took the answer of a leader that it no longer followed. The simulation did so, not the product.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -208,7 +209,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
     for seed in [
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
         400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429, 807_731,
-        815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696,
+        815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696, 1_007_191,
     ] {
         play_with_data_loss(seed).check();
     }

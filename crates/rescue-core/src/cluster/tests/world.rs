@@ -273,7 +273,12 @@ impl World {
                 }
             }
             Event::Told(at, life, read, (value, shows), position) => {
-                if self.lives(at, life) && self.history.reads[read].done.is_none() {
+                // When the leader changes, the answer of the one before no longer counts.
+                let follows = matches!(
+                    self.computers[at].standing,
+                    Standing::Follows { term, .. } if term == position.term
+                );
+                if self.lives(at, life) && self.history.reads[read].done.is_none() && follows {
                     self.computers[at].tell_of(position);
                     self.read_done(read, value, shows);
                 }
