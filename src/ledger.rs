@@ -694,7 +694,7 @@ impl Ledger {
         };
         late.answered = true;
         order.late_answered(now);
-        note_master_notifications(now, order, mirror, &late.tells);
+        note_possible_notifications(now, order, mirror, &late.tells);
         drop(inner);
         self.outbox_changed.notify_one();
     }
@@ -781,15 +781,20 @@ impl Ledger {
     }
 }
 
-/// Notes that the master begins to notify nodes about `tells`.
-fn note_master_notifications(now: Instant, order: &mut Order, mirror: &Master, tells: &[Subject]) {
+/// Notes that the master may begin to notify nodes about `tells`.
+fn note_possible_notifications(
+    now: Instant,
+    order: &mut Order,
+    mirror: &Master,
+    tells: &[Subject],
+) {
     for subject in tells {
         let nodes = match subject {
             Subject::Topic(topic) => mirror.subscribers_of(topic).len(),
             Subject::Param(_) => 1,
             Subject::Name(_) => continue,
         };
-        order.master_notifies(now, subject, nodes);
+        order.master_may_notify(now, subject, nodes);
     }
 }
 

@@ -13,7 +13,7 @@ use ros1_master::{
 
 use super::{
     Ledger, Mark, Superseded, answers::ANSWER_MOST, delivery::Delivery, inner::Notifier,
-    mutant::Mutant, note_master_notifications, shared::Shared,
+    mutant::Mutant, note_possible_notifications, shared::Shared,
 };
 use crate::clock;
 
@@ -114,7 +114,7 @@ impl Ledger {
         for write in writes {
             let tells = write.concern.notified_subjects();
             awaited |= inner.order.acknowledged(write.seq, tells);
-            note_master_notifications(now, &mut inner.order, &inner.mirror, tells);
+            note_possible_notifications(now, &mut inner.order, &inner.mirror, tells);
             inner.pending.acknowledge(write.seq);
             inner.acknowledged = write.seq;
             let reply = write.reply;

@@ -224,12 +224,19 @@ impl Order {
 
     /// Notes that the master now notifies nodes of a change of `subject`. `nodes` is the number of these nodes.
     pub fn master_notifies(&mut self, now: Instant, subject: &Subject, nodes: usize) {
-        let until = self.master_notifications.add(now, subject, nodes);
-        self.outbox.replace_all_with_state(subject);
+        self.master_may_notify(now, subject, nodes);
         let about = self.under_way.about(now, subject);
         let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
-        self.repeats.drop_all_but(subject, &ports, until);
-        for (answer, port) in about {
+        self.repeats.drop_all_but(subject, &ports);
+    }
+
+    /// Like [`Self::master_notifies`], if the master may have nothing to notify of: what rosrescue was going to tell nodes
+    /// again, it tells them afterwards.
+    pub fn master_may_notify(&mut self, now: Instant, subject: &Subject, nodes: usize) {
+        let until = self.master_notifications.add(now, subject, nodes);
+        self.outbox.replace_all_with_state(subject);
+        self.repeats.put_off(subject, until);
+        for (answer, port) in self.under_way.about(now, subject) {
             // An answer in the same batch does not count: its call ran later, or has itself caused the notification.
             if !self.in_flight.answers.contains(&answer) {
                 self.repeats.add(until, port, subject.clone());
@@ -552,22 +559,32 @@ impl Repeats {
         }
     }
 
-    /// Drops the planned notifications about `subject` for nodes at ports other than `kept`, or puts them off until the
-    /// master has sent its own, at `until`, if they must come last.
-    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>, until: Instant) {
+    /// The planned notifications about `subject`.
+    fn about(&self, subject: &Subject) -> Vec<(Instant, (Subject, String))> {
         let from = (subject.clone(), String::new());
         let about = self.at.at.range(from..);
         let about = about.take_while(|((of, _), _)| of == subject);
-        let others = about.filter(|((_, port), _)| !kept.contains(port.as_str()));
-        let others: Vec<_> = others.map(|(thing, at)| (*at, thing.clone())).collect();
-        for (at, thing) in others {
+        about.map(|(thing, at)| (*at, thing.clone())).collect()
+    }
+
+    /// Puts the planned notifications about `subject` off until the master has sent its own, at `until`.
+    fn put_off(&mut self, subject: &Subject, until: Instant) {
+        for (at, thing) in self.about(subject) {
             if let Some(last) = self.last.get_mut(&thing) {
                 *last = until.max(*last);
-                self.at.set(thing, at.max(until));
-                continue;
             }
-            self.at.at.remove(&thing);
-            self.at.queue.remove(&(at, thing));
+            self.at.set(thing, at.max(until));
+        }
+    }
+
+    /// Drops the planned notifications about `subject` for nodes at ports other than `kept`, except those that must come
+    /// last.
+    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
+        for (at, thing) in self.about(subject) {
+            if !kept.contains(thing.1.as_str()) && !self.last.contains_key(&thing) {
+                self.at.at.remove(&thing);
+                self.at.queue.remove(&(at, thing));
+            }
         }
     }
 }
