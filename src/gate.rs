@@ -2,7 +2,7 @@
 //! [ledger](crate::ledger::Ledger) sets it, under its lock, so that the mirror and the gate always fit together.
 //!
 //! `recovery::course` decides when it is [`State::StandingIn`] or [`State::Unknown`], the lifecycle when it is
-//! [`State::Late`] or [`State::Open`]. An examination shuts it for an [injection](State::Injecting). A start with a
+//! [`State::Late`] or [`State::Open`], and an examination when it is [`State::Injecting`] or [`State::Frozen`]. A start with a
 //! checkpoint sets [`State::StandingIn`] (`app::Runs::choose`). While this computer does not lead, `app::cluster` sets
 //! [`State::Elsewhere`] or, if this computer is alone, [`State::StandingIn`].
 
@@ -21,9 +21,12 @@ pub enum State {
     /// The mirror answers reads and writes, because the master has not answered a call for too long. When the master
     /// answers, it gets the writes that it has missed.
     Late,
-    /// rosrescue is giving the master its state (an injection). The mirror answers reads, and
-    /// writes that change nothing. Other writes wait.
+    /// rosrescue is giving the master the state of a moment (an injection). The mirror answers reads and writes; the
+    /// master gets these writes next.
     Injecting,
+    /// The mirror must not change for a moment: an injection begins, or calls are about to pass to the master. The mirror
+    /// answers reads, and writes that change nothing. Other writes wait.
+    Frozen,
     /// Another computer has the master or will have it soon. Calls are forwarded to that computer.
     Elsewhere,
     /// No master has been seen yet, so the state is unknown and calls wait.
@@ -34,6 +37,11 @@ impl State {
     /// Whether calls pass to the master.
     pub fn is_open(self) -> bool {
         matches!(self, Self::Open { .. })
+    }
+
+    /// Whether the master is getting its state.
+    pub(crate) fn is_injecting(self) -> bool {
+        matches!(self, Self::Injecting | Self::Frozen)
     }
 }
 
@@ -146,8 +154,8 @@ mod tests {
         tx.set(State::Open { incarnation: 1 });
         tx.set(State::StandingIn);
         assert_eq!(rx.observe_change(), (State::StandingIn, true));
-        tx.set(State::Injecting);
+        tx.set(State::Frozen);
         rx.changed().await;
-        assert_eq!(rx.observe_change(), (State::Injecting, false));
+        assert_eq!(rx.observe_change(), (State::Frozen, false));
     }
 }

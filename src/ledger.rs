@@ -222,8 +222,7 @@ impl Ledger {
         batch: &[(&Request, &Reply, &Source, Origin)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
-        if inner.session.incarnation != incarnation || inner.is_injecting() || inner.is_elsewhere()
-        {
+        if inner.session.incarnation != incarnation || inner.is_frozen() || inner.is_elsewhere() {
             return Err(Superseded);
         }
         let mut recorded = Recorded::default();
@@ -296,7 +295,7 @@ impl Ledger {
     /// answer to [`Self::record`] or call [`Self::withdraw`].
     pub(crate) fn record_ahead(&self, call: &Arc<Request>, origin: Origin) -> bool {
         let mut inner = self.lock();
-        let is_certain = !inner.is_injecting()
+        let is_certain = !inner.is_frozen()
             && !inner.doubted
             && matches!(inner.shared, Shared::Nobody)
             && inner.journal.is_some()
@@ -388,6 +387,23 @@ impl Ledger {
         difference
     }
 
+    /// Sets the mirror to `state`, which the master with the token `held` holds, and applies to it the writes that the
+    /// mirror has answered since the injection to this master. Changes nothing if there were too many to keep them.
+    pub fn rebase(&self, held: &Token, mut state: Master) {
+        let mut inner = self.lock();
+        if inner.token() != *held {
+            return;
+        }
+        if !Mutant::ForgetsAnswered.lives() {
+            for call in inner.pending.calls() {
+                state.apply_telling(call, &mut ());
+            }
+        }
+        inner.adopt(state);
+        drop(inner);
+        self.recorded();
+    }
+
     /// Like [`Self::adopt`], but only if `state` was read from the present master, whose [`Token`] has the number
     /// `incarnation`, while the mirror was at `version`.
     pub fn adopt_if(
@@ -397,7 +413,7 @@ impl Ledger {
         state: Master,
     ) -> Result<Vec<String>, Superseded> {
         let mut inner = self.lock();
-        if inner.is_injecting()
+        if inner.is_frozen()
             || inner.is_elsewhere()
             // The master has not run these when it was read.
             || !inner.pending.calls().is_empty() && !Mutant::ReadsTooEarly.lives()
@@ -535,16 +551,16 @@ impl Ledger {
     }
 
     /// Sets the gate, so that the mirror may change again. [`Self::open_gate`] sets [`State::Open`], and
-    /// [`Self::begin_injection`], [`Self::resume`] and [`Self::begin_catch_up`] set [`State::Injecting`].
+    /// [`Self::begin_injection`], [`Self::resume`] and [`Self::begin_catch_up`] set [`State::Frozen`].
     pub fn shut_gate(&self, state: State) {
         self.lock().gate.set(state);
     }
 
-    /// Shuts the gate for an injection: the mirror must not change until the gate is set again. Returns the state from
-    /// which the injection is planned.
+    /// Freezes the mirror for an injection, until the gate is set again. Returns the state from which the injection is
+    /// planned.
     pub fn begin_injection(&self) -> Basis {
         let inner = self.lock();
-        inner.gate.set(State::Injecting);
+        inner.gate.set(State::Frozen);
         Basis {
             mirror: inner.mirror.clone(),
             version: inner.version,
@@ -650,13 +666,15 @@ impl Ledger {
         self.lock().outstanding = Outstanding::Awaited;
     }
 
-    /// Whether the present master can continue unchanged: no write is pending, and it runs no batch of an ended
-    /// connection. If so, shuts the gate as [`Self::begin_injection`] does.
-    pub fn resume(&self) -> bool {
+    /// Whether the present master, which has the token `held`, can go on unchanged: that is the latest one, no write is
+    /// pending, and it runs no batch of an ended connection. If so, freezes the mirror as [`Self::begin_injection`] does.
+    pub fn resume(&self, held: &Token) -> bool {
         let inner = self.lock();
-        let whole = inner.pending.calls().is_empty() && !inner.outstanding.is_abandoned();
+        let whole = inner.token() == *held
+            && inner.pending.calls().is_empty()
+            && !inner.outstanding.is_abandoned();
         if whole {
-            inner.gate.set(State::Injecting);
+            inner.gate.set(State::Frozen);
         }
         whole
     }
@@ -699,14 +717,14 @@ impl Ledger {
         self.outbox_changed.notify_one();
     }
 
-    /// Decides what the present master needs after it was late and has answered. Shuts the gate as
-    /// [`Self::begin_injection`] does.
+    /// Decides what the present master needs after it was late and has answered. Freezes the mirror
+    /// as [`Self::begin_injection`] does.
     ///
     /// `None` if the master must be examined instead: it has not answered, its state is in doubt, a node would have to
     /// shut down, or a node would be notified twice of one topic or parameter and could get the older value last.
     pub(crate) fn begin_catch_up(&self) -> Option<CatchUp> {
         let mut inner = self.lock();
-        inner.gate.set(State::Injecting);
+        inner.gate.set(State::Frozen);
         let late = inner.outstanding.take_late();
         let late = late.filter(|late| late.answered && late.is_exact)?;
         if inner.doubted || inner.mirror.is_inexact() {

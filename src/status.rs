@@ -195,7 +195,11 @@ impl Facts {
     /// Whether calls are answered by the master, the mirror, or another computer.
     pub(crate) fn answers_calls(&self, gate: State) -> bool {
         match gate {
-            State::Open { .. } | State::StandingIn | State::Late | State::Injecting => true,
+            State::Open { .. }
+            | State::StandingIn
+            | State::Late
+            | State::Injecting
+            | State::Frozen => true,
             State::Elsewhere => {
                 let cluster = self.cluster.as_ref();
                 cluster.is_some_and(|cluster| cluster.role != Role::Joining)

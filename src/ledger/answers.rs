@@ -123,8 +123,8 @@ impl Ledger {
     /// returns the mark of the last record. That is this call's record, or if it changes nothing, the record that made
     /// it redundant.
     ///
-    /// `None` while a master is being brought to the mirror's state (an injection), if another computer has the master,
-    /// or if the answers to the reads in a multicall are too large. Then the call has to wait.
+    /// `None` while the mirror is frozen, if another computer has the master, or if the answers to the reads in a
+    /// multicall are too large. Then the call has to wait.
     pub fn answer_from_mirror(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) =
@@ -157,7 +157,7 @@ impl Ledger {
         origin: Origin,
     ) -> Option<(Reply, Mark, Option<u64>)> {
         let mut inner = self.lock();
-        if inner.is_injecting() || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
+        if inner.is_frozen() || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
         // The answer is begun before the call is applied, because the call may notify its own caller.

@@ -58,7 +58,7 @@ impl Ledger {
         let mut inner = self.lock();
         let write = Write::parse(call)?;
         let heard = concern.recipients();
-        let is_certain = !inner.is_injecting()
+        let is_certain = !inner.is_frozen()
             && !inner.doubted
             && !inner.is_unconfirmed()
             && !inner.outstanding.is_abandoned()
@@ -107,7 +107,7 @@ impl Ledger {
         writes: &[Acknowledged<'_>],
     ) -> Result<(), Superseded> {
         let inner = &mut *self.lock();
-        if inner.session.incarnation != incarnation || inner.is_injecting() {
+        if inner.session.incarnation != incarnation || inner.is_frozen() {
             return Err(Superseded);
         }
         let mut awaited = false;

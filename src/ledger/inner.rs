@@ -51,7 +51,7 @@ pub(super) struct Inner {
     pub(super) activity: Activity,
     pub(super) order: Order,
     pub(super) diverged: Divergences,
-    /// Whether calls pass to the master. While it shows an injection, the mirror must not change.
+    /// Whether calls pass to the master. While it is frozen, the mirror must not change.
     pub(super) gate: gate::Tx,
     /// Whether the present master may differ from the mirror and must be read again.
     pub(super) doubted: bool,
@@ -165,9 +165,9 @@ impl Inner {
         reply
     }
 
-    /// Whether a master is being brought to the mirror's state, so that the mirror must not change.
-    pub(super) fn is_injecting(&self) -> bool {
-        self.gate.state() == State::Injecting
+    /// Whether the mirror must not change.
+    pub(super) fn is_frozen(&self) -> bool {
+        self.gate.state() == State::Frozen
     }
 
     /// Whether a living master may be newer than the mirror.

@@ -22,6 +22,10 @@ pub(crate) enum Mutant {
     Overtakes,
     /// Writes that the mirror has answered first go to the next master, too, which has got the state.
     KeepsAnswered,
+    /// The master does not get what the mirror has answered during the injection.
+    LeavesBehind,
+    /// What a master holds replaces what the mirror has answered since the injection began.
+    ForgetsAnswered,
     /// An injection is not announced in the journal.
     AnnouncesNothing,
     /// A master is read although it may still run calls of closed connections.

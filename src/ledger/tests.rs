@@ -247,12 +247,12 @@ fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     let now = Instant::now();
     let set = call("setParam", &["/n", "/a", "1"]);
     ledger.abandon_batch();
-    assert!(!ledger.resume());
+    assert!(!ledger.resume(&ledger.token()));
     ledger.settled();
     assert!(ledger.answer_from_mirror(now, &set).is_some());
-    assert!(!ledger.resume());
+    assert!(!ledger.resume(&ledger.token()));
     ledger.delivered();
-    assert!(ledger.resume());
+    assert!(ledger.resume(&ledger.token()));
     assert_eq!(
         ledger.answer_from_mirror(now, &set),
         None,
@@ -262,7 +262,7 @@ fn a_master_continues_unchanged_only_if_no_write_is_pending_or_running() {
     assert!(ledger.answer_from_mirror(now, &set).is_some());
     ledger.abandon_batch();
     ledger.succeed();
-    assert!(ledger.resume());
+    assert!(ledger.resume(&ledger.token()));
 }
 
 /// The registration that the call removes may still be on its way to a slow master.

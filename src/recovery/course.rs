@@ -102,7 +102,7 @@ impl Course {
             self.send_news(now, &mut steps);
         }
         if ends_contact(input) {
-            if gate == State::Injecting && input != Input::NotAMaster {
+            if gate.is_injecting() && input != Input::NotAMaster {
                 steps.add(Step::ReportDeathWhileInjected);
                 // It had answered before.
                 self.lifecycle.on(now, Input::Answered);

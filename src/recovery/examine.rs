@@ -23,6 +23,7 @@ use thiserror::Error;
 use tokio::task::JoinHandle;
 
 use crate::{
+    gate::State,
     ledger::{Basis, Ledger, durability::Mark, late::CatchUp, mutant::Mutant},
     limit::rarely,
     status::{report::RecoveryOutcome, stats::Stats},
@@ -31,6 +32,12 @@ use crate::{
 
 /// Maximum number of rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
+
+/// Maximum number of injections after the first one of a recovery. The last one, or the first one that gives the master
+/// no more than [`FROZEN_MOST`] writes, lets writes wait, so that the gate can open afterwards.
+const UPDATES: u32 = 4;
+/// Maximum number of writes for which others wait while the master gets them. It needs some 40 µs for each.
+const FROZEN_MOST: usize = 50;
 
 /// Maximum number of addresses that are asked whether a node listens there, because calls wait meanwhile.
 const ASKED_MOST: usize = 32;
@@ -186,6 +193,8 @@ enum Change {
     Renew(Token),
     /// Replace everything that the master holds, including this token.
     Replace(Token),
+    /// The master was given the state that it has now, and this token. Change what differs.
+    Update(Token),
 }
 
 impl Change {
@@ -194,6 +203,7 @@ impl Change {
             Self::Add => Plan::new(state, found, token),
             Self::Renew(before) => Plan::renew(found, before, token),
             Self::Replace(before) => Plan::replace(state, found, before, token),
+            Self::Update(before) => Plan::update(state, found, before, token),
         }
     }
 }
@@ -238,7 +248,8 @@ impl Examiner {
         let start = master.now();
         let served = matches!(manner.known, KnownMaster::ServedIfPresent);
         let resumes = |first: &Inspection| {
-            served && first.bears() == TokenState::Present && self.ledger.resume()
+            let token = self.ledger.token();
+            served && first.bears() == TokenState::Present && self.ledger.resume(&token)
         };
         let is_new = matches!(manner.known, KnownMaster::New { .. });
         let mut first = match manner.known {
@@ -362,8 +373,8 @@ impl Examiner {
             .await;
         let ended = self.ended(master, bears, &found).await?;
         examination.inspection = master.now() - start;
-        // From here until the gate opens the mirror must not change, because the master is compared
-        // with the mirror.
+        let is_away = self.ledger.gate().state() == State::StandingIn;
+        // The master is compared with the mirror, so the mirror must not change for a moment.
         let Basis {
             mut mirror,
             version,
@@ -429,6 +440,9 @@ impl Examiner {
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
         let (token, announced) = self.ledger.succeed();
+        if is_away {
+            self.ledger.shut_gate(State::Injecting);
+        }
         master.wait_for_disk(&self.ledger, announced).await;
         let target = Target {
             state,
@@ -436,8 +450,49 @@ impl Examiner {
             change,
         };
         let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
-        self.bring(master, &target, &token, ready, examination)
-            .await
+        let held = self
+            .bring(master, &target, &token, ready, examination)
+            .await?;
+        self.stats
+            .masters_restored
+            .add(u64::from(!matches!(target.change, Change::Renew(_))));
+        self.update(master, held, token, examination).await
+    }
+
+    /// Gives a master that holds the state `held` and has the token `token` what the mirror has answered since it was
+    /// given that, until nothing is missing.
+    async fn update(
+        &self,
+        master: &mut impl Contact,
+        mut held: Master,
+        mut token: Token,
+        examination: &mut Examination,
+    ) -> Result<(), ExamineError> {
+        let mut updates = 0;
+        while !self.ledger.resume(&token) && !Mutant::LeavesBehind.lives() {
+            updates += 1;
+            let is_short = self.ledger.pending() <= FROZEN_MOST || updates == UPDATES;
+            let Basis { mirror, .. } = self.ledger.begin_injection();
+            let (next, announced) = self.ledger.succeed();
+            if !is_short {
+                self.ledger.shut_gate(State::Injecting);
+            }
+            master.wait_for_disk(&self.ledger, announced).await;
+            let target = Target {
+                state: mirror,
+                found: held,
+                change: Change::Update(token),
+            };
+            let skipped = std::mem::take(&mut examination.skipped);
+            held = self
+                .bring(master, &target, &next, None, examination)
+                .await?;
+            examination.skipped.splice(0..0, skipped);
+            token = next;
+        }
+        tracing::debug!(updates, "the master holds the mirror's state");
+        self.ledger.delivered();
+        Ok(())
     }
 
     /// Removes a rosout from the mirror that must not be restored in a master with this state, because it has ended.
@@ -505,7 +560,8 @@ impl Examiner {
         Ok(ended)
     }
 
-    /// Brings the master to `target`, reads it back, and sets `token` in it.
+    /// Brings the master to `target`, makes sure of that, and sets `token` in it. Returns the state that the master
+    /// holds then.
     async fn bring(
         &self,
         master: &mut impl Contact,
@@ -513,7 +569,7 @@ impl Examiner {
         token: &Token,
         ready: Option<Prepared>,
         examination: &mut Examination,
-    ) -> Result<(), ExamineError> {
+    ) -> Result<Master, ExamineError> {
         let Target {
             state,
             found,
@@ -528,19 +584,22 @@ impl Examiner {
             }
         });
         let mut before: Option<(Master, Master)> = None;
-        for round in 1..=ROUNDS {
+        let mut round = 0;
+        loop {
+            round += 1;
             let Prepared { plan, complete, .. } = next;
             tracing::debug!(round, bytes = plan.request().len(), complete, "injecting");
             let raw = master.inject(&plan).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
             let Err(mut deviation) = verdict(&plan, &raw)? else {
                 examination.mismatches.clear();
-                if !complete || plan.expected().is_inexact() {
-                    self.ledger.adopt(plan.expected().clone());
+                let held = plan.expected().clone();
+                if !complete || held.is_inexact() {
+                    self.ledger.rebase(token, held.clone());
                 }
-                self.injected(&plan, change, round);
+                self.injected(&plan, round);
                 master.discard(plan);
-                return Ok(());
+                return Ok(held);
             };
             // What the master holds now replaces what was expected, and the missing part is injected again.
             let first = self.first_look(master).await?;
@@ -572,9 +631,9 @@ impl Examiner {
             });
             let is_whole = deviation.failed.is_empty() && repair.expected() == &now;
             if is_whole || round == ROUNDS {
-                self.ledger.adopt(now);
-                self.injected(&plan, change, ROUNDS);
-                return Ok(());
+                self.ledger.rebase(token, now.clone());
+                self.injected(&plan, ROUNDS);
+                return Ok(now);
             }
             next = Prepared {
                 basis: None,
@@ -583,16 +642,11 @@ impl Examiner {
             };
             before = Some((wanted, now));
         }
-        Ok(())
     }
 
-    /// Notes that the master has got `plan` in this round, and that the mirror equals it.
-    fn injected(&self, plan: &Plan, change: &Change, round: u32) {
-        self.ledger.delivered();
+    /// Notes that the master has got `plan` in this round.
+    fn injected(&self, plan: &Plan, round: u32) {
         tracing::debug!(skipped = plan.skipped().len(), "injected");
-        if !matches!(change, Change::Renew(_)) {
-            self.stats.masters_restored.count();
-        }
         if round > 1 {
             // Another program changes the master, and may have done so once more.
             self.ledger.doubt();

@@ -401,7 +401,7 @@ impl Calls {
                         return Ok(reply);
                     }
                 }
-                State::StandingIn | State::Late | State::Injecting => {
+                State::StandingIn | State::Late | State::Injecting | State::Frozen => {
                     if let Some(reply) = self.answer_from_mirror(known).await {
                         return Ok(reply);
                     }
@@ -512,8 +512,8 @@ impl Calls {
         let held = async {
             loop {
                 hold.wait_until_spent_while_shut(&mut gate).await;
-                // An injection ends by itself. If it fails, the mirror answers.
-                if !is_answerable || gate.state() != State::Injecting {
+                // This ends by itself. If the injection fails, the mirror answers.
+                if !is_answerable || gate.state() != State::Frozen {
                     return;
                 }
                 gate.changed().await;

@@ -84,7 +84,7 @@ mod tests {
             tokio::time::sleep(60 * SECOND).await;
             tx.set(State::StandingIn);
             tokio::time::sleep(SECOND).await;
-            tx.set(State::Injecting);
+            tx.set(State::Frozen);
         };
         let mut hold = Hold::new(8 * SECOND);
         tokio::join!(opener, hold.wait_until_spent_while_shut(&mut rx));

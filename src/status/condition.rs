@@ -152,7 +152,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let (mut text, mut action) = nodes_notice(now, facts);
     let (mut name, mut since) = match now.gate {
         State::Unknown => (ConditionName::Waiting, now.gate_since),
-        State::StandingIn | State::Late | State::Injecting => {
+        State::StandingIn | State::Late | State::Injecting | State::Frozen => {
             (ConditionName::StandingIn, now.gate_since)
         }
         State::Elsewhere => (ConditionName::NoLeader, now.gate_since),
@@ -278,7 +278,7 @@ fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
                 .to_owned(),
             None,
         ),
-        (_, Mode::Core) | (State::Late | State::Injecting, _) => (
+        (_, Mode::Core) | (State::Late | State::Injecting | State::Frozen, _) => (
             "Nodes keep working: rosrescue answers in place of the master, which does not answer in time."
                 .to_owned(),
             None,

@@ -284,7 +284,7 @@ impl Dispatcher {
             Exchange::Idle { not_before } => {
                 not_before.take_if(|at| view.gate_changed || *at <= view.now);
             }
-            Exchange::InFlight(batch) if view.gate != State::StandingIn || !view.leads => {
+            Exchange::InFlight(batch) if !is_away(view.gate) || !view.leads => {
                 batch.grace = None;
             }
             _ => {}
@@ -293,9 +293,9 @@ impl Dispatcher {
             State::Elsewhere => self.send_elsewhere(),
             _ if !view.leads => {}
             State::Open { incarnation } => self.send(view.now, incarnation),
-            State::StandingIn => self.answer_from_mirror(view.now),
+            State::StandingIn | State::Injecting => self.answer_from_mirror(view.now),
             State::Late => self.answer_for_late_master(view.now),
-            State::Injecting | State::Unknown => {}
+            State::Frozen | State::Unknown => {}
         }
         self.answer_unchanged(view);
         self.watch_master(view);
@@ -340,10 +340,10 @@ impl Dispatcher {
         in_flight.iter().chain(&self.queue)
     }
 
-    /// Queues calls. During an injection, the mirror answers those that change nothing at once.
+    /// Queues calls. While the mirror is frozen, it answers those that change nothing at once.
     fn arrive(&mut self, view: &View, items: Vec<Item>) {
         for mut item in items {
-            let is_answered = view.gate == State::Injecting
+            let is_answered = view.gate == State::Frozen
                 && item.patience.is_some()
                 && self.answer_if_unchanged(view.now, &mut item);
             if !is_answered {
@@ -1077,6 +1077,11 @@ impl MirrorAnswers {
     fn count(&self) -> u64 {
         self.made.len() as u64
     }
+}
+
+/// Whether the mirror answers in place of a master that is away or does not know its state yet.
+fn is_away(gate: State) -> bool {
+    matches!(gate, State::StandingIn | State::Injecting)
 }
 
 /// Whether `call`, or an entry of it, registers something for a node.

@@ -244,7 +244,7 @@ impl LastCheck {
             gate: match gate {
                 State::Open { .. } => "open",
                 State::StandingIn | State::Late => "standing_in",
-                State::Injecting => "injecting",
+                State::Injecting | State::Frozen => "injecting",
                 State::Elsewhere => "elsewhere",
                 State::Unknown => "unknown",
             },

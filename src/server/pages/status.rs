@@ -70,7 +70,7 @@ impl Pages {
         let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
         let gate = self.gate.state();
         let gate_since = self.gate.opened_or_shut_at().into_std();
-        let stands_in = matches!(gate, State::StandingIn | State::Late | State::Injecting);
+        let stands_in = gate.is_injecting() || matches!(gate, State::StandingIn | State::Late);
         let facts = self.board.read();
         let unprotected = self.ledger.unprotected();
         let master = self.upstream.address().to_string();

@@ -195,6 +195,10 @@ impl World {
         let params = [Value::from("/direct"), key.as_str().into(), value.into()];
         master.state.apply(&Request::new(Method::SetParam, params));
         self.print(|| format!("a client sets {key} to {value} at the master"));
+        // The parameter is given back its first value if it was set again after that was read.
+        let is_second =
+            self.gate().is_injecting() && std::mem::replace(&mut self.bypassed_in_injection, true);
+        self.injection_broke |= is_second;
         self.bypassed = (!self.injection_broke).then_some((value, life));
         let time = self.dice.below(COMPARE_WITHIN);
         self.after(time, Event::Compares);

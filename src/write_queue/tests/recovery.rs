@@ -69,6 +69,8 @@ enum Question {
     Settle,
     /// The answer to a call.
     Call(Request),
+    /// The answer to an injection.
+    Inject(Request),
     /// That the disk has this record.
     Disk(Mark),
 }
@@ -125,7 +127,7 @@ impl Contact for SimulatedMaster {
 
     async fn inject(&mut self, plan: &Plan) -> Result<RawReply, ExamineError> {
         let call = Request::decode(plan.request()).unwrap();
-        let reply = self.call(call).await?;
+        let reply = self.ask(Question::Inject(call)).await?;
         Ok(raw(&reply))
     }
 
@@ -322,6 +324,7 @@ impl World {
                 self.ledger.open_gate();
                 self.recovery.owed_told = false;
                 self.injection_broke = false;
+                self.bypassed_in_injection = false;
             }
             Action::Spawn => {
                 self.start_master();
@@ -386,19 +389,23 @@ impl World {
                 self.recovery.questions += 1;
                 self.recovery.awaits_disk = Some((record, step, self.recovery.questions));
             }
-            Some(Question::Call(call)) => {
-                self.recovery.questions += 1;
-                let number = self.recovery.questions;
-                if let Some(master) = &mut self.master {
-                    master.running += 1;
-                    let time = 20 + self.dice.below(200);
-                    let of = Asked::Examination(step, number);
-                    self.after(time, super::Event::MasterGets(self.life, of, Some(call)));
-                }
-                self.then(self.recovery.silent_most, Event::Silent(step, number));
-            }
+            Some(Question::Call(call)) => self.ask_master(call, step, 200),
+            Some(Question::Inject(call)) => self.ask_master(call, step, self.injection_most),
             None => {}
         }
+    }
+
+    /// Asks the master, which gets the call within `time_most` microseconds.
+    fn ask_master(&mut self, call: Request, step: u64, time_most: u64) {
+        self.recovery.questions += 1;
+        let number = self.recovery.questions;
+        if let Some(master) = &mut self.master {
+            master.running += 1;
+            let time = 20 + self.dice.below(time_most);
+            let of = Asked::Examination(step, number);
+            self.after(time, super::Event::MasterGets(self.life, of, Some(call)));
+        }
+        self.then(self.recovery.silent_most, Event::Silent(step, number));
     }
 
     fn settles(&mut self, step: u64) {

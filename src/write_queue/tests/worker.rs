@@ -118,7 +118,7 @@ impl World {
         disk.answers.clear();
         (disk.whole, disk.is_writing, self.is_down) = (None, false, true);
         self.print(|| "rosrescue dies".to_owned());
-        if self.gate() == State::Injecting {
+        if self.gate().is_injecting() {
             self.injection_breaks();
         }
         self.may_go_back = true;

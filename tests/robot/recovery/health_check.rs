@@ -1,15 +1,11 @@
 //! The health check after an outage decides which nodes are unregistered and which are kept: nodes that died, nodes
 //! whose port another node has, and nodes that do not answer.
 
-use std::fs;
-use std::thread;
 use std::time::Duration;
 
 use crate::support::{
-    Client, FakeNode, Library, Mode, Robot, State, encode_call, eventually, eventually_some, holds,
-    http_request, in_both_modes, names, params, status,
+    FakeNode, Library, Mode, Robot, State, eventually, holds, in_both_modes, names, status,
 };
-use rustix::process::Signal;
 
 /// Waits for the report of a recovery whose health check has finished, and checks the fields of every report.
 #[track_caller]
@@ -250,77 +246,6 @@ fn reap_all_unregisters_dead_nodes_and_is_off_by_default() {
         now.is_ok_and(|now| now == before)
     }));
     drop((client, after));
-}
-
-/// roscpp locks its list of subscriptions while it registers one, and a request for that list then blocks its
-/// only thread for calls. The health check after a recovery waits for calls that came during the injection.
-#[test]
-fn a_roscpp_node_during_a_slow_registration_counts_as_reachable() {
-    // The injection takes longer than `--hold`.
-    let options = ["--hold", "1", "--node-timeout", "1500"];
-    let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
-    let client = robot.client();
-    client.set_param("/gain", 7);
-    let node = robot.node(Library::Roscpp, "late", &[]);
-    let subscriber = FakeNode::start("/subscriber");
-    subscriber.subscribe(&client, "/topic", "std_msgs/String");
-    let before = robot.settled_state();
-    let (_, api) = before
-        .nodes
-        .iter()
-        .find(|(name, _)| name == "/late")
-        .unwrap();
-    let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
-    let itself = Client::new(port.parse().unwrap());
-    let answers = |method: &str| {
-        let body = http_request(&encode_call(method, params!["/test"]));
-        let mut wire = itself.connect().unwrap();
-        wire.set_patience(Duration::from_millis(500));
-        wire.send(&body).unwrap();
-        wire.response().is_ok()
-    };
-    let dead = robot.master_pid();
-    robot.kill_master();
-    eventually("the gate is shut", || !robot.is_open());
-    // The injection takes some time, and so does the registration in the new master: longer than a node has
-    // time to answer.
-    fs::write(robot.scratch.path("slow"), "3 registerSubscriber").unwrap();
-    robot.revive_master();
-    let mut value = 0;
-    let held = eventually_some("a write waits for the end of the injection", || {
-        let client = client.clone();
-        // A write that changes nothing would not wait.
-        value += 1;
-        let setting = thread::spawn(move || client.set_param("/held", value));
-        holds(Duration::from_millis(300), || !setting.is_finished()).then_some(setting)
-    });
-    client.set_param("/gain", 7);
-    assert!(
-        !held.is_finished(),
-        "a write that changes nothing waited for the injection"
-    );
-    node.signal(Signal::USR1);
-    eventually("the node cannot answer", || !answers("getSubscriptions"));
-    assert!(!answers("getPid"));
-    assert!(!node.said("done").contains(&"subscribe".to_owned()));
-    robot.await_recovery(dead);
-    held.join().unwrap();
-    report(&robot, "the time of the health check", |report| {
-        report["master_pid"] != dead && report["health_check_ms"].is_number()
-    });
-    let last = status(&client)["last_recovery"].clone();
-    assert_eq!(names(&last["removed"]), Vec::<String>::new());
-    assert_eq!(names(&last["unreachable"]), Vec::<String>::new());
-    assert!(answers("getPid"));
-    eventually("all calls have been answered", || {
-        let mut done = node.said("done");
-        done.sort();
-        done == ["offer", "publish", "read", "set", "subscribe"]
-    });
-    let state = robot.state();
-    assert_eq!(state.publishers_of("/late/published"), ["/late"]);
-    assert_eq!(state.subscribers_of("/late/subscribed"), ["/late"]);
-    assert_eq!(state.nodes, before.nodes);
 }
 
 /// A node that does not answer, for example because it is busy, does not have to wait when it registers.

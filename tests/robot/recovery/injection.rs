@@ -2,14 +2,16 @@
 //! lives has the exact state, whatever happened before, and no node notices.
 
 use std::collections::BTreeMap;
+use std::fs;
 use std::thread;
 use std::time::Duration;
 
 use ros1_master::xmlrpc::Value;
+use rustix::process::Signal;
 
 use crate::support::{
-    Client, Failing, FakeNode, Forkserver, Rescue, Scratch, Setup, State, eventually,
-    eventually_some, free_port, holds, open_to, params, status,
+    Client, Failing, FakeNode, Forkserver, Library, Mode, Rescue, Robot, Scratch, Setup, State,
+    eventually, eventually_some, free_port, holds, in_both_modes, open_to, params, status,
 };
 
 /// Number of calls that a master gets before the injection, to read its state.
@@ -369,3 +371,63 @@ fn a_roscore_may_set_its_run_id_at_any_moment_and_the_master_gets_the_old_one() 
         proxied.bare().param("/run_id") == old
     });
 }
+
+/// Nodes do not wait while a new master gets its state: what they call meanwhile is answered, and the master gets it
+/// afterwards.
+fn nodes_call_during_an_injection(mode: Mode) {
+    // The new master takes that long for an injection.
+    let takes = Duration::from_secs(15);
+    let mut robot = Robot::start_under_with(mode, "slow_rosmaster.py", &[], &["-v"]);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    client.set_param("/gone", 1);
+    let nodes = [
+        (Library::Rospy, "__name:=py"),
+        (Library::Roscpp, "__name:=cpp"),
+    ];
+    let nodes = nodes.map(|(library, name)| robot.node(library, "late", &[name]));
+    let subscriber = FakeNode::start("/subscriber");
+    subscriber.subscribe(&client, "/topic", "std_msgs/String");
+    let publisher = FakeNode::start("/publisher");
+    robot.settled_state();
+    let slow = robot.scratch.path("slow");
+    fs::write(&slow, format!("{} registerSubscriber", takes.as_secs())).unwrap();
+    let dead = robot.master_pid();
+    robot.kill_master();
+    robot.revive_proxied_master();
+    robot.rescue.wait_line("the injection begins", |line| {
+        line.contains("injecting") && line.contains("round=1")
+    });
+    for node in &nodes {
+        node.signal(Signal::USR1);
+    }
+    publisher.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/during", 1);
+    client.ok("deleteParam", params!["/test", "/gone"]);
+    eventually("the subscriber hears of the publisher", || {
+        subscriber.updates("/topic").last() == Some(&vec![publisher.api.clone()])
+    });
+    for node in &nodes {
+        eventually("all calls have been answered", || {
+            let mut done = node.said("done");
+            done.sort();
+            done == ["offer", "publish", "read", "set", "subscribe"]
+        });
+    }
+    assert!(!robot.is_open(), "the injection has ended before the calls");
+    // What the master gets afterwards is not slow.
+    fs::remove_file(&slow).unwrap();
+    let mirrored = State::read(&client);
+    robot.await_recovery(dead);
+    robot.await_state(&mirrored, "after the injection");
+    for name in nodes.map(|node| node.said("ready").concat()) {
+        let published = format!("{name}/published");
+        assert_eq!(mirrored.publishers_of(&published), [name]);
+    }
+    assert_eq!(mirrored.publishers_of("/topic"), ["/publisher"]);
+    let own = robot.bare();
+    assert_eq!(own.ok("getParam", params!["/test", "/during"]), 1.into());
+    assert_eq!(own.ok("hasParam", params!["/test", "/gone"]), false.into());
+}
+
+in_both_modes!(nodes_call_during_an_injection);

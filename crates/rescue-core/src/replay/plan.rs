@@ -166,9 +166,21 @@ impl Plan {
         Self::write(target, found, Some(before), Manner::Replace, token)
     }
 
+    /// Plans to bring a master that holds exactly `found`, because it was given that just now, to exactly `target`, and to
+    /// replace its token `before` by `token`. Only what differs is removed and added; no node is notified. Nothing is read
+    /// back: the answers to these few calls show whether they were executed. If the order of a list would differ from
+    /// that of `target`, the plan is that of [`Self::replace`].
+    pub fn update(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
+        let plan = Self::write(target, found, Some(before), Manner::Update, token);
+        match plan.expected() == target {
+            true => plan,
+            false => Self::replace(target, found, before, token),
+        }
+    }
+
     /// Plans to run `writes` on a master whose state is `behind`, and to replace its token `before` by `token`.
     pub fn run(behind: &Master, writes: Vec<Request>, before: &Token, token: &Token) -> Self {
-        Self::sequence(behind, Some(before), token, |write| {
+        Self::sequence(Some(behind), Some(before), token, |write| {
             let mut model = behind.clone();
             for call in writes {
                 let predicted = model.apply(&call).reply;
@@ -179,7 +191,7 @@ impl Plan {
     }
 
     /// Plans the calls that bring a master from `found` to `target`. To [replace](Manner::Replace), the first calls
-    /// remove all registrations.
+    /// remove all registrations; to [update](Manner::Update), those that differ.
     fn write(
         target: &Master,
         found: &Master,
@@ -187,26 +199,32 @@ impl Plan {
         manner: Manner,
         token: &Token,
     ) -> Self {
-        Self::sequence(found, before, token, |write| {
-            let mut emptied = None;
-            if manner == Manner::Replace {
-                let mut model = found.clone();
-                for call in restore::removal(found) {
-                    let predicted = model.apply(&call).reply;
-                    write(call, predicted);
-                }
-                emptied = Some(model);
+        let (removed, last) = match manner {
+            Manner::Replace => (restore::removal(found), Vec::new()),
+            Manner::Update => restore::outdated(found, target),
+            Manner::Add | Manner::Repair => (Vec::new(), Vec::new()),
+        };
+        let reads_back = (manner != Manner::Update).then_some(found);
+        Self::sequence(reads_back, before, token, |write| {
+            let mut emptied = found.clone();
+            for call in removed {
+                let predicted = emptied.apply(&call).reply;
+                write(call, predicted);
             }
-            let Restore { model, skipped, .. } =
-                Restore::run(target, emptied.as_ref().unwrap_or(found), manner, write);
+            let restored = Restore::run(target, &emptied, manner, &mut *write);
+            let (mut model, skipped) = (restored.model, restored.skipped);
+            for call in last {
+                let predicted = model.apply(&call).reply;
+                write(call, predicted);
+            }
             (model, skipped)
         })
     }
 
-    /// Plans the calls that `bring` writes, for a master whose state is `found`. `bring` returns the resulting state
-    /// and what it has left out.
+    /// Plans the calls that `bring` writes. `bring` returns the resulting state and what it has left out. The master is
+    /// read back unless `found`, the state that it had before, is `None`.
     fn sequence(
-        found: &Master,
+        found: Option<&Master>,
         before: Option<&Token>,
         token: &Token,
         bring: impl FnOnce(&mut dyn FnMut(Request, Reply)) -> (Master, Vec<Skipped>),
@@ -228,7 +246,7 @@ impl Plan {
             write(call, predicted);
         }
         let (mut model, skipped) = bring(&mut write);
-        for call in reads(&model, found) {
+        for call in found.map_or_else(Vec::new, |found| reads(&model, found)) {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
         }

@@ -1,6 +1,6 @@
 //! Generates the calls that bring a new master to a state, and tries each one on a model of that master.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use indexmap::IndexMap;
 
@@ -8,7 +8,9 @@ use super::Token;
 use super::plan::Skipped;
 use super::token::{HELPER, NO_API};
 use ros1_master::master::names::{self, CALLER_ID};
-use ros1_master::master::{Master, Method, Request, returnable};
+use ros1_master::master::{
+    Master, Method, Registrations, Registry, Request, Write, WriteTarget, returnable,
+};
 use ros1_master::xmlrpc::{Reply, Struct, Value};
 
 /// Generates the calls that change state and passes each, with its predicted answer, to `write`. Afterwards `model` has
@@ -41,6 +43,16 @@ pub(super) enum Manner {
     Repair,
     /// The parameters and topic types of the target replace those of the master, which has no registrations.
     Replace,
+    /// Like [`Self::Replace`], for a master that still has the registrations that [`outdated`] leaves. Each parameter
+    /// that differs is set or deleted by its own call.
+    Update,
+}
+
+impl Manner {
+    /// Whether the topic types of the target win over those of the master.
+    fn sets_types(self) -> bool {
+        matches!(self, Self::Replace | Self::Update)
+    }
 }
 
 impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
@@ -97,7 +109,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         if tree.iter().eq(found) {
             return;
         }
-        if self.manner == Manner::Repair {
+        if matches!(self.manner, Manner::Repair | Manner::Update) {
             return self.set_different("", tree, found);
         }
         // Another program may have set parameters since the inspection, and this `setParam` removes them. rosmaster
@@ -176,11 +188,12 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         name_for: fn(&str, &str) -> Option<String>,
     ) -> Vec<(&'a str, String, &'a str)> {
         let mut missing = Vec::with_capacity(callers.len());
+        let there: HashSet<&String> = there.into_iter().flatten().collect();
         for caller_id in callers {
             let Some(api) = self.api(caller_id) else {
                 continue;
             };
-            if there.is_some_and(|there| there.contains(caller_id)) {
+            if there.contains(caller_id) {
                 continue;
             }
             match name_for(key, caller_id) {
@@ -204,7 +217,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// The type with which to register a topic. A type that the new master has stays, unless the target's types win.
     fn topic_type(&self, topic: &str) -> &'a str {
         let known = self.found.type_of(topic);
-        let known = known.filter(|known| *known != "*" && self.manner != Manner::Replace);
+        let known = known.filter(|known| *known != "*" && !self.manner.sets_types());
         known.or_else(|| self.target.type_of(topic)).unwrap_or("*")
     }
 
@@ -437,7 +450,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         for (topic, topic_type) in target.topic_types() {
             let known = self.model.type_of(topic);
             let differs = known.is_some_and(|known| known != topic_type);
-            if self.manner == Manner::Replace && differs && topic_type != "*" {
+            if self.manner.sets_types() && differs && topic_type != "*" {
                 self.set_type(topic, topic_type, true);
             }
         }
@@ -498,11 +511,166 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 /// are not notified of the rest.
 pub(super) fn removal(found: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
-    let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
-    let (publishers, mut first): (Vec<_>, Vec<_>) =
-        calls.partition(|call| *call.method() == Method::UnregisterPublisher);
-    first.extend(publishers);
-    first
+    removal_of(
+        found,
+        nodes.map(|(name, _)| (name, found.unregister_calls(name), true)),
+    )
+}
+
+/// The calls with which a helper subscribes to `key` and ends that, if there are subscribers of `key` in `target`.
+fn helper_calls(of: WriteTarget, key: &str, target: &Registry) -> Option<(Request, Request)> {
+    match of {
+        WriteTarget::Subscriber if target.subscribers.contains_key(key) => {
+            let name = names::name_for(key, HELPER)?;
+            let subscribe = [HELPER, &name, "*", NO_API];
+            let unsubscribe = [HELPER, &name, NO_API];
+            Some((
+                Request::new(Method::RegisterSubscriber, subscribe),
+                Request::new(Method::UnregisterSubscriber, unsubscribe),
+            ))
+        }
+        WriteTarget::ParamSubscriber if target.param_subscribers.contains_key(key) => {
+            let name = names::param_name_for(key, HELPER)?;
+            let of = [HELPER, NO_API, &name];
+            Some((
+                Request::new(Method::SubscribeParam, of),
+                Request::new(Method::UnsubscribeParam, of),
+            ))
+        }
+        _ => None,
+    }
+}
+
+/// The registrations under some keys that stay.
+struct Kept<'a> {
+    nodes: HashMap<&'a str, HashSet<&'a str>>,
+    /// The keys whose nodes change.
+    changed: HashSet<&'a str>,
+}
+
+impl<'a> Kept<'a> {
+    /// What stays if the registrations `old` become `new`, and the nodes for which `moves` get another address. A list
+    /// grows only at its end, so nothing of a list stays whose first nodes would differ.
+    fn of(old: &'a Registrations, new: &'a Registrations, moves: impl Fn(&str) -> bool) -> Self {
+        let mut kept = Self {
+            nodes: HashMap::new(),
+            changed: HashSet::new(),
+        };
+        for (key, before) in old {
+            let after = new.get(key).map_or(&[][..], Vec::as_slice);
+            let wanted: HashSet<&str> = after.iter().map(String::as_str).collect();
+            let stays = |node: &&String| wanted.contains(node.as_str()) && !moves(node);
+            let nodes: Vec<&String> = before.iter().filter(stays).collect();
+            let is_prefix = nodes
+                .iter()
+                .zip(after)
+                .all(|(node, wanted)| *node == wanted);
+            if nodes.len() < before.len() || nodes.len() < after.len() || !is_prefix {
+                kept.changed.insert(key);
+            }
+            if is_prefix {
+                let nodes = nodes.into_iter().map(String::as_str).collect();
+                kept.nodes.insert(key, nodes);
+            }
+        }
+        let added = new.keys().filter(|key| !old.contains_key(key));
+        kept.changed.extend(added.map(String::as_str));
+        kept
+    }
+
+    fn has(&self, key: &str, node: &str) -> bool {
+        let nodes = self.nodes.get(key);
+        nodes.is_some_and(|nodes| nodes.contains(node))
+    }
+
+    fn differ(&self, key: &str) -> bool {
+        self.changed.contains(key)
+    }
+}
+
+/// The calls that remove from a master, which holds `found`, registrations of some nodes: the given calls, and all that
+/// the master knows of a node if the flag says so. A service that another node has taken over must be taken back for
+/// that, so it has no provider afterwards. Publishers come last, so that no subscriber is notified.
+fn removal_of<'a>(
+    found: &Master,
+    nodes: impl Iterator<Item = (&'a str, Vec<Request>, bool)>,
+) -> Vec<Request> {
+    let (mut calls, mut taken_back, mut publishers) = (Vec::new(), Vec::new(), Vec::new());
+    for (caller_id, registrations, is_all) in nodes {
+        for call in registrations {
+            match call.method() {
+                Method::UnregisterPublisher => publishers.push(call),
+                _ => calls.push(call),
+            }
+        }
+        let Some(node) = found.registry().nodes.get(caller_id).filter(|_| is_all) else {
+            continue;
+        };
+        for service in found.taken_over(caller_id, node) {
+            if let Some(name) = names::name_for(service, caller_id) {
+                let register = [caller_id, &name, NO_API, &node.api];
+                taken_back.push(Request::new(Method::RegisterService, register));
+                let unregister = [caller_id, &name, NO_API];
+                taken_back.push(Request::new(Method::UnregisterService, unregister));
+            }
+        }
+    }
+    calls.extend(taken_back);
+    calls.extend(publishers);
+    calls
+}
+
+/// The calls that remove from a master that holds `found` what differs in `target`: registrations that `target` lacks or
+/// has at another address, and what would be notified of the rest, which is the subscribers of topics whose publishers or
+/// type differ and, if any parameter differs, the subscribers of parameters.
+///
+/// A topic or key that keeps subscribers keeps its place, because a helper subscribes to it first. Also returns the calls
+/// that remove the helper in the end. A master never connects to its address.
+pub(super) fn outdated(found: &Master, target: &Master) -> (Vec<Request>, Vec<Request>) {
+    let (old, new) = (found.registry(), target.registry());
+    let same_params = found.params() == target.params();
+    let moves = |node: &str| found.api_of(node) != target.api_of(node);
+    let publishers = Kept::of(&old.publishers, &new.publishers, moves);
+    let subscribers = Kept::of(&old.subscribers, &new.subscribers, moves);
+    let param_subscribers = Kept::of(&old.param_subscribers, &new.param_subscribers, moves);
+    let stays = |node: &str, call: &Request| {
+        let Some(write) = Write::parse(call) else {
+            return false;
+        };
+        let key = write.name();
+        match write.target() {
+            WriteTarget::Publisher => publishers.has(key, node),
+            WriteTarget::Subscriber => {
+                subscribers.has(key, node)
+                    && !publishers.differ(key)
+                    && found.type_of(key) == target.type_of(key)
+            }
+            WriteTarget::Service => old.services.get(key) == new.services.get(key),
+            WriteTarget::ParamSubscriber => param_subscribers.has(key, node) && same_params,
+            WriteTarget::Parameter => false,
+        }
+    };
+    let nodes = old.nodes.keys().filter(|name| !Token::is_ours(name));
+    let removed = nodes.map(|name| {
+        let moves = moves(name);
+        let mut calls = found.unregister_calls(name);
+        calls.retain(|call| moves || !stays(name, call));
+        (name.as_str(), calls, moves)
+    });
+    let removed = removal_of(found, removed);
+    let (mut calls, mut last) = (Vec::new(), Vec::new());
+    let mut held = HashSet::new();
+    for write in removed.iter().filter_map(Write::parse) {
+        let key = write.name();
+        if held.insert((write.target(), key.to_owned()))
+            && let Some((subscribe, unsubscribe)) = helper_calls(write.target(), key, new)
+        {
+            calls.push(subscribe);
+            last.push(unsubscribe);
+        }
+    }
+    calls.extend(removed);
+    (calls, last)
 }
 
 /// Makes the changes that lead from the parameter tree `from` to `to` in the tree `onto`. What `to` lacks is removed only

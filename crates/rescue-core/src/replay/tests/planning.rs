@@ -2,6 +2,7 @@ use super::*;
 use crate::replay::{Plan, Skipped, Token, difference};
 use ros1_master::master::Kind;
 use ros1_master::xmlrpc::{decode_call, encode_call, encode_reply};
+use test_support::dice::Dice;
 
 fn token() -> Token {
     Token::new("m", 1)
@@ -599,4 +600,66 @@ fn nothing_is_lost_that_another_program_does_at_any_moment_of_an_injection() {
             );
         }
     }
+}
+
+/// A random write of one of a few nodes, some of which have two addresses.
+fn random_write(dice: &mut Dice) -> Request {
+    let node = format!("/n{}", dice.below(5));
+    let api = format!("http://h:{}{}/", &node[2..], dice.below(9) / 8);
+    let (topic, key) = (
+        format!("/t{}", dice.below(4)),
+        format!("/p{}", dice.below(3)),
+    );
+    let topic_type = ["a/B", "c/D", "*"][usize::try_from(dice.below(3)).unwrap()];
+    let strings = |method: &str, params: &[&str]| call(method, params);
+    match dice.below(10) {
+        0..3 => strings("registerPublisher", &[&node, &topic, topic_type, &api]),
+        3 | 4 => strings("registerSubscriber", &[&node, &topic, topic_type, &api]),
+        5 => strings("unregisterPublisher", &[&node, &topic, &api]),
+        6 => strings("unregisterSubscriber", &[&node, &topic, &api]),
+        7 => strings(
+            "registerService",
+            &[&node, &topic, &format!("rosrpc://{node}"), &api],
+        ),
+        8 => strings("subscribeParam", &[&node, &api, &key]),
+        _ => set(&key, i32::try_from(dice.below(3)).unwrap()),
+    }
+}
+
+#[test]
+fn a_state_follows_another_without_any_callback() {
+    let mut dice = Dice(7);
+    let mut small = 0;
+    for round in 0..1_000 {
+        let mut found = Master::default();
+        for _ in 0..dice.below(30) {
+            found.apply(&random_write(&mut dice));
+        }
+        let mut target = found.clone();
+        for _ in 0..dice.below(8) {
+            target.apply(&random_write(&mut dice));
+        }
+        let before = Token::new("m", 0);
+        let mut master = found.clone();
+        for call in before.set_calls() {
+            master.apply(&call);
+        }
+        let plan = Plan::update(&target, &found, &before, &token());
+        let outcome = master.apply(&sent(&plan));
+        assert_eq!(plan.verify(&outcome.reply), Ok(()));
+        // No node is at the address of tokens and helpers.
+        let to_node = |notice: &Notice| match notice {
+            Notice::PublisherUpdate { to, .. }
+            | Notice::ParamUpdate { to, .. }
+            | Notice::Shutdown { to, .. } => !to.starts_with("rosrpc://rosrescue"),
+        };
+        let notices: Vec<_> = outcome.notices.into_iter().filter(to_node).collect();
+        assert_eq!(notices, [], "round {round}");
+        assert_eq!(plan.expected(), &target, "round {round}");
+        small += u32::from(count(&plan, "getSystemState") == 0);
+        assert!(Token::is_found(&master.apply(&token().lookup()).reply));
+        assert!(!Token::is_found(&master.apply(&before.lookup()).reply));
+    }
+    println!("{small} plans change only what differs");
+    assert!(small > 900);
 }
