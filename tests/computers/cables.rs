@@ -169,6 +169,8 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
     fleet.computers[leader].set_param("/steady", 7);
     for cut in [leader, (leader + 1) % 3] {
         await_param(&fleet, "/steady", 7);
+        // A computer that lacks a record of which the leader's answer to it has told does not answer reads.
+        fleet.await_same_state();
         let key = format!("/written_{cut}");
         fleet.network.cut_cable(cut);
         let lonely = &fleet.computers[cut];
