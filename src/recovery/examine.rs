@@ -471,7 +471,7 @@ impl Examiner {
         let mut updates = 0;
         while !self.ledger.resume(&token) && !Mutant::LeavesBehind.lives() {
             updates += 1;
-            let is_short = self.ledger.pending() <= FROZEN_MOST || updates == UPDATES;
+            let is_short = self.ledger.pending() <= FROZEN_MOST || updates >= UPDATES;
             let Basis { mirror, .. } = self.ledger.begin_injection();
             let (next, announced) = self.ledger.succeed();
             if !is_short {
