@@ -422,13 +422,22 @@ impl Machine {
         }
     }
 
+    /// Whether etcd has not answered for so long that what it showed last does not count: it may show the same again
+    /// because an older copy was restored. Longer than until a claim, which follows the time to live after the last answer.
+    fn is_cut_off_from_etcd(&self, now: Instant) -> bool {
+        let long = 2 * self.settings.ttl;
+        self.heard.is_some_and(|at| at + long <= now)
+    }
+
     /// Handles the keys `leader` and `alive` as etcd shows them.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
-        let heard = self.heard.replace(now);
-        if view.leader.is_none() && heard.is_some_and(|at| at + self.settings.ttl <= now) {
+        let Settings { ttl, .. } = self.settings;
+        let is_news = view.leader.is_none() && self.heard.is_some_and(|at| at + ttl <= now);
+        if is_news || self.is_cut_off_from_etcd(now) {
             // Others may have led meanwhile, and etcd may have lost their journal, too. They say so now.
-            self.hold_claims(now + self.settings.ttl);
+            self.hold_claims(now + ttl);
         }
+        self.heard = Some(now);
         if view.revision < self.view.revision {
             return;
         }

@@ -79,7 +79,7 @@ impl Machine {
                     settled: self.session.settled_by(seq),
                 }
             }
-            None if self.observed.is_none() => Op::Read,
+            None if self.observed.is_none() || self.is_cut_off_from_etcd(now) => Op::Read,
             None => {
                 self.claims += 1;
                 let claim = self.claims;

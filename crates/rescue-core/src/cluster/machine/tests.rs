@@ -126,6 +126,30 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
     assert_eq!(op, claim);
 }
 
+/// Seed 3042947.
+#[test]
+fn who_has_not_heard_of_etcd_for_twice_the_time_to_live_reads_first_and_claims_later() {
+    let (mut machine, now) = following(WhenAlone::Serve);
+    let (_, op) = sent(&machine.on(now + TTL, Input::Wake));
+    assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+    let given_up = now + TTL + ANSWER_LIMIT + RETRY;
+    machine.on(given_up, Input::Wake);
+    let (number, op) = sent(&machine.on(given_up + RETRY, Input::Wake));
+    assert_eq!(op, Op::Read);
+    let answer = EtcdAnswer::Is(led("b", 5, 6));
+    let answered = given_up + 2 * RETRY;
+    machine.on(answered, Input::Answer { number, answer });
+    let actions = machine.on(answered + TTL - ms(1), Input::Wake);
+    assert!(
+        !actions
+            .iter()
+            .any(|action| matches!(action, Action::Send { .. })),
+        "{actions:?}"
+    );
+    let (_, op) = sent(&machine.on(answered + TTL, Input::Wake));
+    assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+}
+
 #[test]
 fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
     let (mut machine, now) = machine(WhenAlone::Serve);
