@@ -104,10 +104,12 @@ impl Member {
             false => seq,
         };
         self.position = JournalPosition { epoch, term, seq };
-        self.held = Holdings {
-            journal_number,
-            term,
-            seq,
-        };
+        if !lost {
+            self.held = Holdings {
+                journal_number,
+                term,
+                seq,
+            };
+        }
     }
 }
