@@ -58,15 +58,20 @@ impl Outgoing {
         self.changes.iter()
     }
 
-    /// Whether another computer added `entry` to the journal while this one had changes to add there.
-    pub fn differs(&self, entry: &WatchedEntry) -> bool {
-        match (self.changes.front(), entry) {
-            (None, _) => false,
-            (Some(Change::Call(own, _)), WatchedEntry::Records { records, .. }) => {
-                records.first() != Some(own)
-            }
-            (Some(_), _) => true,
-        }
+    /// Keeps those of the next `entries` of the journal that this computer has added. What follows its last change is kept,
+    /// too.
+    pub fn retain_own(&self, entries: &mut Vec<(u64, WatchedEntry)>) {
+        let mut own = self.changes.iter();
+        let mut is_own = |record: &Record| match own.next() {
+            Some(Change::Call(own, _)) => own == record,
+            Some(Change::State { .. }) => false,
+            None => true,
+        };
+        let others = entries.iter().position(|(_, entry)| match entry {
+            WatchedEntry::Records { records, .. } => !records.iter().all(&mut is_own),
+            WatchedEntry::Apart(_) => true,
+        });
+        entries.truncate(others.unwrap_or(entries.len()));
     }
 
     /// The number of the last change, or 0.

@@ -198,6 +198,7 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 3042947 and 10022831: a computer that had been cut off from etcd since before the copy was made claimed as soon as etcd had that copy.
 /// 10053294 and 10066558: etcd lost data again before a new journal had begun. A computer that had been cut off meanwhile forgot that
 /// it still held the first one's records, and waited too long for those that had not forgotten it.
+/// 10000346: a leader that had hung took entries of the next leader, which arrived with their deletion, for its own.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -213,7 +214,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
         400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429, 807_731,
         815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696, 1_007_191,
-        3_042_947, 10_022_831, 10_053_294, 10_066_558,
+        3_042_947, 10_022_831, 10_000_346, 10_053_294, 10_066_558,
     ] {
         play_with_data_loss(seed).check();
     }

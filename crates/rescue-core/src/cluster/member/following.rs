@@ -156,10 +156,11 @@ impl Member {
             entries.retain(|(revision, _)| !is_other || *revision < origin);
             let next = self.journal.progress.seq + 1;
             // Others' entries must not count as the state on which this computer's own writes were made.
-            let first = entries.first().map(|(_, first)| first);
-            let first =
-                first.filter(|first| first.begins_with(next) && !self.outgoing.differs(first));
-            if first.is_some() {
+            self.outgoing.retain_own(&mut entries);
+            if entries
+                .first()
+                .is_some_and(|(_, first)| first.begins_with(next))
+            {
                 self.take_entries(now, entries);
                 // This computer's own entries need no merge.
                 self.outgoing.committed(self.journal.progress.seq);
