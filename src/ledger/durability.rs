@@ -95,7 +95,7 @@ impl Ledger {
             return;
         }
         if let Some(worker) = self.worker() {
-            crate::task::spawn_blocking(move || worker.work());
+            worker.wake();
         }
     }
 

@@ -1,3 +1,5 @@
+use std::{cell::RefCell, sync::mpsc};
+
 use ros1_master::{
     master::{Master, Method, Request, Snapshot},
     xmlrpc::Value,
@@ -160,14 +162,14 @@ fn a_disk_that_is_given_too_much_is_given_up() {
 fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
-    let (go_on, hangs) = std::sync::mpsc::sync_channel::<()>(1);
-    let (began, begins) = std::sync::mpsc::sync_channel::<()>(1);
+    let (go_on, hangs) = mpsc::sync_channel::<()>(1);
+    let (began, begins) = mpsc::sync_channel::<()>(1);
     journal.run(move |_| {
         began.send(()).unwrap();
         hangs.recv().unwrap();
     });
     let worker = journal.worker();
-    let first = std::thread::spawn(move || worker.work());
+    let first = thread::spawn(move || worker.work());
     begins.recv().unwrap();
     journal.append(entry(0));
     journal.worker().work();
@@ -175,4 +177,33 @@ fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
     go_on.send(()).unwrap();
     first.join().unwrap();
     assert_eq!(disk.reached(), 1);
+}
+
+thread_local! {
+    /// Dropped when its thread ends.
+    static END: RefCell<Option<mpsc::SyncSender<()>>> = const { RefCell::new(None) };
+}
+
+#[test]
+fn the_disks_thread_runs_jobs_as_they_come_and_ends_with_the_journal() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    let (ended, ends) = mpsc::sync_channel(1);
+    let mut end = Some(ended);
+    for value in 0..3 {
+        journal.append(entry(value));
+        let (began, begins) = mpsc::sync_channel(1);
+        let end = end.take();
+        journal.run(move |_| {
+            if end.is_some() {
+                END.set(end);
+            }
+            began.send(thread::current().id()).unwrap();
+        });
+        journal.worker().wake();
+        assert_ne!(begins.recv().unwrap(), thread::current().id());
+        assert_eq!(disk.reached(), value as u64 + 1);
+    }
+    drop(journal);
+    ends.recv().unwrap_err();
 }
