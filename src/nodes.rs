@@ -334,7 +334,7 @@ pub(crate) fn notify_after_restart(nodes: &Arc<Nodes>) {
     nodes
         .ledger
         .with_activity(|mirror, activity| activity.notice_all(mirror, now));
-    notify_owed(nodes, now, Telling::Twice);
+    notify_owed(nodes, now, Telling::Now);
 }
 
 fn notify_of_change(nodes: &Arc<Nodes>, change: NotifyingChange) {

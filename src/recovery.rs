@@ -291,6 +291,7 @@ impl Driver {
         match step {
             Step::Disconnect => self.disconnect(),
             Step::Shut(gate) => self.examiner.ledger.shut_gate(gate),
+            Step::ExpectEarlier(until) => self.examiner.ledger.expect_earlier(until),
             Step::NotifyAll => nodes::notify_after_restart(&self.nodes),
             Step::ReportDeathWhileInjected => alarm!(
                 warn,

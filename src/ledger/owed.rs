@@ -54,6 +54,13 @@ pub(crate) struct Queued {
 }
 
 impl Ledger {
+    /// Notes until when notifications of an earlier process may still arrive; see [`Order::expect_earlier`](rescue_core::order::Order::expect_earlier).
+    pub(crate) fn expect_earlier(&self, until: Instant) {
+        if !Mutant::ForgetsLastProcess.lives() {
+            self.with_order(|order, _| order.expect_earlier(until));
+        }
+    }
+
     /// Queues the state of each topic and parameter whose notifications may not have been sent by the master that was
     /// lost at `outage`.
     pub(crate) fn queue_owed(&self, now: Instant, outage: Instant, telling: Telling) -> Queued {

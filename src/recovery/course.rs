@@ -39,6 +39,8 @@ pub(crate) enum Step {
     Disconnect,
     /// Set the gate, which ends an injection that is in progress.
     Shut(State),
+    /// Expect notifications of an earlier process until this time.
+    ExpectEarlier(Instant),
     /// Notify all nodes of the present state, because no master is sending them an older one.
     NotifyAll,
     /// Report that a master died after the gate was shut for its injection, and before it opened.
@@ -112,6 +114,9 @@ impl Course {
         let actions = self.lifecycle.on(now, input);
         if matches!(input, Input::Start { .. }) {
             self.shut(&mut steps);
+            if self.news == News::Owed {
+                steps.add(Step::ExpectEarlier(now + BACKLOG));
+            }
         }
         if input == Input::LateAnswered {
             steps.add(Step::SetPatience(self.lifecycle.patience().clone()));

@@ -912,7 +912,7 @@ fn late_masters_are_given_what_they_missed() {
 /// * 1076138: a late master runs a call that changes nothing, so it does not notify nodes of what rosrescue has left to it.
 #[test]
 fn older_news_is_not_what_nodes_hear_last() {
-    for seed in [719_532, 817_847, 1_076_138] {
+    for seed in [719_532, 817_847, 1_076_138, 1_183_284] {
         let broken = mistake(None, seed, 1);
         assert!(broken.is_none(), "{broken:?}");
     }
@@ -954,6 +954,7 @@ fn raw(reply: &Reply) -> RawReply {
         reason: None,
         headers: HeaderMap::new(),
         body: xmlrpc::encode_reply(reply).into(),
+/// * 1183284: rosrescue dies while it notifies of a call that the disk does not have.
     }
 }
 

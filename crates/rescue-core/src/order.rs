@@ -79,6 +79,8 @@ pub struct Order {
     /// notifications while the mirror answers.
     is_late: bool,
     repeats: Repeats,
+    /// Until when notifications of an earlier process may still arrive.
+    earlier_until: Option<Instant>,
     /// Whether a call or a notification waits until an answer or a notification has arrived, or until the master has
     /// answered its calls.
     awaited: bool,
@@ -298,6 +300,12 @@ impl Order {
         (self.master_notifications, self.is_late) = Default::default();
     }
 
+    /// Notes that notifications of an earlier process may still arrive until `until`. Nodes that are told something before
+    /// then are told the state once more. That process may have recorded nothing of what it was sending.
+    pub fn expect_earlier(&mut self, until: Instant) {
+        self.earlier_until = Some(until);
+    }
+
     /// Queues `call`, which a master would send now, for the node at `port`. If a master that is gone may already have
     /// run a write about `subject`, it may have sent something newer than `call`. In that case, the node is told the
     /// present state instead. If the master is only late and may still have notifications about `subject` to send, they
@@ -379,6 +387,9 @@ impl Order {
             if written && !is_repeat || sending_until.is_some() {
                 let again = now + REPEAT_AFTER;
                 self.repeats.add(again, port.to_owned(), subject.clone());
+            }
+            if let Some(until) = self.earlier_until.filter(|until| now < *until) {
+                self.notify_of_state_at(until, port, subject.clone());
             }
             self.repeats.sent(now, port, &subject);
             let recipient = Recipient {

@@ -255,6 +255,7 @@ impl World {
             match step {
                 Step::Disconnect => self.disconnect(),
                 Step::Shut(gate) => self.shut(gate),
+                Step::ExpectEarlier(until) => self.ledger.expect_earlier(until),
                 Step::NotifyAll => self.notify_all(),
                 Step::ReportDeathWhileInjected => self.injection_breaks(),
                 Step::SetPatience(patience) => {
@@ -574,6 +575,6 @@ impl World {
         let now = self.instant();
         self.ledger
             .with_activity(|mirror, activity| activity.notice_all(mirror, now));
-        self.ledger.queue_owed(now, now, Telling::Twice);
+        self.ledger.queue_owed(now, now, Telling::Now);
     }
 }

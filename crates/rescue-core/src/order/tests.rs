@@ -465,3 +465,21 @@ fn a_state_that_must_come_last_is_told_although_another_reason_had_put_it_off() 
     }
     assert_eq!(told, 1);
 }
+
+#[test]
+fn what_is_told_while_notifications_of_an_earlier_process_may_arrive_is_told_again_after_them() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    let end = now + Duration::from_secs(1);
+    order.expect_earlier(end);
+    mirror.apply(&subscribe("/a", "/t"));
+    order.notify_of_state(A, topic("/t"));
+    let (_, number) = sent(order.next_notification(now, A, &mirror));
+    order.notification_taken(number);
+    mirror.apply(&publish("/b", "/t"));
+    assert_eq!(order.next_repeat(), Some(end));
+    order.queue_due_repeats(end);
+    let (publishers, number) = sent(order.next_notification(end, A, &mirror));
+    assert_eq!(publishers, Value::Array(vec!["http://b:1/".into()]));
+    order.notification_taken(number);
+    assert_eq!(order.next_repeat(), None);
+}
