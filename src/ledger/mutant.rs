@@ -18,6 +18,8 @@ pub(crate) enum Mutant {
     ForgetsLastProcess,
     /// The mirror answers writes first although nothing would keep them if the process ended.
     AnswersUnprotected,
+    /// The journal does not get to know which writes the master has run.
+    NotesNothingRun,
     /// Calls overtake a write that the mirror has answered first.
     Overtakes,
     /// Writes that the mirror has answered first go to the next master, too, which has got the state.

@@ -108,6 +108,10 @@ enum Event {
     Breaks,
     /// A client sets a parameter directly at the master.
     Bypasses,
+    /// A client sets it through rosrescue.
+    SetsBefore,
+    /// It is set directly if the master has had this value for a while.
+    BypassesAfter(i32),
     /// A node's process ends. Another one begins under the same name.
     NodeRestarts,
     /// The write queue compares the master with the mirror.
@@ -154,6 +158,9 @@ struct Done {
 
 /// From this seed on, injections take as long as for a robot of many nodes, so that writes are answered meanwhile.
 const LONG_INJECTIONS: u64 = 1_000_000;
+/// From this seed on, the parameter that a client sets directly at the master was set through rosrescue before, and
+/// rosrescue dies after.
+const SET_BEFORE: u64 = 2_000_000;
 
 struct World {
     dice: Dice,
@@ -212,8 +219,10 @@ struct World {
     /// has not opened since. The next injection lets the mirror win over what a client has set meanwhile, and over what
     /// only the lost answer has shown; see decision 52.
     injection_broke: bool,
-    /// Whether a client has set a value directly at the master since an injection began.
-    bypassed_in_injection: bool,
+    /// Whether a client has set a value directly at the master since calls last passed to it.
+    bypassed_before_open: bool,
+    /// Where the answer to a client goes that has set the parameter through rosrescue.
+    set_before: Option<oneshot::Receiver<AnswerAndDelivery>>,
     /// Whether the connections to a living master broke, or a master was taken for hung. It may go on and notify nodes of
     /// what it knows after the mirror has told them newer news. Nobody can see that, so values may go back before the
     /// last one comes.
@@ -265,9 +274,9 @@ impl World {
             disk,
             is_down: false,
             is_calm,
-            injection_most: match seed < LONG_INJECTIONS {
-                true => 200,
-                false => 30_000,
+            injection_most: match seed {
+                LONG_INJECTIONS..SET_BEFORE => 30_000,
+                _ => 200,
             },
             deaths: 0,
             waiting: Vec::new(),
@@ -289,7 +298,8 @@ impl World {
             caught_up: 0,
             bypassed: None,
             injection_broke: false,
-            bypassed_in_injection: false,
+            bypassed_before_open: false,
+            set_before: None,
             may_go_back: false,
             broken: Vec::new(),
             prints: std::env::var_os("ROSRESCUE_STEPS").is_some(),
@@ -312,13 +322,17 @@ impl World {
             }
             return world;
         }
+        if seed >= SET_BEFORE {
+            let time = 5_000 + world.dice.below(60_000);
+            world.after(time, Event::SetsBefore);
+        }
         // Most masters die or lose their connections while calls are under way, some more than once.
         for _ in 0..world.dice.below(4) {
             let time = 5_000 + world.dice.below(60_000);
             let event = match world.dice.below(10) {
                 0..2 => Event::Breaks,
                 2..5 => Event::WorkerDies,
-                5 => Event::Bypasses,
+                5 if seed < SET_BEFORE => Event::Bypasses,
                 6 => Event::NodeRestarts,
                 _ => Event::Dies,
             };
@@ -441,6 +455,22 @@ impl World {
             since: self.now,
             answered,
         });
+        self.dispatch(Input::Calls(vec![item]));
+    }
+
+    /// A client sets the parameter that it will set directly at the master.
+    fn sets_before(&mut self) {
+        if self.is_down {
+            return self.after(5_000, Event::SetsBefore);
+        }
+        self.value += 1;
+        let call = set_bypassed(self.value);
+        self.print(|| format!("a client calls {call:?}"));
+        let raw = Some((Head::default(), Bytes::from(call.encode())));
+        let (mut item, answered) = Item::new(raw, Some(Arc::new(call)));
+        item.patience = Some(self.instant() + Duration::from_micros(PATIENCE));
+        self.set_before = Some(answered);
+        self.after(1_000, Event::BypassesAfter(self.value));
         self.dispatch(Input::Calls(vec![item]));
     }
 
@@ -722,6 +752,8 @@ impl World {
             Event::Breaks => self.breaks(),
             Event::Recovery(event) => self.recovers(event),
             Event::Bypasses => self.bypasses(),
+            Event::SetsBefore => return self.sets_before(),
+            Event::BypassesAfter(value) => self.bypasses_after(value),
             Event::NodeRestarts => self.node_restarts(),
             Event::Compares => {
                 self.after(COMPARE_WITHIN, Event::Compares);
@@ -867,6 +899,13 @@ impl World {
     }
 }
 
+/// The call of a client that sets the parameter that clients also set directly at the master.
+fn set_bypassed(value: i32) -> Request {
+    let key = format!("/{BYPASSED}");
+    let params = [Value::from("/direct"), key.as_str().into(), value.into()];
+    Request::new(Method::SetParam, params)
+}
+
 /// The first seed from `from` on that breaks promises, and these.
 fn mistake(mutant: Option<Mutant>, from: u64, schedules: u64) -> Option<(u64, Vec<String>)> {
     let stats: &'static Stats = Box::leak(Box::default());
@@ -897,6 +936,12 @@ fn every_promise_holds_while_injections_take_long() {
 }
 
 #[test]
+fn every_promise_holds_when_a_parameter_is_also_set_directly() {
+    let found = mistake(None, SET_BEFORE, 500);
+    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+}
+
+#[test]
 fn late_masters_are_given_what_they_missed() {
     let stats: &'static Stats = Box::leak(Box::default());
     let worlds = (0..100).map(|seed| World::new(seed, stats));
@@ -909,6 +954,7 @@ fn late_masters_are_given_what_they_missed() {
 ///   health check has told the state again.
 /// * 817847: a master that was stopped goes on, sends an old notification, and is killed. Subscribers were told the present
 ///   state before.
+/// * 1183284: rosrescue dies while it notifies of a call that the disk does not have.
 /// * 1076138: a late master runs a call that changes nothing, so it does not notify nodes of what rosrescue has left to it.
 #[test]
 fn older_news_is_not_what_nodes_hear_last() {
@@ -933,6 +979,7 @@ fn each_rule_is_needed() {
         (Mutant::ReadsTooEarly, 3_000),
         (Mutant::LeavesBehind, LONG_INJECTIONS),
         (Mutant::ForgetsAnswered, LONG_INJECTIONS),
+        (Mutant::NotesNothingRun, SET_BEFORE),
         (Mutant::AnnouncesNothing, 32_200),
         (Mutant::UndoesDirectChange, 190_870),
         (Mutant::ReadsBeforeRun, 800),
@@ -954,7 +1001,6 @@ fn raw(reply: &Reply) -> RawReply {
         reason: None,
         headers: HeaderMap::new(),
         body: xmlrpc::encode_reply(reply).into(),
-/// * 1183284: rosrescue dies while it notifies of a call that the disk does not have.
     }
 }
 

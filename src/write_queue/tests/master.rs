@@ -180,6 +180,33 @@ impl World {
         }
     }
 
+    /// A client sets a parameter directly at the master if the journal must know that the master has run the call that set
+    /// it to `value`. Then rosrescue dies.
+    pub(super) fn bypasses_after(&mut self, value: i32) {
+        let held = self.master.as_ref();
+        let held = held.and_then(|it| it.state.params().get(BYPASSED)?.as_int());
+        let is_known = held == Some(value)
+            && self.gate().is_open()
+            && self.in_flight.is_none()
+            && !self.is_down;
+        match (is_known, self.set_before.is_some()) {
+            // The master may have run the call just now.
+            (true, true) => {
+                self.set_before = None;
+                self.after(15_000, Event::BypassesAfter(value));
+            }
+            (true, false) if !self.ledger.has_jobs() => {
+                self.bypasses();
+                let time = 5_000 + self.dice.below(50_000);
+                self.after(time, Event::WorkerDies);
+            }
+            (true | false, _) if self.calls_left > 0 => {
+                self.after(2_000, Event::BypassesAfter(value));
+            }
+            _ => {}
+        }
+    }
+
     /// A client sets a parameter directly at the master.
     pub(super) fn bypasses(&mut self) {
         let now = self.now;
@@ -191,14 +218,13 @@ impl World {
         }
         self.value += 1;
         let (value, life) = (self.value, self.life);
-        let key = format!("/{BYPASSED}");
-        let params = [Value::from("/direct"), key.as_str().into(), value.into()];
-        master.state.apply(&Request::new(Method::SetParam, params));
-        self.print(|| format!("a client sets {key} to {value} at the master"));
+        let call = set_bypassed(value);
+        master.state.apply(&call);
+        self.print(|| format!("at the master, a client calls {call:?}"));
         // The parameter is given back its first value if it was set again after that was read.
         let is_second =
-            self.gate().is_injecting() && std::mem::replace(&mut self.bypassed_in_injection, true);
-        self.injection_broke |= is_second;
+            !self.gate().is_open() && std::mem::replace(&mut self.bypassed_before_open, true);
+        self.injection_broke |= is_second && self.gate().is_injecting();
         self.bypassed = (!self.injection_broke).then_some((value, life));
         let time = self.dice.below(COMPARE_WITHIN);
         self.after(time, Event::Compares);

@@ -325,7 +325,7 @@ impl World {
                 self.ledger.open_gate();
                 self.recovery.owed_told = false;
                 self.injection_broke = false;
-                self.bypassed_in_injection = false;
+                self.bypassed_before_open = false;
             }
             Action::Spawn => {
                 self.start_master();
