@@ -29,7 +29,7 @@ use tokio::{
 };
 
 use self::{
-    batch::{CallAnswer, Item, Precondition},
+    batch::{CallAnswer, Item, MadeBy, Precondition},
     dispatcher::Dispatcher,
 };
 pub(crate) use self::{dispatcher::PATIENCE, drain::Drain, evict::MoveJudge};
@@ -84,8 +84,8 @@ impl WriteQueue {
     }
 
     async fn call_own(&self, call: Request, condition: Option<Precondition>) -> Option<Reply> {
-        let (mut item, answered) = Item::new(None, Some(Arc::new(call)));
-        item.condition = condition;
+        let made_by = MadeBy::Rosrescue(condition);
+        let (item, answered) = Item::new(made_by, Some(Arc::new(call)));
         self.items.send(item).await.ok()?;
         match answered.await.ok()?.0 {
             CallAnswer::Made(reply) => Some(reply),

@@ -504,9 +504,9 @@ impl Calls {
         hold: &mut Hold,
     ) -> Result<AnswerAndDelivery, Unanswered> {
         let is_answerable = call.as_deref().is_some_and(Request::is_answerable);
-        let (mut item, answered) = Item::new(Some((head, body)), call);
-        (item.source, item.origin) = (incoming.source, incoming.origin);
-        item.patience = Some(self.patience().into_std());
+        let patience = Some(self.patience().into_std());
+        let (item, answered) = Item::of_client((head, body), call, patience);
+        let item = item.came_from(incoming.source, incoming.origin);
         self.write_queue.submit(item).await;
         let mut gate = self.gate.clone();
         let held = async {

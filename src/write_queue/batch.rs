@@ -38,35 +38,55 @@ pub(crate) enum CallAnswer {
     Elsewhere,
 }
 
+/// A call in the write queue.
 #[derive(Debug)]
 pub(crate) struct Item {
-    /// The client's bytes. `None` for a call made by rosrescue.
-    pub raw: Option<(Head, Bytes)>,
     /// The call. `None` if the bytes could not be decoded.
-    pub call: Option<Arc<Request>>,
-    /// Where the answer goes. `None` once the call has been answered while its batch is still in flight.
-    caller: Option<Caller>,
+    pub(super) call: Option<Arc<Request>>,
+    pub(super) made_by: MadeBy,
+    answer_to: AnswerTo,
     /// The topics, parameters and node names that the call concerns, for the order in which nodes hear of them.
     concern: Concern,
     /// Tracks the answer on its way to the caller. Set once the call is on its way to the master, or the mirror has
     /// answered it.
-    pub delivery: Option<Delivery>,
-    /// For a call made by rosrescue: the condition under which the call is still wanted.
-    pub condition: Option<Precondition>,
+    pub(super) delivery: Option<Delivery>,
     /// Whether nodes whose port the call takes have been unregistered.
-    pub way_made: bool,
-    pub source: Source,
-    /// Who made the call.
-    pub origin: Origin,
-    /// Set for the writes of a computer that was cut off.
-    pub(super) merge: Option<Merge>,
-    /// When the mirror answers the call if it changes nothing and the master has not answered. `None` if the mirror has
-    /// been asked already.
-    pub patience: Option<Instant>,
-    /// Set for a call that unregisters dead nodes before another one.
-    pub(super) evicted: Option<Evicted>,
-    /// The mirror's answer, if the caller has got it before the master has run the call.
-    pub(super) first: Option<First>,
+    pub(super) way_made: bool,
+    pub(super) source: Source,
+    /// Who made the call, for the log.
+    pub(super) origin: Origin,
+}
+
+/// Who made a call, and what only such calls have.
+#[derive(Debug)]
+pub(super) enum MadeBy {
+    Client {
+        /// The client's bytes.
+        request: (Head, Bytes),
+        /// When the mirror answers the call if it changes nothing and the master has not answered. `None` if the mirror
+        /// has been asked already.
+        patience: Option<Instant>,
+    },
+    /// A computer that was cut off.
+    CutOff {
+        /// The writes that conflict with nothing.
+        request: (Head, Bytes),
+        merge: Merge,
+    },
+    /// rosrescue. The call is wanted as long as the condition holds.
+    Rosrescue(Option<Precondition>),
+    /// rosrescue, to unregister dead nodes before another call.
+    Eviction(Evicted),
+}
+
+/// Where the master's answer goes.
+#[derive(Debug)]
+enum AnswerTo {
+    Caller(Caller),
+    /// To nobody: the caller has got the mirror's answer before the master has run the call. The two are compared.
+    Comparison(First),
+    /// To nobody: the caller has got the mirror's answer while the batch was in flight.
+    Nobody,
 }
 
 /// The mirror's answer to a call that the master must still run.
@@ -119,29 +139,60 @@ impl Precondition {
 }
 
 impl Item {
-    /// Creates an item for a client's call, or without `raw` for a call made by rosrescue. Also returns the receiver of
-    /// its answer.
-    pub(crate) fn new(
-        raw: Option<(Head, Bytes)>,
+    /// Creates an item for a client's call. Also returns the receiver of its answer.
+    pub(crate) fn of_client(
+        request: (Head, Bytes),
+        call: Option<Arc<Request>>,
+        patience: Option<Instant>,
+    ) -> (Self, oneshot::Receiver<AnswerAndDelivery>) {
+        Self::new(MadeBy::Client { request, patience }, call)
+    }
+
+    /// Creates an item. Also returns the receiver of its answer.
+    pub(super) fn new(
+        made_by: MadeBy,
         call: Option<Arc<Request>>,
     ) -> (Self, oneshot::Receiver<AnswerAndDelivery>) {
         let (answer, answered) = oneshot::channel();
         let item = Self {
             concern: Concern::of_call(call.as_deref()),
-            raw,
             call,
-            caller: Some(Caller(answer)),
+            made_by,
+            answer_to: AnswerTo::Caller(Caller(answer)),
             delivery: None,
-            condition: None,
             way_made: false,
             source: Source::Here,
             origin: Origin::Rosrescue,
-            merge: None,
-            patience: None,
-            evicted: None,
-            first: None,
         };
         (item, answered)
+    }
+
+    /// Sets from where the call came.
+    pub(crate) fn came_from(mut self, source: Source, origin: Origin) -> Self {
+        (self.source, self.origin) = (source, origin);
+        self
+    }
+
+    /// The bytes to send. `None` for a call made by rosrescue.
+    pub(super) fn request(&self) -> Option<&(Head, Bytes)> {
+        match &self.made_by {
+            MadeBy::Client { request, .. } | MadeBy::CutOff { request, .. } => Some(request),
+            MadeBy::Rosrescue(_) | MadeBy::Eviction(_) => None,
+        }
+    }
+
+    /// See [`MadeBy::Client`].
+    pub(super) fn patience(&self) -> Option<Instant> {
+        match &self.made_by {
+            MadeBy::Client { patience, .. } => *patience,
+            _ => None,
+        }
+    }
+
+    pub(super) fn set_patience(&mut self, until: Option<Instant>) {
+        if let MadeBy::Client { patience, .. } = &mut self.made_by {
+            *patience = until;
+        }
     }
 
     /// Whether the mirror can answer the call.
@@ -151,9 +202,9 @@ impl Item {
 
     /// The call, if the mirror can answer it. It cannot if rosmaster would refuse the path of the request.
     pub(super) fn answerable(&self) -> Option<&Request> {
-        let raw = self.raw.as_ref();
         let call = self.call.as_deref().filter(|call| call.is_answerable())?;
-        raw.is_none_or(|(head, _)| head.may_be_for_rpc())
+        self.request()
+            .is_none_or(|(head, _)| head.may_be_for_rpc())
             .then_some(call)
     }
 
@@ -169,31 +220,53 @@ impl Item {
 
     pub(super) fn reply(self, answer: CallAnswer) {
         self.log_eviction(&answer);
-        if let Some(caller) = self.caller {
+        if let AnswerTo::Caller(caller) = self.answer_to {
             caller.reply(answer, self.delivery);
         }
     }
 
     /// Takes the caller, who gets an answer before the master's.
     pub(super) fn take_caller(&mut self) -> Option<Caller> {
-        self.caller.take()
+        match std::mem::replace(&mut self.answer_to, AnswerTo::Nobody) {
+            AnswerTo::Caller(caller) => Some(caller),
+            other => {
+                self.answer_to = other;
+                None
+            }
+        }
     }
 
     /// Whether the answer is no longer awaited: the call is answered, or its client has disconnected.
     pub(super) fn is_dropped(&self) -> bool {
-        let caller = self.caller.as_ref();
-        let is_kept = self.evicted.is_some() || self.is_answered_first();
-        !is_kept && caller.is_none_or(|caller| caller.0.is_closed())
+        let is_dropped = match &self.answer_to {
+            AnswerTo::Caller(caller) => caller.0.is_closed(),
+            AnswerTo::Comparison(_) => false,
+            AnswerTo::Nobody => true,
+        };
+        is_dropped && !matches!(self.made_by, MadeBy::Eviction(_))
     }
 
-    /// Whether the caller has got the mirror's answer, and the master must still run the call.
+    /// The mirror's answer, if the caller has got it and the master must still run the call.
+    pub(super) fn first(&self) -> Option<&First> {
+        match &self.answer_to {
+            AnswerTo::Comparison(first) => Some(first),
+            _ => None,
+        }
+    }
+
+    /// Notes that the caller has got the mirror's answer, and the master must still run the call.
+    pub(super) fn set_first(&mut self, first: First) {
+        self.set_patience(None);
+        self.answer_to = AnswerTo::Comparison(first);
+    }
+
     pub(super) fn is_answered_first(&self) -> bool {
-        self.first.is_some()
+        self.first().is_some()
     }
 
     /// Logs the nodes that the call has unregistered, if it is an eviction and `answer` answers it.
     pub(super) fn log_eviction(&self, answer: &CallAnswer) {
-        if let Some(Evicted { nodes, by }) = &self.evicted
+        if let MadeBy::Eviction(Evicted { nodes, by }) = &self.made_by
             && matches!(answer, CallAnswer::Raw(_) | CallAnswer::Made(_))
         {
             tracing::info!(
@@ -207,7 +280,7 @@ impl Item {
     /// Whether the call must stay behind all calls that were queued before it. A call that cannot be decoded may change
     /// anything, and a call by rosrescue was decided from the effects of earlier calls.
     fn is_last(&self) -> bool {
-        self.raw.is_none() || self.call.is_none()
+        self.request().is_none() || self.call.is_none()
     }
 
     /// Method and caller id, for messages.
@@ -226,12 +299,12 @@ impl Item {
             let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
             !shows && call.kind().mutates()
         };
-        let plain = self.raw.as_ref().is_none_or(|(head, _)| head.is_for_rpc());
+        let plain = self.request().is_none_or(|(head, _)| head.is_for_rpc());
         plain && self.call.as_ref().is_some_and(shareable)
     }
 
     fn weight(&self) -> usize {
-        self.raw.as_ref().map_or(0, |(_, body)| body.len())
+        self.request().map_or(0, |(_, body)| body.len())
     }
 }
 
@@ -267,7 +340,7 @@ pub(crate) fn pack(
             true => None,
             false => order.must_wait(now, &item.concern),
         };
-        if let Some(First { latest, .. }) = &item.first
+        if let Some(First { latest, .. }) = item.first()
             && !Mutant::Overtakes.lives()
         {
             // The journal takes all writes before one that the master has run for run, so nothing overtakes this one.
@@ -310,14 +383,10 @@ pub(crate) fn pack(
 
 /// The request for `items`. For a single call, the client's own bytes.
 pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
-    if let [
-        Item {
-            raw: Some((head, body)),
-            ..
-        },
-    ] = items
+    if let [item] = items
+        && let Some(request) = item.request()
     {
-        return (head.clone(), body.clone());
+        return request.clone();
     }
     let calls = items.iter().filter_map(|item| item.call.as_deref());
     let body = match items {

@@ -12,7 +12,7 @@ use bytes::Bytes;
 
 use super::{
     MoveJudge,
-    batch::{self, Batch, CallAnswer, Caller, First, Item},
+    batch::{self, Batch, CallAnswer, Caller, First, Item, MadeBy},
     evict, merge,
     outdated::is_outdated,
     resync::ResyncSchedule,
@@ -309,7 +309,7 @@ impl Dispatcher {
             Exchange::InFlight(batch) => batch.grace,
             Exchange::Lost | Exchange::LateEnded => None,
         };
-        let impatient = self.waiting().filter_map(|item| item.patience).min();
+        let impatient = self.waiting().filter_map(Item::patience).min();
         let others = [
             self.held_until,
             self.late_at,
@@ -344,7 +344,7 @@ impl Dispatcher {
     fn arrive(&mut self, view: &View, items: Vec<Item>) {
         for mut item in items {
             let is_answered = view.gate == State::Frozen
-                && item.patience.is_some()
+                && item.patience().is_some()
                 && self.answer_if_unchanged(view.now, &mut item);
             if !is_answered {
                 if self.may_answer_first(view, &item) {
@@ -376,8 +376,7 @@ impl Dispatcher {
             && !is_behind
             && !self.queue.iter().any(waits)
             && self.opaque.answers.is_empty()
-            && item.raw.as_ref().is_some_and(|(head, _)| head.is_for_rpc())
-            && item.merge.is_none()
+            && matches!(&item.made_by, MadeBy::Client { request: (head, _), .. } if head.is_for_rpc())
             && item.answerable().is_some_and(|call| {
                 let judge = &self.judge;
                 self.ledger
@@ -408,8 +407,7 @@ impl Dispatcher {
         if registers {
             self.judge.note_registration();
         }
-        item.patience = None;
-        item.first = Some(First {
+        item.set_first(First {
             reply: reply.clone(),
             seq,
             latest: now + FIRST_WAITS,
@@ -429,7 +427,7 @@ impl Dispatcher {
         }
         let (ledger, before) = (&self.ledger, self.queue.len());
         self.queue.retain(|item| {
-            if let Some(First { seq, .. }) = &item.first {
+            if let Some(First { seq, .. }) = item.first() {
                 ledger.note_left_out(*seq, item.concern());
             }
             !item.is_answered_first()
@@ -451,7 +449,7 @@ impl Dispatcher {
                 reply: predicted,
                 seq,
                 ..
-            } = item.first.as_ref()?;
+            } = item.first()?;
             Some(Acknowledged {
                 seq: *seq,
                 concern: item.concern(),
@@ -472,7 +470,7 @@ impl Dispatcher {
     /// Answers the calls whose patience has ended, if they change nothing. A call that the master has answered already
     /// is not among them: only its answer still waits for the disk.
     fn answer_unchanged(&mut self, view: &View) {
-        let is_due = |item: &Item| item.patience.is_some_and(|at| at <= view.now);
+        let is_due = |item: &Item| item.patience().is_some_and(|at| at <= view.now);
         if !self.waiting().any(is_due) {
             return;
         }
@@ -491,10 +489,10 @@ impl Dispatcher {
             }
             if !view.gate.is_open() {
                 // The gate may open later, and the master behind it may hang.
-                item.patience = Some(view.now + PATIENCE);
+                item.set_patience(Some(view.now + PATIENCE));
                 continue;
             }
-            item.patience = None;
+            item.set_patience(None);
             self.actions.push(Action::Report(Report::Slow));
             self.answer_if_unchanged(view.now, item);
         }
@@ -606,7 +604,7 @@ impl Dispatcher {
         let mut is_recorded = false;
         if let [item] = items.as_slice()
             && !item.is_answered_first()
-            && let Some(call) = item.call.as_ref().filter(|_| item.raw.is_some())
+            && let Some(call) = item.call.as_ref().filter(|_| item.request().is_some())
         {
             is_recorded = self.ledger.record_ahead(call, item.origin);
         }
@@ -785,7 +783,7 @@ impl Dispatcher {
             return items;
         };
         let mut length = 1;
-        if first.raw.is_some() && !first.way_made && !first.is_answered_first() {
+        if first.request().is_some() && !first.way_made && !first.is_answered_first() {
             if let Some(call) = first.call.as_deref()
                 && let Some(eviction) = self.judge.judge_move(&ledger, call)
             {
@@ -962,7 +960,7 @@ impl Dispatcher {
         for mut item in items {
             item.delivery = None;
             tells.extend_from_slice(item.concern().notified_subjects());
-            if let Some(First { seq, .. }) = &item.first {
+            if let Some(First { seq, .. }) = item.first() {
                 self.ledger.note_left_out(*seq, item.concern());
                 continue;
             }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use rescue_core::health::Eviction;
 use ros1_master::master::{Master, Request};
 
-use super::batch::{Evicted, Item};
+use super::batch::{Evicted, Item, MadeBy};
 use crate::ledger::Ledger;
 
 /// Judges calls that could make the master shut down an innocent node. By default, it objects to none.
@@ -36,10 +36,9 @@ impl MoveJudge for () {}
 
 /// The call that unregisters the nodes of `eviction`. `by` is the node that takes their port or name.
 pub(super) fn unregistration(eviction: Eviction, by: String) -> Item {
-    let (mut item, _) = Item::new(None, Some(Arc::new(eviction.call)));
-    item.evicted = Some(Evicted {
+    let evicted = Evicted {
         nodes: eviction.nodes,
         by,
-    });
-    item
+    };
+    Item::new(MadeBy::Eviction(evicted), Some(Arc::new(eviction.call))).0
 }

@@ -3,6 +3,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use bytes::Bytes;
 use rescue_core::{
     checkpoint::format::Origin,
     cluster::{
@@ -19,7 +20,7 @@ use ros1_master::{
 };
 use tokio::sync::oneshot;
 
-use super::batch::{self, AnswerAndDelivery, Item};
+use super::batch::{self, AnswerAndDelivery, Item, MadeBy};
 use crate::{ledger::Ledger, upstream::Head};
 
 /// Whether each write of an item conflicts with changes by other computers, as decided last.
@@ -54,30 +55,35 @@ pub(super) fn item(
     origin: Origin,
 ) -> (Item, oneshot::Receiver<AnswerAndDelivery>, Verdicts) {
     let judged = Verdicts::default();
-    let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
-    item.source = Source::Merge(ask.id.clone());
-    item.origin = origin;
-    set_call(&mut item, multicall(&ask.calls));
-    item.merge = Some(Merge {
-        ask,
-        judged: judged.clone(),
-    });
-    (item, answered, judged)
+    let source = Source::Merge(ask.id.clone());
+    let call = multicall(&ask.calls);
+    let made_by = MadeBy::CutOff {
+        request: request(&call),
+        merge: Merge {
+            ask,
+            judged: judged.clone(),
+        },
+    };
+    let (item, answered) = Item::new(made_by, Some(Arc::new(call)));
+    (item.came_from(source, origin), answered, judged)
 }
 
 fn multicall<'a>(calls: impl IntoIterator<Item = &'a Request>) -> Request {
     Request::multicall(calls.into_iter().cloned())
 }
 
-fn set_call(item: &mut Item, call: Request) {
-    item.raw = Some((Head::default(), call.encode().into()));
-    item.call = Some(Arc::new(call));
+fn request(call: &Request) -> (Head, Bytes) {
+    (Head::default(), call.encode().into())
 }
 
 /// Leaves out writes that conflict with changes by other computers. If no write remains, answers the item and returns
 /// `None`.
 pub(super) fn leave_out_conflicts(ledger: &Ledger, mut item: Item) -> Option<Item> {
-    let Some(Merge { ask, judged }) = &item.merge else {
+    let MadeBy::CutOff {
+        request: sent,
+        merge: Merge { ask, judged },
+    } = &mut item.made_by
+    else {
         return Some(item);
     };
     let calls: Vec<&Request> = ask.calls.iter().collect();
@@ -93,6 +99,7 @@ pub(super) fn leave_out_conflicts(ledger: &Ledger, mut item: Item) -> Option<Ite
         return None;
     }
     let call = multicall(runs);
-    set_call(&mut item, call);
+    *sent = request(&call);
+    item.call = Some(Arc::new(call));
     Some(item)
 }

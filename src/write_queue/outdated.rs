@@ -2,17 +2,22 @@
 
 use ros1_master::master::Master;
 
-use super::batch::Item;
+use super::batch::{Item, MadeBy};
 use crate::ledger::{Ledger, activity::Activity};
 
 /// Whether a call made by rosrescue is no longer right. It is outdated if its
 /// [precondition](super::batch::Precondition) no longer holds, or if it would shut a node down that has registered at
 /// another address meanwhile.
 pub(super) fn is_outdated(ledger: &Ledger, item: &Item) -> bool {
-    let Some(call) = item.call.as_deref().filter(|_| item.raw.is_none()) else {
+    let condition = match &item.made_by {
+        MadeBy::Rosrescue(condition) => condition.as_ref(),
+        MadeBy::Eviction(_) => None,
+        MadeBy::Client { .. } | MadeBy::CutOff { .. } => return false,
+    };
+    let Some(call) = item.call.as_deref() else {
         return false;
     };
-    let is_false = item.condition.as_ref().is_some_and(|of| {
+    let is_false = condition.is_some_and(|of| {
         let last_calls = |_: &Master, activity: &mut Activity| activity.last_calls(&of.node);
         !of.holds(call.kind(), ledger.with_activity(last_calls))
     });

@@ -443,9 +443,9 @@ impl World {
             return;
         }
         let body = Bytes::from(call.encode());
-        let raw = Some((Head::default(), body));
-        let (mut item, answered) = Item::new(raw, Some(Arc::new(call.clone())));
-        item.patience = Some(self.instant() + Duration::from_micros(PATIENCE));
+        let patience = Some(self.instant() + Duration::from_micros(PATIENCE));
+        let request = (Head::default(), body);
+        let (mut item, answered) = Item::of_client(request, Some(Arc::new(call.clone())), patience);
         if Mutant::NoOrder.lives() {
             item.forget_concern();
         }
@@ -466,9 +466,9 @@ impl World {
         self.value += 1;
         let call = set_bypassed(self.value);
         self.print(|| format!("a client calls {call:?}"));
-        let raw = Some((Head::default(), Bytes::from(call.encode())));
-        let (mut item, answered) = Item::new(raw, Some(Arc::new(call)));
-        item.patience = Some(self.instant() + Duration::from_micros(PATIENCE));
+        let patience = Some(self.instant() + Duration::from_micros(PATIENCE));
+        let request = (Head::default(), Bytes::from(call.encode()));
+        let (item, answered) = Item::of_client(request, Some(Arc::new(call)), patience);
         self.set_before = Some(answered);
         self.after(1_000, Event::BypassesAfter(self.value));
         self.dispatch(Input::Calls(vec![item]));

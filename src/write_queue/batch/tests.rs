@@ -6,7 +6,7 @@ use crate::{cli::SyncPolicy, ledger::Ledger};
 
 fn item(call: Request) -> Item {
     let body = Bytes::from(call.encode());
-    Item::new(Some((Head::default(), body)), Some(Arc::new(call))).0
+    Item::of_client((Head::default(), body), Some(Arc::new(call)), None).0
 }
 
 #[test]
@@ -118,8 +118,8 @@ fn an_answer_that_its_client_does_not_read_delays_others_only_briefly() {
 #[test]
 fn calls_by_rosrescue_and_undecodable_calls_overtake_nothing() {
     let ledger = ledger();
-    let unreadable = || Item::new(Some((Head::default(), Bytes::new())), None).0;
-    let own = || Item::new(None, Some(Arc::new(set("/x", 1)))).0;
+    let unreadable = || Item::of_client((Head::default(), Bytes::new()), None, None).0;
+    let own = || Item::new(MadeBy::Rosrescue(None), Some(Arc::new(set("/x", 1)))).0;
     for last in [own, unreadable] {
         let calls = [subscribe("/a", "/t"), publish("/b", "/t")];
         let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
@@ -155,8 +155,8 @@ fn calls_that_may_share_are_one_batch_and_keep_their_order() {
 #[test]
 fn a_single_call_goes_out_as_its_own_bytes() {
     let body = Bytes::from_static(b"<methodCall> odd </methodCall>");
-    let mut odd = item(set("/a", 1));
-    odd.raw = Some((Head::default(), body.clone()));
+    let call = Some(Arc::new(set("/a", 1)));
+    let (odd, _) = Item::of_client((Head::default(), body.clone()), call, None);
     assert_eq!(outbound(&[odd]).1, body);
     let (_, both) = outbound(&[item(set("/a", 1)), item(set("/b", 2))]);
     let expected = Request::multicall([set("/a", 1), set("/b", 2)]);

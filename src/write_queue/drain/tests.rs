@@ -86,8 +86,8 @@ impl Served {
     }
 
     async fn submit(&self, call: Request) -> oneshot::Receiver<AnswerAndDelivery> {
-        let raw = Some((Head::default(), Bytes::from_static(b"<methodCall/>")));
-        let (item, answered) = Item::new(raw, Some(Arc::new(call)));
+        let request = (Head::default(), Bytes::from_static(b"<methodCall/>"));
+        let (item, answered) = Item::of_client(request, Some(Arc::new(call)), None);
         self.queue.submit(item).await;
         answered
     }
