@@ -294,9 +294,12 @@ impl Call<'_> {
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
         let seq = seq.unwrap_or(0);
         let epoch = self.others.followed.borrow().epoch;
-        self.others
-            .shown
-            .raise(JournalPosition { epoch, term, seq });
+        self.others.shown.raise(JournalPosition {
+            epoch,
+            term,
+            seq,
+            ..JournalPosition::default()
+        });
         let number = raw.headers.get(peer::ANSWER_HEADER);
         let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
         let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);

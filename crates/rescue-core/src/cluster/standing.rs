@@ -59,6 +59,9 @@ pub struct JournalPosition {
     pub term: u64,
     /// The number of a record in the journal.
     pub seq: u64,
+    /// After etcd has lost its data and before a new journal has been read: the leader's term and the number of the record
+    /// up to which the mirror has the lost journal.
+    pub lost: (u64, u64),
 }
 
 impl JournalPosition {
@@ -84,6 +87,41 @@ impl JournalPosition {
     /// Whether a mirror at this position may answer reads after earlier answers have shown the position `shown`. On one
     /// computer, no read goes back in time.
     pub fn shows(self, shown: Self) -> bool {
-        self >= shown || Mutant::StaleReads.lives()
+        // A new journal has all that its first leader knew, but what is left of the lost one in this mirror may be less.
+        let has_read = (self.term, self.seq) > (0, 0);
+        let has_all = match shown.epoch < self.epoch && !has_read {
+            true => self.lost >= (shown.term, shown.seq),
+            false => self >= shown,
+        };
+        has_all || Mutant::StaleReads.lives()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(epoch: u64, term: u64, seq: u64) -> JournalPosition {
+        JournalPosition {
+            epoch,
+            term,
+            seq,
+            ..JournalPosition::default()
+        }
+    }
+
+    /// Found on real computers: the leader had just started again when the journal was deleted, and it answered writes before
+    /// the others noticed. Their mirrors, which lacked these writes, then answered reads.
+    #[test]
+    fn a_mirror_that_lacks_what_was_shown_of_a_lost_journal_waits_for_the_next_one() {
+        let lost = |term, seq| JournalPosition {
+            lost: (term, seq),
+            ..at(1, 0, 0)
+        };
+        assert!(lost(5, 934).shows(at(0, 5, 934)));
+        assert!(!lost(5, 934).shows(at(0, 5, 939)));
+        assert!(!lost(5, 934).shows(at(0, 6, 0)));
+        assert!(at(1, 7, 1).shows(at(0, 5, 939)));
+        assert!(!lost(5, 934).shows(at(1, 7, 1)));
     }
 }

@@ -189,8 +189,10 @@ impl Member {
                 (self.local.state, self.local.restored) = (journal.state, true);
             }
             // The mirror goes on answering. That of a process which has just started may be older than the new journal.
+            let JournalPosition { term, seq, .. } = self.position;
             self.position = JournalPosition {
                 epoch,
+                lost: self.position.lost.max((term, seq)),
                 ..JournalPosition::default()
             };
         }

@@ -103,13 +103,20 @@ impl Member {
             true => seq.max(self.outgoing.last()),
             false => seq,
         };
-        self.position = JournalPosition { epoch, term, seq };
-        if !lost {
-            self.held = Holdings {
-                journal_number,
-                term,
-                seq,
-            };
+        if lost {
+            // The mirror has what it has of the lost journal until a new one has begun.
+            return;
         }
+        self.position = JournalPosition {
+            epoch,
+            term,
+            seq,
+            lost: (0, 0),
+        };
+        self.held = Holdings {
+            journal_number,
+            term,
+            seq,
+        };
     }
 }

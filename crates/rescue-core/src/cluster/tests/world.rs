@@ -865,5 +865,10 @@ impl World {
 
 fn position(term: u64, seq: u64) -> JournalPosition {
     let epoch = 0;
-    JournalPosition { epoch, term, seq }
+    JournalPosition {
+        epoch,
+        term,
+        seq,
+        ..JournalPosition::default()
+    }
 }
