@@ -71,7 +71,8 @@ fn authority(host: &HeaderValue) -> Option<(String, u16)> {
 
 /// Whether a page of this host can only be one of rosrescue's own.
 fn is_own(host: &str) -> bool {
-    let bare = host.trim_start_matches('[').trim_end_matches(']');
+    // A browser takes an address with a dot at its end for the address, and asks no name server.
     let name = host.strip_suffix('.').unwrap_or(host);
+    let bare = name.trim_start_matches('[').trim_end_matches(']');
     bare.parse::<IpAddr>().is_ok() || name == "localhost" || NAMES.contains(&name)
 }
