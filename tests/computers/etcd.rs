@@ -99,7 +99,12 @@ pub(crate) fn delete_keys(fleet: &Fleet, prefix: &str) {
                 success: vec![etcd_kv::TxnOp::Delete(range)],
                 ..etcd_kv::Txn::default()
             };
-            client.txn(&txn, READ).await.unwrap();
+            // After a failure, etcd may have to elect its leader first.
+            let until = Instant::now() + Duration::from_secs(60);
+            while let Err(error) = client.txn(&txn, READ).await {
+                println!("deleting {prefix}: {error}; trying again");
+                assert!(Instant::now() < until, "etcd does not answer: {error}");
+            }
         });
     });
 }
