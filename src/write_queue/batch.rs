@@ -53,7 +53,7 @@ pub(crate) struct Item {
     /// Whether nodes whose port the call takes have been unregistered.
     pub(super) way_made: bool,
     pub(super) source: Source,
-    /// Who made the call, for the log.
+    /// The address from which the call came, for the log.
     pub(super) origin: Origin,
 }
 

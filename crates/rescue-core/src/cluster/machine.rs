@@ -422,8 +422,9 @@ impl Machine {
         }
     }
 
-    /// Whether etcd has not answered for so long that what it showed last does not count: it may show the same again
-    /// because an older copy was restored. Longer than until a claim, which follows the time to live after the last answer.
+    /// Whether etcd has been silent for so long that this computer must read it before it claims: if an older copy is
+    /// restored meanwhile, etcd shows the leader that this computer knew. Twice the time to live, because a claim
+    /// follows one time to live after the last answer.
     fn is_cut_off_from_etcd(&self, now: Instant) -> bool {
         let long = 2 * self.settings.ttl;
         self.heard.is_some_and(|at| at + long <= now)
@@ -432,8 +433,8 @@ impl Machine {
     /// Handles the keys `leader` and `alive` as etcd shows them.
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         let Settings { ttl, .. } = self.settings;
-        let is_news = view.leader.is_none() && self.heard.is_some_and(|at| at + ttl <= now);
-        if is_news || self.is_cut_off_from_etcd(now) {
+        let was_silent = self.heard.is_some_and(|at| at + ttl <= now);
+        if view.leader.is_none() && was_silent || self.is_cut_off_from_etcd(now) {
             // Others may have led meanwhile, and etcd may have lost their journal, too. They say so now.
             self.hold_claims(now + ttl);
         }

@@ -195,9 +195,10 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 900690: a computer was cut off again while it sent its writes and had not read the new journal. What it answered then was
 /// forgotten.
 /// 1007191: a computer took the answer of a leader that it no longer followed. The simulation did so, not the product.
-/// 3042947 and 10022831: a computer that had been cut off from etcd since before the copy was made claimed as soon as etcd had that copy.
-/// 10053294 and 10066558: etcd lost data again before a new journal had begun. A computer that had been cut off meanwhile forgot that
-/// it still held the first one's records, and waited too long for those that had not forgotten it.
+/// 3042947 and 10022831: a computer that had been cut off from etcd since before the copy was made claimed as soon as etcd
+/// had that copy.
+/// 10053294 and 10066558: etcd lost data again before a new journal had begun. A computer that had been cut off meanwhile
+/// forgot that it still held the first one's records, and waited too long for those that had not forgotten it.
 /// 10000346: a leader that had hung took entries of the next leader, which arrived with their deletion, for its own.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.

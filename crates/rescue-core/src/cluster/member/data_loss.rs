@@ -188,7 +188,8 @@ impl Member {
             if !journal.own_wins && journal.progress.seq > 0 {
                 (self.local.state, self.local.restored) = (journal.state, true);
             }
-            // The mirror goes on answering. That of a process which has just started may be older than the new journal.
+            // The mirror goes on answering if it has all that was shown. That of a process which has just started may be
+            // older than the new journal.
             let JournalPosition { term, seq, .. } = self.position;
             self.position = JournalPosition {
                 epoch,

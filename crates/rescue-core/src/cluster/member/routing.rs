@@ -79,11 +79,14 @@ impl Member {
             // What the checkpoint holds still counts.
             return;
         }
+        if self.data_loss.since().is_some() {
+            // The mirror has what it has of the lost journal until a new one has begun.
+            return;
+        }
         let seq = self.journal.progress.seq;
         // If `differs`, the mirror is at no position of the journal: it holds records or kept writes that the journal
         // lacks.
-        let lost = self.data_loss.since().is_some();
-        let differs = self.local.seq > seq || lost || !self.cut_off.is_empty();
+        let differs = self.local.seq > seq || !self.cut_off.is_empty();
         if self.journal.own_wins && differs && !self.records() {
             return;
         }
@@ -103,10 +106,6 @@ impl Member {
             true => seq.max(self.outgoing.last()),
             false => seq,
         };
-        if lost {
-            // The mirror has what it has of the lost journal until a new one has begun.
-            return;
-        }
         self.position = JournalPosition {
             epoch,
             term,
