@@ -64,6 +64,12 @@ impl DataLoss {
         left && !Mutant::BelievesOldCopy.lives()
     }
 
+    /// Whether `view` shows a journal that began after the loss.
+    pub(super) fn is_made_good_by(&self, view: &View) -> bool {
+        self.present
+            .is_some_and(|loss| view.journal_number > loss.holds.journal_number)
+    }
+
     /// The origin of the journal that this computer could not read, for its member entry.
     pub(super) fn unreadable(&self) -> u64 {
         self.unreadable

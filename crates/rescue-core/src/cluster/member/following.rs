@@ -345,6 +345,13 @@ impl Member {
                 self.machine.hold_claims(now + self.settings().ttl);
             }
         } else {
+        // All of a journal that began after a loss is newer than what this computer kept. Comparing states would not show
+        // a value that others have set and set back.
+        let is_new_journal = first && self.data_loss.is_made_good_by(&read.view);
+        let of_others = match is_new_journal {
+            true => read.records.clone(),
+            false => Vec::new(),
+        };
             self.see(now, read.view.clone());
         }
         let journal = &mut self.journal;
@@ -375,6 +382,7 @@ impl Member {
         }
         // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
         // without a state says nothing of what others have changed.
+            self.cut_off.note(&of_others);
         if first && !self.journal.is_empty() {
             self.cut_off.note_difference(None, &self.journal.state);
         }
