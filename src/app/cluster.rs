@@ -281,20 +281,18 @@ impl ClusterDriver {
             Action::AnswerFromMirror => ledger.shut_gate(State::StandingIn),
             Action::AnswerNothing => ledger.shut_gate(State::Elsewhere),
             Action::NotifyOwnOnly(own_only) => context.nodes.set_alone(own_only),
-            Action::ReplacePartitionWrites { base, calls } => {
+            Action::ReplacePartitionWrites(writes) => {
                 self.partition_writes
-                    .replace(&context.checkpoint, base, calls)
+                    .replace(&context.checkpoint, writes)
                     .await;
             }
             Action::AddPartitionWrites(calls) => {
                 self.partition_writes.add(calls).await;
                 if self.partition_writes.has_outgrown()
-                    && let Some((base, calls)) = self.member.partition_writes()
+                    && let Some(writes) = self.member.partition_writes()
                 {
                     let path = &self.setup.context.checkpoint;
-                    self.partition_writes
-                        .replace(path, base.clone(), calls)
-                        .await;
+                    self.partition_writes.replace(path, writes).await;
                 }
             }
             Action::DeletePartitionWrites => {

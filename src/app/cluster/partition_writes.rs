@@ -12,12 +12,12 @@ use std::{
 use checkpoint_store::{Store, StoreError, SyncJob, Synced, regular_file};
 use rescue_core::{
     checkpoint::{
-        format::{Checkpoint, RecordContent},
+        format::{Checkpoint, RecordContent, Session},
         session,
     },
-    cluster::cut_off::CutOff,
+    cluster::{member::PartitionWrites, merge::WritesToSend},
 };
-use ros1_master::master::{Master, Request};
+use ros1_master::master::Request;
 
 use crate::{
     ledger::disk_jobs::{DISK_PATIENCE, SILENT},
@@ -50,7 +50,7 @@ fn file_path(checkpoint: &Path) -> PathBuf {
 impl PartitionWritesFile {
     /// Opens the file, and returns the writes that an earlier process left. If the session of that process does not
     /// continue (`goes_on` is false), the file is kept under another name.
-    pub(super) async fn load(checkpoint: &Path, goes_on: bool) -> (Self, CutOff) {
+    pub(super) async fn load(checkpoint: &Path, goes_on: bool) -> (Self, Option<PartitionWrites>) {
         let path = file_path(checkpoint);
         let opened = wait::within(DISK_PATIENCE, move || {
             if let Err(error) = check(&path) {
@@ -79,26 +79,27 @@ impl PartitionWritesFile {
                 return Default::default();
             }
         };
+        let held = loaded.session().map_or(0, |session| session.cluster_seq);
         let base = session::rebuild(loaded.checkpoint, Vec::new()).mirror;
-        let calls = loaded.records.into_iter().filter_map(|record| {
-            let RecordContent::Call { call, .. } = record.entry else {
-                return None;
-            };
-            Some(call)
-        });
-        let left = CutOff::restored(base.clone(), calls);
+        let mut pending = WritesToSend::default();
+        for record in loaded.records {
+            if let RecordContent::Call { call, .. } = record.entry {
+                pending.add(&call);
+            }
+        }
+        let calls: Vec<_> = pending.calls().cloned().collect();
         tracing::info!(
-            calls = left.len(),
+            calls = calls.len(),
             "an earlier process was cut off; its writes are sent to the next leader"
         );
+        let left = PartitionWrites { base, held, calls };
         let mut this = Self::default();
-        let calls = left.calls().cloned().collect();
-        this.write(store, base, calls).await;
-        (this, left)
+        this.write(store, left.clone()).await;
+        (this, Some(left))
     }
 
-    /// Replaces the file's content by `calls`, which were answered since the state was `base`.
-    pub(super) async fn replace(&mut self, checkpoint: &Path, base: Master, calls: Vec<Request>) {
+    /// Replaces the file's content.
+    pub(super) async fn replace(&mut self, checkpoint: &Path, writes: PartitionWrites) {
         let path = file_path(checkpoint);
         let store = match self.store.take() {
             Some(store) => Some(Ok(store)),
@@ -111,19 +112,23 @@ impl PartitionWritesFile {
             }
         };
         match store {
-            Some(Ok(store)) => self.write(store, base, calls).await,
+            Some(Ok(store)) => self.write(store, writes).await,
             Some(Err(error)) => log_unsaved(&error),
             None => log_unsaved(&SILENT),
         }
     }
 
-    async fn write(&mut self, mut store: Store, base: Master, calls: Vec<Request>) {
+    async fn write(&mut self, mut store: Store, writes: PartitionWrites) {
         let checkpoint = Checkpoint {
             seq: store.seq(),
-            snapshot: base.snapshot(),
+            session: Session {
+                cluster_seq: writes.held,
+                ..Session::default()
+            },
+            snapshot: writes.base.snapshot(),
             ..Checkpoint::default()
         };
-        let entries = entries(calls);
+        let entries = entries(writes.calls);
         let write = move || {
             let written = store.begin(&checkpoint);
             let written = written.and_then(|()| store.append(&entries).map(|_| ()));
@@ -261,7 +266,10 @@ fn log_unsaved(error: &dyn std::fmt::Display) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros1_master::{master::Method, xmlrpc::Value};
+    use ros1_master::{
+        master::{Master, Method},
+        xmlrpc::Value,
+    };
 
     fn set(key: &str, value: i32) -> Request {
         let params = [Value::from("/n"), key.into(), value.into()];
@@ -274,13 +282,21 @@ mod tests {
         base
     }
 
-    fn calls(of: &CutOff) -> Vec<Request> {
-        of.calls().cloned().collect()
+    fn writes(calls: Vec<Request>) -> PartitionWrites {
+        PartitionWrites {
+            base: base(),
+            held: 7,
+            calls,
+        }
+    }
+
+    async fn loaded(checkpoint: &Path, goes_on: bool) -> Option<PartitionWrites> {
+        PartitionWritesFile::load(checkpoint, goes_on).await.1
     }
 
     async fn begun(checkpoint: &Path) -> PartitionWritesFile {
         let mut kept = PartitionWritesFile::default();
-        kept.replace(checkpoint, base(), Vec::new()).await;
+        kept.replace(checkpoint, writes(Vec::new())).await;
         kept
     }
 
@@ -302,18 +318,14 @@ mod tests {
         kept.add(vec![set("/b", 2)]).await;
         drop(kept);
         for _ in 0..2 {
-            let (_kept, left) = PartitionWritesFile::load(&checkpoint, true).await;
-            assert!(left.base() == Some(&base()));
-            assert_eq!(calls(&left), [set("/a", 1), set("/b", 2)]);
+            let left = loaded(&checkpoint, true).await.unwrap();
+            assert!(left.base == base());
+            assert_eq!(left.held, 7);
+            assert_eq!(left.calls, [set("/a", 1), set("/b", 2)]);
         }
         PartitionWritesFile::default().remove(&checkpoint).await;
         assert_eq!(files(&checkpoint), [""; 0]);
-        assert!(
-            PartitionWritesFile::load(&checkpoint, true)
-                .await
-                .1
-                .is_empty()
-        );
+        assert!(loaded(&checkpoint, true).await.is_none());
     }
 
     #[tokio::test]
@@ -323,22 +335,12 @@ mod tests {
         let mut kept = begun(&checkpoint).await;
         kept.add(vec![set("/a", 1)]).await;
         drop(kept);
-        assert!(
-            PartitionWritesFile::load(&checkpoint, false)
-                .await
-                .1
-                .is_empty()
-        );
+        assert!(loaded(&checkpoint, false).await.is_none());
         let names = files(&checkpoint);
         assert!(!names.is_empty() && !names.contains(&"chkpt.yaml.alone".to_owned()));
         let text = std::fs::read_to_string(folder.path().join(&names[0])).unwrap();
         assert!(text.contains("before"), "{text}");
-        assert!(
-            PartitionWritesFile::load(&checkpoint, true)
-                .await
-                .1
-                .is_empty()
-        );
+        assert!(loaded(&checkpoint, true).await.is_none());
     }
 
     #[tokio::test]
@@ -347,19 +349,21 @@ mod tests {
         let checkpoint = folder.path().join("chkpt.yaml");
         let mut kept = begun(&checkpoint).await;
         let mut largest = 0;
-        let values = |round| (0..10).map(move |key| set(&format!("/k{key}"), round));
+        let values = |round| -> Vec<_> {
+            let set = |key| set(&format!("/k{key}"), round);
+            (0..10).map(set).collect()
+        };
         for round in 0..300 {
-            kept.add(values(round).collect()).await;
+            kept.add(values(round)).await;
             if kept.has_outgrown() {
-                kept.replace(&checkpoint, base(), values(round).collect())
-                    .await;
+                kept.replace(&checkpoint, writes(values(round))).await;
             }
             let bytes = std::fs::metadata(file_path(&checkpoint)).unwrap().len();
             largest = largest.max(bytes);
         }
         assert!(largest < 3 * FILE_BYTES, "{largest}");
         drop(kept);
-        let (_kept, left) = PartitionWritesFile::load(&checkpoint, true).await;
-        assert_eq!(calls(&left), values(299).collect::<Vec<_>>());
+        let left = loaded(&checkpoint, true).await.unwrap();
+        assert_eq!(left.calls, values(299));
     }
 }

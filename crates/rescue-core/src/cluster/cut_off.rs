@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use crate::{
     checkpoint::format::{Record, RecordContent},
     cluster::{
+        member::PartitionWrites,
         merge::{self, Changes, WritesToSend},
         mutant::Mutant,
         sharing::{Change, Source},
@@ -49,10 +50,10 @@ pub struct CutOff {
 }
 
 impl CutOff {
-    /// Restores what an earlier process left: the state when it was cut off, and the writes answered since.
-    pub fn restored(base: Master, calls: impl IntoIterator<Item = Request>) -> Self {
-        let mut period = Period::new(base);
-        for call in calls {
+    /// Restores what an earlier process left.
+    pub fn restored(left: PartitionWrites) -> Self {
+        let mut period = Period::new(left.base);
+        for call in left.calls {
             if Mutant::GuessesByValues.lives() {
                 period.changes.expect([call.clone()]);
             }

@@ -28,7 +28,7 @@ use crate::{
         standing::{JournalPosition, Standing},
     },
 };
-use ros1_master::master::{Master, Request};
+use ros1_master::master::Master;
 
 mod alone;
 mod chores;
@@ -55,7 +55,7 @@ pub use self::{
     probes::PROBES,
     types::{
         Action, Cause, Evidence, ForwardedWrites, Holdings, Input, LocalCheckpoint, MemberEntry,
-        MemberEntryChange, News, Read, WatchedEntry,
+        MemberEntryChange, News, PartitionWrites, Read, WatchedEntry,
     },
 };
 
@@ -144,21 +144,23 @@ struct Queue {
 }
 
 impl Member {
-    /// Creates a member that waits for [`Input::Begin`]. `cut_off` holds the partition writes of an earlier process.
+    /// Creates a member that waits for [`Input::Begin`]. `left` holds the partition writes of an earlier process.
     /// `id` is the unique name under which partition writes are sent to a leader.
     pub fn new(
         settings: Settings,
         keys: Keys,
         local: LocalCheckpoint,
-        mut cut_off: CutOff,
+        left: Option<PartitionWrites>,
         id: String,
     ) -> Self {
         let known = local.restored;
+        let known_to_hold = left.as_ref().map(|left| left.held).filter(|held| *held > 0);
         let held = Holdings {
             journal_number: local.journal_number,
             term: local.term,
-            seq: local.seq,
+            seq: known_to_hold.unwrap_or(local.seq),
         };
+        let mut cut_off = left.map(CutOff::restored).unwrap_or_default();
         let mut machine = Machine::new(settings);
         machine.note_journal(local.journal_number);
         machine.note_term(local.term);
@@ -311,10 +313,13 @@ impl Member {
         }
     }
 
-    /// The partition writes that have not reached a leader, with the state before them.
-    pub fn partition_writes(&self) -> Option<(&Master, Vec<Request>)> {
-        let base = self.cut_off.base()?;
-        Some((base, self.cut_off.calls().cloned().collect()))
+    /// The partition writes that have not reached a leader.
+    pub fn partition_writes(&self) -> Option<PartitionWrites> {
+        Some(PartitionWrites {
+            base: self.cut_off.base()?.clone(),
+            held: self.held.seq,
+            calls: self.cut_off.calls().cloned().collect(),
+        })
     }
 
     /// This computer's entry among the members.

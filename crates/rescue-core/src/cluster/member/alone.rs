@@ -105,11 +105,8 @@ impl Member {
 
     /// Stores exactly the writes that a leader must still get.
     pub(super) fn store_all_writes(&mut self) {
-        let kept = self
-            .partition_writes()
-            .map(|(base, calls)| (base.clone(), calls));
-        self.act(match kept {
-            Some((base, calls)) => Action::ReplacePartitionWrites { base, calls },
+        self.act(match self.partition_writes() {
+            Some(writes) => Action::ReplacePartitionWrites(writes),
             None => Action::DeletePartitionWrites,
         });
     }

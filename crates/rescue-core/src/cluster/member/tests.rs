@@ -8,7 +8,10 @@ use crate::{
         merge::wire::{Ask, MergeAnswer, WriteOutcome},
     },
 };
-use ros1_master::{master::Method, xmlrpc::Value};
+use ros1_master::{
+    master::{Method, Request},
+    xmlrpc::Value,
+};
 
 /// Record `seq`, in which others set the parameter again.
 fn record(seq: u64) -> Record {
@@ -70,10 +73,13 @@ impl Merges {
             commit: Commit::Always,
             alone: WhenAlone::Serve,
         };
-        let left = CutOff::restored(Master::default(), [set(-1)]);
+        let left = PartitionWrites {
+            calls: vec![set(-1)],
+            ..PartitionWrites::default()
+        };
         let (keys, own) = (Keys::new("robot"), LocalCheckpoint::default());
         Self {
-            member: Member::new(settings, keys, own, left, "a-1".to_owned()),
+            member: Member::new(settings, keys, own, Some(left), "a-1".to_owned()),
             now: Instant::now(),
             inputs: VecDeque::from([Input::Begin]),
             journal: Progress::default(),
@@ -230,7 +236,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
         restored: true,
     };
     let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
-    let mut member = Member::new(settings, keys, own, CutOff::default(), "a-1".to_owned());
+    let mut member = Member::new(settings, keys, own, None, "a-1".to_owned());
     let now = Instant::now();
     let mut followed = |input| {
         let mut actions = member.on(now, input).into_iter();

@@ -38,8 +38,18 @@ pub struct LocalCheckpoint {
     pub term: u64,
     /// See [`View::journal_number`]; of the journal of that term.
     pub journal_number: u64,
-    /// The last record of the journal that the state contains.
+    /// The last record of the journal that the state contains, counted on while this computer was cut off.
     pub seq: u64,
+}
+
+/// Partition writes, as they are stored beside the checkpoint.
+#[derive(Clone, Debug, Default)]
+pub struct PartitionWrites {
+    /// The state before them.
+    pub base: Master,
+    /// The last record of the journal that this computer held. 0 if it is unknown.
+    pub held: u64,
+    pub calls: Vec<Request>,
 }
 
 /// A computer's entry among the members, as JSON at `ROBOT/members/NAME`.
@@ -346,11 +356,8 @@ pub enum Action {
     AnswerNothing,
     /// Notify only this computer's own nodes if true, all nodes if false.
     NotifyOwnOnly(bool),
-    /// Keep exactly these partition writes. `base` is the state before them.
-    ReplacePartitionWrites {
-        base: Master,
-        calls: Vec<Request>,
-    },
+    /// Keep exactly these partition writes.
+    ReplacePartitionWrites(PartitionWrites),
     /// Keep these partition writes, too, until a leader has them.
     AddPartitionWrites(Vec<Request>),
     /// Delete the kept writes, because none is left to send.

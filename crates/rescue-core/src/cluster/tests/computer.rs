@@ -4,10 +4,9 @@ use std::time::{Duration, Instant};
 
 use super::world::ScheduleOptions;
 use crate::cluster::{
-    cut_off::CutOff,
     journal::Keys,
     machine::Settings,
-    member::{LocalCheckpoint, Member},
+    member::{LocalCheckpoint, Member, PartitionWrites},
     merge::wire,
     sharing::{Sharing, Source},
     standing::{JournalPosition, Standing},
@@ -86,7 +85,7 @@ impl Ledger {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Disk {
     pub(super) own: LocalCheckpoint,
-    pub(super) kept: Option<(Master, Vec<Request>)>,
+    pub(super) kept: Option<PartitionWrites>,
 }
 
 #[derive(Debug)]
@@ -157,12 +156,9 @@ fn member(name: &str, index: usize, life: u64, plan: &ScheduleOptions, disk: &Di
         commit: plan.commit,
         alone: plan.alone,
     };
-    let left = match &disk.kept {
-        Some((base, calls)) => CutOff::restored(base.clone(), calls.iter().cloned()),
-        None => CutOff::default(),
-    };
+    let (own, left) = (disk.own.clone(), disk.kept.clone());
     let id = settings.id.clone();
-    Member::new(settings, Keys::new("robot"), disk.own.clone(), left, id)
+    Member::new(settings, Keys::new("robot"), own, left, id)
 }
 
 pub(super) fn uri(index: usize) -> String {

@@ -661,14 +661,14 @@ impl World {
                 self.after(50 * MS, Event::TellAll(at, leadership, None));
             }
             Action::NotifyOwnOnly(own_only) => self.computers[at].own_only = own_only,
-            Action::ReplacePartitionWrites { base, calls } => {
+            Action::ReplacePartitionWrites(writes) => {
                 let computer = &mut self.computers[at];
-                computer.disk.kept = Some((base, calls));
+                computer.disk.kept = Some(writes);
                 computer.synced.kept = computer.disk.kept.clone();
             }
             Action::AddPartitionWrites(calls) => {
-                if let Some((_, kept)) = &mut self.computers[at].disk.kept {
-                    kept.extend(calls);
+                if let Some(kept) = &mut self.computers[at].disk.kept {
+                    kept.calls.extend(calls);
                 }
             }
             Action::DeletePartitionWrites => self.forget_kept(at),

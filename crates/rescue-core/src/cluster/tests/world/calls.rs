@@ -435,9 +435,13 @@ impl World {
     /// Deletes a computer's file of the writes that it answered while it was cut off.
     pub(super) fn forget_kept(&mut self, at: usize) {
         self.computers[at].synced.kept = None;
-        let (_, kept) = self.computers[at].disk.kept.take().unwrap_or_default();
+        let kept = self.computers[at].disk.kept.take().unwrap_or_default();
         for name in (0..KEYS).map(key) {
-            let last = kept.iter().rev().find(|call| call.text(1) == Some(&*name));
+            let last = kept
+                .calls
+                .iter()
+                .rev()
+                .find(|call| call.text(1) == Some(&*name));
             if let Some(call) = last.filter(|call| !self.history.is_settled(call, &self.etcd)) {
                 let what = format!("{at} forgets {call:?}, which no journal has");
                 self.history.breaks(&what);
