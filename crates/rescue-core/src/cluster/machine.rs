@@ -434,15 +434,17 @@ impl Machine {
     fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
         let Settings { ttl, .. } = self.settings;
         let was_silent = self.heard.is_some_and(|at| at + ttl <= now);
-        if view.leader.is_none() && was_silent || self.is_cut_off_from_etcd(now) {
-            // Others may have led meanwhile, and etcd may have lost their journal, too. They say so now.
+        let first = self.observed.is_none();
+        // The keys of an etcd that is not new may have been deleted.
+        let is_bare = view.leader.is_none() && view.revision > 1;
+        if is_bare && (first || was_silent) || self.is_cut_off_from_etcd(now) {
+            // Others may have led meanwhile, and etcd may have lost their journal. They say so now.
             self.hold_claims(now + ttl);
         }
         self.heard = Some(now);
         if view.revision < self.view.revision {
             return;
         }
-        let first = self.observed.is_none();
         let changed = view.guard() != self.view.guard();
         if first || changed {
             self.observed = Some(now);

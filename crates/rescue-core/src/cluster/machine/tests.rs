@@ -150,6 +150,30 @@ fn who_has_not_heard_of_etcd_for_twice_the_time_to_live_reads_first_and_claims_l
     assert!(matches!(op, Op::Claim { .. }), "{op:?}");
 }
 
+/// Its keys may just have been deleted, and this computer may not have read the journal.
+#[test]
+fn who_starts_and_finds_an_etcd_in_use_without_a_leader_claims_after_the_time_to_live() {
+    let first_claim = |revision| {
+        let (mut machine, now) = machine(WhenAlone::Serve);
+        let (number, _) = sent(&machine.on(now, Input::Start(0)));
+        let bare = View {
+            revision,
+            ..View::default()
+        };
+        let answer = EtcdAnswer::Is(bare);
+        let mut actions = machine.on(now, Input::Answer { number, answer });
+        let mut waited = Duration::ZERO;
+        while actions.is_empty() {
+            waited = machine.deadline().unwrap() - now;
+            actions = machine.on(now + waited, Input::Wake);
+        }
+        assert!(matches!(sent(&actions).1, Op::Claim { .. }), "{actions:?}");
+        waited
+    };
+    assert_eq!(first_claim(1), Duration::ZERO);
+    assert_eq!(first_claim(29), TTL);
+}
+
 #[test]
 fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
     let (mut machine, now) = machine(WhenAlone::Serve);

@@ -287,11 +287,13 @@ impl Member {
             return;
         };
         let before = std::mem::take(&mut self.reading.before);
-        // Another journal has begun since, or an older copy has replaced the one that was read. What was read of the earlier
-        // one is no loss.
+        // Another journal has begun since, an older copy has replaced the one that was read, or its leader's key has been
+        // deleted. What was read of the earlier one is no loss.
         let known = self.view();
         let is_late = (before.revision..known.revision).contains(&read.view.revision);
-        let is_other = read.view.origin != known.origin || read.view.seq() > known.seq();
+        let is_deleted = known.leader.is_none() && read.view.leader.is_some();
+        let is_other =
+            read.view.origin != known.origin || read.view.seq() > known.seq() || is_deleted;
         if is_late && is_other {
             self.reading.load_at = Some(now);
             self.reading.check_due |= checks;
@@ -340,11 +342,9 @@ impl Member {
             // This computer may have begun the journal before this read.
             let is_empty = read.view.seq() == 0 && !self.records();
             self.journal.own_wins = own || is_empty || self.data_loss.since().is_some();
-            // etcd is not new, so its keys may just have been deleted. Computers that hold the state say so now.
-            if leader.is_none() && read.view.revision > 1 {
-                self.machine.hold_claims(now + self.settings().ttl);
-            }
         } else {
+            self.see(now, read.view.clone());
+        }
         // All of a journal that began after a loss is newer than what this computer kept. Comparing states would not show
         // a value that others have set and set back.
         let is_new_journal = first && self.data_loss.is_made_good_by(&read.view);
@@ -352,8 +352,6 @@ impl Member {
             true => read.records.clone(),
             false => Vec::new(),
         };
-            self.see(now, read.view.clone());
-        }
         let journal = &mut self.journal;
         let mut is_new_state = first;
         if let Some((state, displaced)) = read.state
@@ -382,9 +380,9 @@ impl Member {
         }
         // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
         // without a state says nothing of what others have changed.
-            self.cut_off.note(&of_others);
         if first && !self.journal.is_empty() {
             self.cut_off.note_difference(None, &self.journal.state);
+            self.cut_off.note(&of_others);
         }
         if is_new_state {
             self.adopt();
