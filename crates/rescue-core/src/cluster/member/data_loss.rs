@@ -194,15 +194,15 @@ impl Member {
             if !journal.own_wins && journal.progress.seq > 0 {
                 (self.local.state, self.local.restored) = (journal.state, true);
             }
-            // The mirror goes on answering if it has all that was shown. That of a process which has just started may be
-            // older than the new journal.
-            let JournalPosition { term, seq, .. } = self.position;
-            self.position = JournalPosition {
-                epoch,
-                lost: self.position.lost.max((term, seq)),
-                ..JournalPosition::default()
-            };
         }
+        // The mirror goes on answering if it has all that was shown. That of a process which has just started may be older
+        // than the new journal.
+        let JournalPosition { term, seq, .. } = self.position;
+        self.position = JournalPosition {
+            epoch,
+            lost: self.position.lost.max((term, seq)),
+            ..JournalPosition::default()
+        };
         self.journal.own_wins = true;
         (self.local.term, self.local.journal_number) = (0, 0);
         self.reading.load_by(now);
