@@ -200,6 +200,17 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 10053294 and 10066558: etcd lost data again before a new journal had begun. A computer that had been cut off meanwhile
 /// forgot that it still held the first one's records, and waited too long for those that had not forgotten it.
 /// 10000346: a leader that had hung took entries of the next leader, which arrived with their deletion, for its own.
+/// 10070719, 10135767, 10142857, 11003001 and 11018319: in a new journal, others set a value and set it back before a former
+/// leader had read it. The comparison of states did not show that, and its older value replaced theirs.
+/// 11019204: after a restart, a computer counted what it had answered while it was cut off as part of the journal. It seemed
+/// to hold the most, and replaced newer writes.
+/// 10077286: a computer that started could not read etcd in time. Then the leader's key was deleted, and this computer
+/// began a new journal without any state.
+/// 10176536: a process that had not read etcd before a loss took what it had shown since for something older, and its reads
+/// went back.
+/// 10102380, 10166911 and 11021318: an older copy went on, because its leader could not know of the loss. The simulation knew
+/// of this case only if that leader had hung.
+/// 12012029: the simulation expected fewer writes to be kept.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -215,7 +226,9 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         58_295, 108_303, 300_094, 304_360, 304_951, 307_899, 309_725, 310_723, 312_806, 315_404,
         400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429, 807_731,
         815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696, 1_007_191,
-        3_042_947, 10_022_831, 10_000_346, 10_053_294, 10_066_558,
+        3_042_947, 10_022_831, 10_000_346, 10_053_294, 10_066_558, 10_070_719, 10_077_286,
+        10_102_380, 10_135_767, 10_142_857, 10_166_911, 10_176_536, 11_003_001, 11_018_319,
+        11_019_204, 11_021_318, 12_012_029,
     ] {
         play_with_data_loss(seed).check();
     }

@@ -123,7 +123,7 @@ pub(super) struct Computer {
     /// The number of the master's process. `None` without a master.
     pub(super) master: Option<u64>,
     pub(super) own_only: bool,
-    /// How often the computer was cut off since it last had no writes to send.
+    /// How often the computer was cut off, or noticed that etcd had lost data, since it last had no writes to send.
     pub(super) times_alone: usize,
     /// How much of the journal the computer held when it was cut off: as a record number, and as a place in the log.
     pub(super) cut: (u64, usize),

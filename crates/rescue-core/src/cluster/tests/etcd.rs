@@ -26,6 +26,8 @@ pub(super) struct Sent {
     pub(super) parts: Vec<Put>,
     pub(super) requires: Option<Evidence>,
     pub(super) sent_at: u64,
+    /// See [`Computer::unaware`](super::computer::Computer::unaware).
+    pub(super) unaware: bool,
     /// When the sender gives up.
     pub(super) until: u64,
 }
@@ -88,7 +90,8 @@ pub(super) struct Etcd {
     pub(super) replaced_at: u64,
     /// Whether an older copy was restored, and no computer has led with it yet or begun a new journal.
     pub(super) is_old: bool,
-    /// The places in the log where a new journal began, or an older one went on, and whether its leader did.
+    /// The places in the log where a new journal began, or an older one went on, and whether its leader could not know of
+    /// the loss.
     pub(super) beginnings: Vec<(usize, bool)>,
 }
 
@@ -294,7 +297,9 @@ impl Etcd {
                 }
                 self.claims.push(sent.from);
                 if std::mem::take(&mut self.is_old) && begins.is_none() {
-                    self.goes_on(false);
+                    // A process that started after the copy was restored, and one whose claim the network held up since
+                    // before that, take it for the journal.
+                    self.goes_on(sent.unaware || sent.sent_at < self.replaced_at);
                 }
                 let of = sent.settings.clone();
                 self.view.leader = Some(Leader {
@@ -394,9 +399,9 @@ impl Etcd {
         seq
     }
 
-    /// Notes that an older journal goes on. `is_resumed` says whether its leader does, which cannot know of the loss.
-    fn goes_on(&mut self, is_resumed: bool) {
-        self.beginnings.push((self.log.len(), is_resumed));
+    /// Notes that an older journal goes on. `is_unaware` says that its leader cannot know of the loss.
+    fn goes_on(&mut self, is_unaware: bool) {
+        self.beginnings.push((self.log.len(), is_unaware));
         self.is_lost = false;
         self.log(Held::State(Box::new(self.state.clone())));
     }

@@ -132,6 +132,8 @@ pub(super) struct History {
 pub(super) struct Beginning {
     /// The place of its first state in the log.
     pub(super) place: usize,
+    /// Whether an older journal went on, with a leader that could not know of the loss.
+    pub(super) is_unaware: bool,
     /// The values that the mirror of each computer had. `None` for a computer that could not say so in time, because it
     /// did not run or did not reach etcd.
     pub(super) knew: Vec<Option<[Option<i32>; KEYS]>>,
@@ -594,7 +596,14 @@ impl History {
                 let entry = first / 1000;
                 let done = read.done.unwrap();
                 let since = done.max(etcd.log[entry].0);
-                let lost = matches!(read.shows, Shows::Early(term) if term != etcd.terms[entry]);
+                let of_other =
+                    matches!(read.shows, Shows::Early(term) if term != etcd.terms[entry]);
+                // The leader may have been deposed, and lead again since an older copy was restored.
+                let is_back = self.beginnings.iter().any(|of| {
+                    let place = of.place;
+                    of.is_unaware && place <= entry && done < etcd.log[place].0
+                });
+                let lost = of_other || read.shows != Shows::Agreed && is_back;
                 if !lost {
                     floors.push(Floor {
                         shown: done,

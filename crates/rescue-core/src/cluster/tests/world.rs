@@ -395,17 +395,18 @@ impl World {
 
     /// Notes what the computers held when a new journal began.
     fn note_beginning(&mut self) {
-        let (place, is_resumed) = self.etcd.beginnings[self.etcd.beginnings.len() - 1];
+        let (place, is_unaware) = self.etcd.beginnings[self.etcd.beginnings.len() - 1];
         let lost_at = self.etcd.lost_at;
         let patience = 3 * self.plan.ttl.as_micros() as u64 + 1000 * MS;
         let knew = self.computers.iter().map(|computer| {
             let until = computer.disturbed_until;
             let could_tell = until <= lost_at || until + patience <= self.now;
             let values = [0, 1, 2, 3].map(|key| value_of(&computer.ledger.mirror, key));
-            (computer.up && could_tell && !is_resumed).then_some(values)
+            (computer.up && could_tell && !is_unaware).then_some(values)
         });
         let beginning = Beginning {
             place,
+            is_unaware,
             knew: knew.collect(),
         };
         self.trace(|| format!("a new journal begins: {beginning:?}"));
@@ -565,6 +566,7 @@ impl World {
                     parts,
                     requires,
                     sent_at: self.now,
+                    unaware: self.computers[at].unaware,
                     until: self.now + ANSWER_LIMIT.as_micros() as u64,
                 };
                 self.send(Box::new(sent));
