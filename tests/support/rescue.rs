@@ -10,6 +10,7 @@ use rosrescue::guardian::handover::TUNABLES;
 
 use super::patience::eventually;
 use super::process::{Process, behind};
+use super::ros::path_with_quick_rosversion;
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 
@@ -41,6 +42,10 @@ impl Setup {
         // under a guardian.
         let (name, value) = TUNABLES;
         command.env(NO_GUARDIAN, "1").env(name, value);
+        // Benchmarks measure what users have.
+        if cfg!(test) {
+            command.env("PATH", path_with_quick_rosversion());
+        }
         // On a busy computer any master is late from time to time. Tests about that set a time themselves.
         command.env("ROSRESCUE_STAND_IN_AFTER", "5000");
         Self {

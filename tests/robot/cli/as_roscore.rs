@@ -31,7 +31,10 @@ fn a_bare_rosrescue_is_a_core_and_prints_what_roscore_prints() {
         let port = free_port();
         let uri = Client::at("localhost", port).uri();
         if is_ours {
+            let path = std::env::var_os("PATH").unwrap();
             let setup = Setup::bare(&scratch, [""; 0]).env("ROS_MASTER_URI", uri);
+            // With the real `rosversion`.
+            let setup = setup.env("PATH", path);
             let _rescue = setup.at_port(port).start();
             return complete(&Client::new(port));
         }
