@@ -1,5 +1,5 @@
-//! The new master dies at every single call of the injection, once or several times in a row. The master that finally
-//! lives has the exact state, whatever happened before, and no node notices.
+//! The new master dies at every single call of the injection. The master that finally lives has the exact state, whatever
+//! happened before, and no node notices. The simulation of the write queue plays several deaths in a row.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,8 +10,8 @@ use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
 use crate::support::{
-    Client, Failing, FakeNode, Forkserver, Library, Mode, Rescue, Robot, Scratch, Setup, State,
-    eventually, eventually_some, free_port, holds, in_both_modes, open_to, params, status,
+    Client, FakeNode, Forkserver, Library, Mode, Rescue, Robot, Scratch, Setup, State, eventually,
+    free_port, holds, in_both_modes, open_to, params, status,
 };
 
 /// Number of calls that a master gets before the injection, to read its state.
@@ -61,12 +61,6 @@ impl Proxied {
         let pid = self.forkserver.start(self.port, "");
         self.await_open(pid);
         pid
-    }
-
-    /// Starts a master that dies for the reasons in `failures`.
-    fn die(&mut self, failures: &str) {
-        let pid = self.forkserver.start(self.port, failures);
-        self.forkserver.wait(pid);
     }
 }
 
@@ -215,28 +209,6 @@ fn a_new_master_may_die_at_every_call_of_the_injection() {
     nodes.assert_no_node_disturbed();
 }
 
-#[test]
-fn new_masters_may_die_in_the_injection_many_times_in_a_row() {
-    let (mut proxied, before, nodes) = proxied_with_state();
-    let mut pid = proxied.bare().master_pid().unwrap();
-    for (number, deaths) in (LOOK + 1..90).step_by(8).zip((3..=7).cycle()) {
-        proxied.forkserver.kill(pid);
-        // Die at the same call each time, or at another one.
-        for death in 0..deaths {
-            let call = match deaths % 2 {
-                0 => number,
-                _ => LOOK + 1 + (number * (death + 1) * 31) % 60,
-            };
-            proxied.die(&format!("call {call}"));
-        }
-        pid = proxied.live();
-        let when = format!("after {deaths} deaths about call {number}");
-        before.assert_same(&State::read(&proxied.bare()), &when);
-        nodes.assert_no_node_disturbed();
-    }
-    nodes.assert_no_node_disturbed();
-}
-
 /// A crash loop of masters that rosrescue did not start is reported too.
 #[test]
 fn a_crash_loop_of_masters_started_by_others_is_reported() {
@@ -261,51 +233,6 @@ fn a_crash_loop_of_masters_started_by_others_is_reported() {
     });
     assert_eq!(status(&client)["open"], true);
     nodes.assert_no_node_disturbed();
-}
-
-/// The state is small, because a core restarts its masters at once only for the first five deaths within a
-/// minute. Of four deaths per core, two are in the injection.
-#[test]
-fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
-    let mut number = 0;
-    loop {
-        let robot = Failing::core(&[]);
-        let client = robot.client();
-        let all = ["/n0", "/n1"].map(FakeNode::start);
-        client.set_param("/p0/q", 1);
-        for node in &all {
-            node.publish(&client, "/topic", "a/B");
-            node.offer(&client, &format!("{}/service", node.name));
-            // Each recovery notifies the first subscriber of the second publisher again.
-            node.subscribe(&client, "/topic", "a/B");
-            node.watch_param(&client, "/p0");
-        }
-        let before = robot.state();
-        let nodes = Nodes::new(all.into(), &before);
-        for deaths in 1..=2 {
-            number += 1;
-            robot
-                .failures
-                .set(&format!("call {number}\ntimes {deaths}"));
-            let pid = robot.kill_master();
-            let survived = eventually_some("the gate is open to another master", || {
-                let now = open_to(&status(&client))?;
-                // The gate may still be open to a master that has just died.
-                let dead = robot.failures.deaths();
-                let lives = now != pid && !dead.contains(&now);
-                lives.then_some(dead.len() < deaths)
-            });
-            nodes.assert_no_node_disturbed();
-            if survived {
-                println!("{} calls in an injection", number - 1);
-                // Parameters, two registrations of each kind, what is read back, and the token.
-                assert!(number > 10, "the injection had only {number} calls");
-                return;
-            }
-            let when = format!("after a death at call {number}");
-            before.assert_same(&robot.state(), &when);
-        }
-    }
 }
 
 /// Number of calls that a new master gets for each of the states below, until it has answered the last one that reads
