@@ -273,6 +273,7 @@ impl Member {
         }
     }
 
+    /// Handles a read of etcd. `None` if it failed.
     pub(super) fn loaded(&mut self, now: Instant, read: Option<Read>) {
         self.reading.loading = false;
         // A read that began before `refresh` was called does not count, whether it failed or not.
@@ -281,20 +282,13 @@ impl Member {
             self.reading.fresh = Some(1);
         }
         let checks = std::mem::take(&mut self.reading.checks);
-        let Some(mut read) = read else {
+        let Some(read) = read else {
             self.reading.load_at = Some(now + AGAIN);
             self.reading.check_due |= checks;
             return;
         };
         let before = std::mem::take(&mut self.reading.before);
-        // Another journal has begun since, an older copy has replaced the one that was read, or its leader's key has been
-        // deleted. What was read of the earlier one is no loss.
-        let known = self.view();
-        let is_late = (before.revision..known.revision).contains(&read.view.revision);
-        let is_deleted = known.leader.is_none() && read.view.leader.is_some();
-        let is_other =
-            read.view.origin != known.origin || read.view.seq() > known.seq() || is_deleted;
-        if is_late && is_other {
+        if self.is_late(&before, &read.view) {
             self.reading.load_at = Some(now);
             self.reading.check_due |= checks;
             return;
@@ -303,6 +297,35 @@ impl Member {
         if self.has_lost(&read.view, &before, read.is_readable) {
             return self.start_over(now, &read.view);
         }
+        let Some(read) = self.usable(now, read, checks) else {
+            return;
+        };
+        if !earlier {
+            self.reading.fresh = self.reading.fresh.map(|_| 0);
+        }
+        if !self.reading.watching {
+            self.reading.watching = true;
+            self.act(Action::Watch(read.view.clone()));
+        }
+        match std::mem::replace(&mut self.reading.loaded, true) {
+            false => self.take_first(now, read),
+            true => self.take_later(now, read),
+        }
+        self.discard_own_state();
+    }
+
+    /// Whether a read that began when etcd had shown `before` says nothing: another journal has begun since, an older copy
+    /// has replaced the one that was read, or its leader's key has been deleted. What was read of the earlier one is no
+    /// loss.
+    fn is_late(&self, before: &View, read: &View) -> bool {
+        let known = self.view();
+        let is_deleted = known.leader.is_none() && read.leader.is_some();
+        let is_other = read.origin != known.origin || read.seq() > known.seq() || is_deleted;
+        (before.revision..known.revision).contains(&read.revision) && is_other
+    }
+
+    /// What counts of a read that shows no loss. `None` if another read must follow first.
+    fn usable(&mut self, now: Instant, mut read: Read, checks: bool) -> Option<Read> {
         // Without its origin, what can be read is left of a lost journal.
         if self.data_loss.is_remainder(&read.view) || read.view.origin == 0 {
             read = Read {
@@ -312,7 +335,8 @@ impl Member {
         } else if !read.is_readable {
             // The leader of this journal repairs it.
             self.reading.load_at = Some(now + AGAIN);
-            return self.see(now, read.view);
+            self.see(now, read.view);
+            return None;
         } else if checks {
             // The records are known.
             (read.state, read.records) = (None, Vec::new());
@@ -321,41 +345,79 @@ impl Member {
         }
         if self.reading.is_doubtful {
             self.reading.load_at = Some(now);
-            return;
+            return None;
         }
-        if !earlier {
-            self.reading.fresh = self.reading.fresh.map(|_| 0);
+        Some(read)
+    }
+
+    /// Takes the first read since the start, or since a loss of etcd's data.
+    fn take_first(&mut self, now: Instant, read: Read) {
+        if self.namesake.watch.is_none() {
+            self.begin_watch_for_namesake(now, &read.view);
         }
-        if !self.reading.watching {
-            self.reading.watching = true;
-            self.act(Action::Watch(read.view.clone()));
-        }
-        let first = !std::mem::replace(&mut self.reading.loaded, true);
-        if first {
-            if self.namesake.watch.is_none() {
-                self.begin_watch_for_namesake(now, &read.view);
-            }
-            // etcd's journal is the truth. The checkpoint counts only if it continues that journal in the same term.
-            let leader = read.view.leader.as_ref();
-            let whole = self.is_whole(read.view.seq());
-            let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
-            // This computer may have begun the journal before this read.
-            let is_empty = read.view.seq() == 0 && !self.records();
-            self.journal.own_wins = own || is_empty || self.data_loss.since().is_some();
-        } else {
-            self.see(now, read.view.clone());
-        }
+        // etcd's journal is the truth. The checkpoint counts only if it continues that journal in the same term.
+        let leader = read.view.leader.as_ref();
+        let whole = self.is_whole(read.view.seq());
+        let own = leader.is_none_or(|leader| self.was_self(leader) && whole);
+        // This computer may have begun the journal before this read.
+        let is_empty = read.view.seq() == 0 && !self.records();
+        self.journal.own_wins = own || is_empty || self.data_loss.since().is_some();
         // All of a journal that began after a loss is newer than what this computer kept. Comparing states would not show
         // a value that others have set and set back.
-        let is_new_journal = first && self.data_loss.is_made_good_by(&read.view);
-        let of_others = match is_new_journal {
+        let of_others = match self.data_loss.is_made_good_by(&read.view) {
             true => read.records.clone(),
             false => Vec::new(),
         };
+        let Read {
+            view,
+            state,
+            records,
+            progress,
+            ..
+        } = read;
         let journal = &mut self.journal;
-        let mut is_new_state = first;
-        if let Some((state, displaced)) = read.state
-            && read.progress.seq >= journal.progress.seq
+        let is_taken = match state {
+            Some((state, displaced)) if progress.seq >= journal.progress.seq => {
+                journal.state = state;
+                journal.displaced.add(now, displaced);
+                journal.apply(now, &records);
+                journal.progress = progress;
+                true
+            }
+            _ => {
+                let new = journal.progress.take(records, 0);
+                new.map(|new| journal.apply(now, &new)).is_ok()
+            }
+        };
+        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
+        // without a state says nothing of what others have changed.
+        if !journal.is_empty() {
+            self.cut_off.note_difference(None, &journal.state);
+            self.cut_off.note(&of_others);
+        }
+        if is_taken {
+            self.adopt();
+        }
+        let watch = self.namesake.watch.as_ref();
+        if watch.is_none_or(|of| of.is_over(now)) {
+            self.start(now);
+        }
+        self.see(now, view);
+    }
+
+    /// Takes a read that continues an earlier one.
+    fn take_later(&mut self, now: Instant, read: Read) {
+        let Read {
+            view,
+            state,
+            records,
+            progress,
+            ..
+        } = read;
+        self.see(now, view);
+        let journal = &mut self.journal;
+        if let Some((state, displaced)) = state
+            && progress.seq >= journal.progress.seq
         {
             let before = std::mem::replace(&mut journal.state, state);
             // The first state of a new journal comes from the computer that held the most.
@@ -363,42 +425,15 @@ impl Member {
                 true => &self.local.state,
                 false => &before,
             };
-            if !first {
-                self.cut_off.note_difference(Some(before), &journal.state);
-                self.cut_off.note(&read.records);
-            }
+            self.cut_off.note_difference(Some(before), &journal.state);
+            self.cut_off.note(&records);
             journal.displaced.add(now, displaced);
-            journal.apply(now, &read.records);
-            journal.progress = read.progress;
-            is_new_state = true;
-        } else {
-            match journal.progress.take(read.records, 0) {
-                Ok(new) if first => self.journal.apply(now, &new),
-                Ok(new) => self.follow(now, &new),
-                Err(_) => is_new_state = false,
-            }
-        }
-        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
-        // without a state says nothing of what others have changed.
-        if first && !self.journal.is_empty() {
-            self.cut_off.note_difference(None, &self.journal.state);
-            self.cut_off.note(&of_others);
-        }
-        if is_new_state {
+            journal.apply(now, &records);
+            journal.progress = progress;
             self.adopt();
+        } else if let Ok(new) = journal.progress.take(records, 0) {
+            self.follow(now, &new);
         }
-        if first {
-            if self
-                .namesake
-                .watch
-                .as_ref()
-                .is_none_or(|of| of.is_over(now))
-            {
-                self.start(now);
-            }
-            self.see(now, read.view);
-        }
-        self.discard_own_state();
     }
 
     /// Starts the machine, unless it has started already.
