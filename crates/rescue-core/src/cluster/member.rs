@@ -158,7 +158,8 @@ impl Member {
         let held = Holdings {
             journal_number: local.journal_number,
             term: local.term,
-            seq: known_to_hold.unwrap_or(local.seq),
+            // The file may be of a journal before the checkpoint's.
+            seq: known_to_hold.map_or(local.seq, |held| held.min(local.seq)),
         };
         let mut cut_off = left.map(CutOff::restored).unwrap_or_default();
         let mut machine = Machine::new(settings);
