@@ -625,7 +625,7 @@ impl Ledger {
         if !inner.pending.calls().is_empty() || inner.acknowledged > 0 {
             inner.pending.clear();
             inner.acknowledged = 0;
-            inner.session.delivered = inner.seq();
+            inner.session.delivered = inner.seq;
             inner.session_unwritten = true;
         }
         inner.write_session();

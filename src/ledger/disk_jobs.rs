@@ -33,8 +33,6 @@ type Job = Box<dyn FnOnce(&mut Store) + Send>;
 /// The ledger's access to the store. No method waits for the disk.
 pub(super) struct Journal {
     shared: Arc<StoreQueue>,
-    /// Number of the journal's last entry, whether or not it was written.
-    seq: u64,
     /// Whether entries are passed to the store. False after the disk was silent, until the next complete checkpoint.
     gives: bool,
 }
@@ -206,7 +204,6 @@ impl Journal {
         shared.reach(seq);
         Self {
             shared: Arc::new(shared),
-            seq,
             gives: true,
         }
     }
@@ -214,11 +211,6 @@ impl Journal {
     /// The handle with which a thread runs the jobs.
     pub(super) fn worker(&self) -> Arc<StoreQueue> {
         Arc::clone(&self.shared)
-    }
-
-    /// Number of the journal's last entry, whether or not it was written.
-    pub(super) fn seq(&self) -> u64 {
-        self.seq
     }
 
     /// The store's state after its last job.
@@ -236,11 +228,10 @@ impl Journal {
         self.shared.seen().kept.take()
     }
 
-    /// Passes `entries` to the store, which records them later and keeps a failure.
-    pub(super) fn append(&mut self, entries: Vec<RecordContent>) {
-        self.seq += entries.len() as u64;
+    /// Passes `entries`, whose numbers end with `last`, to the store, which records them later and keeps a failure.
+    pub(super) fn append(&mut self, entries: Vec<RecordContent>, last: u64) {
         if !self.gives {
-            return self.shared.reach(self.seq);
+            return self.shared.reach(last);
         }
         let given = self.run(move |store| {
             if let Err(error) = store.append(&entries) {
@@ -248,7 +239,7 @@ impl Journal {
             }
         });
         if given.is_none() {
-            self.give_up();
+            self.give_up(last);
         }
     }
 
@@ -272,10 +263,11 @@ impl Journal {
         })
     }
 
-    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment. From now on entries are
-    /// passed to the store again.
+    /// Like [`Self::run`], for `work` that writes the complete `checkpoint` of this moment, after the entry `last`. From
+    /// now on entries are passed to the store again.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
+        last: u64,
         checkpoint: impl FnOnce() -> Checkpoint + Send + 'static,
         work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
     ) -> Option<oneshot::Receiver<T>> {
@@ -291,20 +283,20 @@ impl Journal {
             work(store, checkpoint())
         });
         if given.is_none() {
-            self.give_up();
+            self.give_up(last);
         }
         given
     }
 
-    /// Gives up on a silent disk: answers no longer wait for it, and the store gets no records until the next complete
-    /// checkpoint.
-    pub(super) fn give_up(&mut self) {
+    /// Gives up on a silent disk: answers no longer wait for it, and the store gets no records after `last` until the next
+    /// complete checkpoint.
+    pub(super) fn give_up(&mut self, last: u64) {
         if std::mem::take(&mut self.gives) {
             let mut seen = self.shared.seen();
             seen.gaps += 1;
             seen.unprotected = Some(SILENT.to_owned());
         }
-        self.shared.reach(self.seq);
+        self.shared.reach(last);
     }
 }
 

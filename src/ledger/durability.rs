@@ -140,8 +140,9 @@ impl Ledger {
     /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded until the next complete
     /// checkpoint.
     pub(crate) fn give_up_disk(&self) {
-        if let Some(journal) = &mut self.lock().journal {
-            journal.give_up();
+        let inner = &mut *self.lock();
+        if let Some(journal) = &mut inner.journal {
+            journal.give_up(inner.seq);
         }
         self.disk_silent.notify_one();
     }
@@ -201,12 +202,13 @@ impl Ledger {
         work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
     ) -> Option<T> {
         let result = {
-            let mut inner = self.lock();
+            let inner = &mut *self.lock();
             let checkpoint = inner.checkpoint();
             // The checkpoint replaces the journal and lacks that call, so its answer makes a new record.
             inner.ahead = None;
             inner.whole.taken = inner.version;
-            inner.journal.as_mut()?.run_whole(checkpoint, work)?
+            let journal = inner.journal.as_mut()?;
+            journal.run_whole(inner.seq, checkpoint, work)?
         };
         self.write();
         result.await.ok()
@@ -222,10 +224,13 @@ impl Ledger {
         self.lock().journal.as_ref()?.take_kept()
     }
 
-    /// Sets a new store, which is still empty.
-    pub fn set_store(&self, store: Store) {
-        let journal = Journal::new(store, self.durable.clone(), self.sync);
+    /// Sets a new store, which is still empty. Records are numbered after the ones of the store, and after those that
+    /// there have been without a store.
+    pub fn set_store(&self, mut store: Store) {
         let mut inner = self.lock();
+        store.skip_to(inner.seq);
+        inner.seq = store.seq();
+        let journal = Journal::new(store, self.durable.clone(), self.sync);
         (inner.journal, inner.ahead) = (Some(journal), None);
     }
 

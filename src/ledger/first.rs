@@ -87,7 +87,7 @@ impl Ledger {
             label: Label { at, origin },
         }]);
         inner.add_pending([call.clone()]);
-        let (mark, seq) = (inner.mark(), inner.seq());
+        let (mark, seq) = (inner.mark(), inner.seq);
         inner.order.answered_first(seq, concern.notified_subjects());
         drop(inner);
         self.recorded();

@@ -38,6 +38,9 @@ pub(super) struct Inner {
     pub(super) session: Session,
     /// `None` if no checkpoint could be opened. Then the state is unprotected.
     pub(super) journal: Option<Journal>,
+    /// Number of the last record, whether or not it was written. It counts without a journal, too: the next process
+    /// compares the numbers of pending writes with numbers that this session has used before.
+    pub(super) seq: u64,
     pub(super) shared: Shared,
     /// Changes whenever the mirror changes.
     pub(super) version: u64,
@@ -91,11 +94,14 @@ impl Inner {
             Ok(pending) => (pending, false),
             Err(TooMany) => (PendingWrites::default(), true),
         };
+        // With a store, the numbers go on from its last one.
+        let seq = pending.last().max(session.last_seq());
         let mut inner = Self {
             mirror,
             identity: (-1, String::new()),
             session,
             journal: None,
+            seq,
             shared: Shared::Nobody,
             version: 0,
             whole: Whole::default(),
@@ -207,7 +213,7 @@ impl Inner {
     }
 
     pub(super) fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
-        let last = self.seq();
+        let last = self.seq;
         if self.pending.extend(writes, last).is_err() {
             // If the present master answers again, it gets the mirror's whole state.
             self.raise_incarnation();
@@ -241,7 +247,7 @@ impl Inner {
         self.note_acknowledged();
         let announced = Announced {
             incarnation: self.next_incarnation(),
-            at: self.seq(),
+            at: self.seq,
         };
         let session = Session {
             announced: Some(announced),
@@ -264,7 +270,7 @@ impl Inner {
         self.acknowledged = 0;
         self.session.incarnation = self.next_incarnation();
         self.session.announced = None;
-        self.session.delivered = self.seq();
+        self.session.delivered = self.seq;
         self.session_unwritten = true;
     }
 
@@ -319,14 +325,9 @@ impl Inner {
         is_ahead
     }
 
-    /// Number of the journal's last record.
-    pub(super) fn seq(&self) -> u64 {
-        self.last_seq().unwrap_or_default()
-    }
-
     /// Number of the journal's last record. `None` without a journal.
     pub(super) fn last_seq(&self) -> Option<u64> {
-        self.journal.as_ref().map(Journal::seq)
+        self.journal.as_ref().map(|_| self.seq)
     }
 
     /// Identifies the last record, so that an answer can wait for it.
@@ -347,8 +348,12 @@ impl Inner {
         // The session's record comes first, because it names the incarnation of the following entries.
         self.write_session();
         self.share(&entries, sources);
-        if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {
-            journal.append(entries);
+        if entries.is_empty() {
+            return;
+        }
+        self.seq += entries.len() as u64;
+        if let Some(journal) = &mut self.journal {
+            journal.append(entries, self.seq);
         }
     }
 
@@ -410,7 +415,7 @@ impl Inner {
     pub(super) fn checkpoint(&self) -> impl FnOnce() -> Checkpoint + Send + use<> {
         let mirror = self.mirror.clone();
         let rest = Checkpoint {
-            seq: self.seq(),
+            seq: self.seq,
             session: Session {
                 cluster_seq: self.cluster_seq(),
                 at: clock::wall_millis(),

@@ -72,6 +72,11 @@ impl PendingWrites {
         self.calls.len() <= COUNT_MAX && self.bytes <= BYTES_MAX
     }
 
+    /// The number of the last write's record, or 0.
+    pub(super) fn last(&self) -> u64 {
+        self.seqs.last().copied().unwrap_or_default()
+    }
+
     /// Drops the pending writes that come from a checkpoint. Returns the number of the last one's record, or 0.
     pub(super) fn forget_restored(&mut self) -> u64 {
         let last = self.seqs.get(..self.restored).and_then(<[u64]>::last);

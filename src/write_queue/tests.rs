@@ -161,6 +161,8 @@ const LONG_INJECTIONS: u64 = 1_000_000;
 /// From this seed on, the parameter that a client sets directly at the master was set through rosrescue before, and
 /// rosrescue dies after.
 const SET_BEFORE: u64 = 2_000_000;
+/// From this seed on, nothing happens to the master, and the disk may be read-only when rosrescue starts again.
+const READ_ONLY: u64 = 3_000_000;
 
 struct World {
     dice: Dice,
@@ -244,7 +246,9 @@ impl World {
             true => Supervision::Ours,
             false => Supervision::Theirs,
         };
-        let disk = dice.one_in(2).then(Disk::new);
+        let may_be_read_only = seed >= READ_ONLY;
+        let has_disk = may_be_read_only || dice.one_in(2);
+        let disk = has_disk.then(|| Disk::new(may_be_read_only));
         let writes = match dice.one_in(2) {
             true => Writes::Mirror,
             false => Writes::Master,
@@ -256,7 +260,7 @@ impl World {
             recovery,
             ..
         } = Parts::begin(disk.as_ref(), supervision, writes, stats);
-        let is_calm = disk.is_some() && dice.one_in(4);
+        let is_calm = has_disk && (may_be_read_only || dice.one_in(4));
         let mut world = Self {
             dice,
             start: Instant::now(),
@@ -312,8 +316,9 @@ impl World {
             world.call(node);
         }
         if world.is_calm {
+            let first = if may_be_read_only { 0 } else { 5_000 };
             for _ in 0..1 + world.dice.below(3) {
-                let time = 5_000 + world.dice.below(60_000);
+                let time = first + world.dice.below(60_000);
                 let event = match world.dice.one_in(3) {
                     true => Event::DiskFails,
                     false => Event::WorkerDies,
@@ -938,6 +943,12 @@ fn every_promise_holds_while_injections_take_long() {
 #[test]
 fn every_promise_holds_when_a_parameter_is_also_set_directly() {
     let found = mistake(None, SET_BEFORE, 500);
+    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+}
+
+#[test]
+fn every_promise_holds_when_the_disk_is_read_only_at_a_start() {
+    let found = mistake(None, READ_ONLY, 500);
     assert!(found.is_none(), "seed and broken promises: {found:#?}");
 }
 

@@ -217,6 +217,12 @@ impl<S: Storage> Store<S> {
         (self.seq, self.synced_seq, self.generation) = (seq, seq, generation);
     }
 
+    /// Uses no number up to `seq` for an entry from now on. Call it before the first checkpoint is begun.
+    pub fn skip_to(&mut self, seq: u64) {
+        let seq = self.seq.max(seq);
+        self.set_counts(seq, self.generation);
+    }
+
     /// The path of the file, with links resolved.
     pub fn path(&self) -> &Path {
         &self.place.names.path

@@ -1,5 +1,6 @@
-use std::{cell::RefCell, sync::mpsc};
+use std::{cell::RefCell, ops::Range, sync::mpsc};
 
+use checkpoint_store::StoreError;
 use ros1_master::{
     master::{Master, Method, Request, Snapshot},
     xmlrpc::Value,
@@ -48,27 +49,46 @@ fn set(value: i32) -> Request {
     Request::new(Method::SetParam, params)
 }
 
-fn entry(value: i32) -> Vec<RecordContent> {
-    vec![RecordContent::call(set(value))]
+/// The number of the record that sets this value. Each test begins with 0.
+fn seq(value: i32) -> u64 {
+    u64::try_from(value).unwrap() + 1
+}
+
+fn append(journal: &mut Journal, value: i32) {
+    journal.append(vec![RecordContent::call(set(value))], seq(value));
 }
 
 /// The complete state after these values were set.
-fn whole(journal: &Journal, values: std::ops::Range<i32>) -> Checkpoint {
+fn whole(values: Range<i32>) -> Checkpoint {
     let mut state = Master::default();
+    let last = values.end - 1;
     for value in values {
         state.apply(&set(value));
     }
     Checkpoint {
-        seq: journal.seq(),
+        seq: seq(last),
         snapshot: state.snapshot(),
         ..Checkpoint::default()
     }
 }
 
+/// Begins a complete checkpoint.
+fn begin_whole(
+    journal: &mut Journal,
+    values: Range<i32>,
+) -> Option<oneshot::Receiver<Result<(), StoreError>>> {
+    let checkpoint = whole(values);
+    let last = checkpoint.seq;
+    journal.run_whole(
+        last,
+        || checkpoint,
+        |store, checkpoint| store.begin(&checkpoint),
+    )
+}
+
 /// Writes a complete checkpoint.
-fn rewrite(journal: &mut Journal, values: std::ops::Range<i32>) {
-    let checkpoint = whole(journal, values);
-    let done = journal.run_whole(|| checkpoint, |store, checkpoint| store.begin(&checkpoint));
+fn rewrite(journal: &mut Journal, values: Range<i32>) {
+    let done = begin_whole(journal, values);
     journal.worker().work();
     done.unwrap().try_recv().unwrap().unwrap();
 }
@@ -81,14 +101,14 @@ fn unprotected(journal: &Journal) -> Option<String> {
 fn a_record_is_awaited_until_it_is_written_or_synced() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
-    journal.append(entry(0));
-    assert_eq!((journal.seq(), disk.reached()), (1, 0));
+    append(&mut journal, 0);
+    assert_eq!(disk.reached(), 0);
     journal.worker().work();
     assert_eq!(disk.reached(), 1);
 
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Always);
-    journal.append(entry(0));
+    append(&mut journal, 0);
     journal.worker().work();
     assert_eq!(disk.reached(), 0);
     journal.run(|store| {
@@ -97,7 +117,7 @@ fn a_record_is_awaited_until_it_is_written_or_synced() {
     });
     journal.worker().work();
     assert_eq!(disk.reached(), 1);
-    let state = whole(&journal, 0..1).snapshot;
+    let state = whole(0..1).snapshot;
     assert_eq!(disk.found(journal), state);
 }
 
@@ -105,20 +125,20 @@ fn a_record_is_awaited_until_it_is_written_or_synced() {
 fn records_withheld_from_a_silent_disk_are_in_the_next_complete_checkpoint() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
-    journal.append(entry(0));
+    append(&mut journal, 0);
     // Nothing has been written yet.
-    journal.give_up();
+    journal.give_up(seq(0));
     assert_eq!(disk.reached(), 1);
-    journal.append(entry(1));
-    assert_eq!((journal.seq(), disk.reached()), (2, 2));
+    append(&mut journal, 1);
+    assert_eq!(disk.reached(), 2);
     // The disk answers again: only the first record is written.
     journal.worker().work();
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     rewrite(&mut journal, 0..2);
     assert_eq!(unprotected(&journal), None);
-    journal.append(entry(2));
+    append(&mut journal, 2);
     journal.worker().work();
-    let state = whole(&journal, 0..3).snapshot;
+    let state = whole(0..3).snapshot;
     assert_eq!(disk.found(journal), state);
 }
 
@@ -126,18 +146,17 @@ fn records_withheld_from_a_silent_disk_are_in_the_next_complete_checkpoint() {
 fn a_whole_checkpoint_from_before_the_second_silence_protects_nothing() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
-    journal.give_up();
-    journal.append(entry(0));
-    let checkpoint = whole(&journal, 0..1);
-    let _done = journal.run_whole(|| checkpoint, |store, checkpoint| store.begin(&checkpoint));
-    journal.append(entry(1));
-    journal.give_up();
-    journal.append(entry(2));
+    journal.give_up(0);
+    append(&mut journal, 0);
+    let _done = begin_whole(&mut journal, 0..1);
+    append(&mut journal, 1);
+    journal.give_up(seq(1));
+    append(&mut journal, 2);
     journal.worker().work();
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     rewrite(&mut journal, 0..3);
     assert_eq!(unprotected(&journal), None);
-    let state = whole(&journal, 0..3).snapshot;
+    let state = whole(0..3).snapshot;
     assert_eq!(disk.found(journal), state);
 }
 
@@ -146,14 +165,14 @@ fn a_disk_that_is_given_too_much_is_given_up() {
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Interval);
     for value in 0..=2048 {
-        journal.append(entry(value));
+        append(&mut journal, value);
     }
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     assert!(journal.run(|_| ()).is_none());
     journal.worker().work();
     rewrite(&mut journal, 0..2049);
     assert_eq!(unprotected(&journal), None);
-    let state = whole(&journal, 0..2049).snapshot;
+    let state = whole(0..2049).snapshot;
     assert_eq!(disk.found(journal), state);
 }
 
@@ -171,7 +190,7 @@ fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
     let worker = journal.worker();
     let first = thread::spawn(move || worker.work());
     begins.recv().unwrap();
-    journal.append(entry(0));
+    append(&mut journal, 0);
     journal.worker().work();
     assert_eq!(disk.reached(), 0);
     go_on.send(()).unwrap();
@@ -191,7 +210,7 @@ fn the_disks_thread_runs_jobs_as_they_come_and_ends_with_the_journal() {
     let (ended, ends) = mpsc::sync_channel(1);
     let mut end = Some(ended);
     for value in 0..3 {
-        journal.append(entry(value));
+        append(&mut journal, value);
         let (began, begins) = mpsc::sync_channel(1);
         let end = end.take();
         journal.run(move |_| {
@@ -202,7 +221,7 @@ fn the_disks_thread_runs_jobs_as_they_come_and_ends_with_the_journal() {
         });
         journal.worker().wake();
         assert_ne!(begins.recv().unwrap(), thread::current().id());
-        assert_eq!(disk.reached(), value as u64 + 1);
+        assert_eq!(disk.reached(), seq(value));
     }
     drop(journal);
     ends.recv().unwrap_err();

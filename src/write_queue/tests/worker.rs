@@ -1,11 +1,12 @@
 //! The process of rosrescue. It dies, and the next one goes on with what the last one has written to the disk.
 
 use std::{
+    path::PathBuf,
     pin::Pin,
     task::{Context, Poll, Waker},
 };
 
-use checkpoint_store::{Store, StoreError};
+use checkpoint_store::{Loaded, Store, StoreError};
 use rescue_core::checkpoint::session::{self, Rebuilt};
 use tempfile::TempDir;
 
@@ -22,10 +23,14 @@ pub(super) struct Disk {
     whole: Option<Writing>,
     /// Answers that wait for the disk.
     answers: Vec<Answers>,
+    /// Whether it may be read-only for a while when rosrescue starts.
+    may_be_read_only: bool,
+    is_read_only: bool,
+    has_been_read_only: bool,
 }
 
 impl Disk {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(may_be_read_only: bool) -> Self {
         // A disk in memory, if there is one: each schedule has its own folder.
         let folder = TempDir::new_in("/dev/shm").or_else(|_| TempDir::new());
         Self {
@@ -33,7 +38,23 @@ impl Disk {
             is_writing: false,
             whole: None,
             answers: Vec::new(),
+            may_be_read_only,
+            is_read_only: false,
+            has_been_read_only: false,
         }
+    }
+
+    fn path(&self) -> PathBuf {
+        self.folder.path().join("chkpt.yaml")
+    }
+
+    /// As [`begin`](crate::app::startup::begin).
+    fn open(&self) -> (Option<Store>, Option<Loaded>) {
+        if self.is_read_only {
+            return (None, checkpoint_store::read(&self.path()).unwrap());
+        }
+        let (store, loaded) = Store::open(&self.path()).unwrap();
+        (Some(store), loaded)
     }
 }
 
@@ -54,11 +75,8 @@ impl Parts {
         writes: Writes,
         stats: &'static Stats,
     ) -> Self {
-        let opened = disk.map(|disk| Store::open(&disk.folder.path().join("chkpt.yaml")).unwrap());
-        let (store, loaded) = opened.unzip();
-        let rebuilt = loaded
-            .flatten()
-            .map(|it| session::rebuild(it.checkpoint, it.records));
+        let (store, loaded) = disk.map(Disk::open).unwrap_or_default();
+        let rebuilt = loaded.map(|it| session::rebuild(it.checkpoint, it.records));
         let Rebuilt {
             mirror,
             session,
@@ -98,10 +116,17 @@ impl Parts {
 impl World {
     /// Lets the worker, whose parts are new, begin.
     pub(super) fn begin_worker(&mut self, is_restored: bool) {
-        if self.disk.is_some() {
-            // Before the first complete checkpoint nothing is answered.
-            self.begin_checkpoint();
-            self.disk_writes();
+        match &self.disk {
+            Some(disk) if disk.is_read_only => {
+                let time = 5_000 + self.dice.below(100_000);
+                self.after(time, Event::DiskRecovers);
+            }
+            Some(_) => {
+                // Before the first complete checkpoint nothing is answered.
+                self.begin_checkpoint();
+                self.disk_writes();
+            }
+            None => {}
         }
         let is_ours = self.recovery.supervision == Supervision::Ours;
         self.recover(lifecycle::Input::Start {
@@ -115,6 +140,11 @@ impl World {
         let Some(disk) = self.disk.as_mut().filter(|_| !self.is_down) else {
             return;
         };
+        // Only a living master keeps what the disk does not (decision 34).
+        let is_kept = self.ledger.gate().is_open() && self.ledger.pending() == 0;
+        if disk.has_been_read_only && !is_kept {
+            return self.after(1_000, Event::WorkerDies);
+        }
         disk.answers.clear();
         (disk.whole, disk.is_writing, self.is_down) = (None, false, true);
         self.print(|| "rosrescue dies".to_owned());
@@ -179,7 +209,13 @@ impl World {
 
     /// The next worker starts.
     pub(super) fn worker_starts(&mut self) {
-        self.print(|| "rosrescue starts".to_owned());
+        let disk = self.disk.as_mut().filter(|disk| disk.may_be_read_only);
+        if let Some(disk) = disk {
+            disk.is_read_only = self.dice.one_in(2);
+            disk.has_been_read_only |= disk.is_read_only;
+        }
+        let is_read_only = self.disk.as_ref().is_some_and(|disk| disk.is_read_only);
+        self.print(|| format!("rosrescue starts, the disk is read-only: {is_read_only}"));
         let is_restored = self.replace(true);
         self.is_down = false;
         self.begin_worker(is_restored);
@@ -198,7 +234,7 @@ impl World {
     /// Lets the disk begin what is due.
     pub(super) fn wake_disk(&mut self) {
         let Some(disk) = &self.disk else { return };
-        if disk.whole.is_none() && self.ledger.checkpoint_due() {
+        if !disk.is_read_only && disk.whole.is_none() && self.ledger.checkpoint_due() {
             self.begin_checkpoint();
         }
         let Some(disk) = &mut self.disk else { return };
@@ -241,9 +277,16 @@ impl World {
     }
 
     pub(super) fn disk_recovers(&mut self) {
-        if !self.is_down {
-            self.begin_checkpoint();
+        if self.is_down {
+            return;
         }
+        let disk = self.disk.as_mut().filter(|disk| disk.is_read_only);
+        if let Some(disk) = disk {
+            disk.is_read_only = false;
+            self.ledger
+                .set_store(Store::open_over(&disk.path()).unwrap());
+        }
+        self.begin_checkpoint();
     }
 
     fn begin_checkpoint(&mut self) {

@@ -67,6 +67,14 @@ pub struct Session {
     pub at: u64,
 }
 
+impl Session {
+    /// The highest number of a record that this names, or 0.
+    pub fn last_seq(&self) -> u64 {
+        let announced = self.announced.map_or(0, |it| it.at);
+        self.delivered.max(announced)
+    }
+}
+
 /// An injection that has been begun: a master with the token of `incarnation` holds the state as of record `at`. Other
 /// masters lack what they lacked before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
