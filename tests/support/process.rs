@@ -258,7 +258,7 @@ impl Process {
 
 impl Process {
     /// Prints the end of the output. All of it goes to a file.
-    fn show_end(&self, ended: Option<ExitStatus>) {
+    pub(crate) fn show_end(&self, ended: Option<ExitStatus>) {
         const SHOWN: usize = 60;
         let log = self.log();
         let lines: Vec<_> = log.lines().collect();

@@ -176,11 +176,11 @@ impl Rescue {
     /// Starts rosrescue again after it has ended, with the same arguments and without waiting.
     #[track_caller]
     pub(crate) fn start_again(&mut self) {
-        assert!(
-            self.process.exited().is_some(),
-            "rosrescue is still running"
-        );
+        let ended = self.process.exited();
+        assert!(ended.is_some(), "rosrescue is still running");
         self.assert_no_panic();
+        // A test that fails later shows what each process has said.
+        self.process.show_end(ended);
         self.process = Process::start("rosrescue, again", &mut self.setup.command);
     }
 
