@@ -311,6 +311,11 @@ impl Member {
             false => self.take_first(now, read),
             true => self.take_later(now, read),
         }
+        if checks && !self.records() {
+            // A leader knows the records that a check has read. This one was deposed meanwhile, and the watch begins
+            // after them.
+            self.reading.load_by(now);
+        }
         self.discard_own_state();
     }
 
