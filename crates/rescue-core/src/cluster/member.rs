@@ -182,7 +182,7 @@ impl Member {
             held,
             outgoing: Outgoing::default(),
             cut_off,
-            merging: Merging::new(id),
+            merging: Merging::new(id.into()),
             before: Before::default(),
             namesake: Namesake::default(),
             probing: Probing::default(),

@@ -46,10 +46,9 @@ enum Step {
 /// The state of sending the writes of the oldest period of being cut off to the leader.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The first part of the name under which this computer sends its partition writes. The second part is `periods`.
-    id: String,
-    /// For how many periods of being cut off all writes were sent before.
-    periods: u64,
+    /// The name under which this computer sends its partition writes. It is the same for all periods of being cut off:
+    /// what an earlier period has changed is older than the writes of a later one, and no conflict.
+    id: Arc<str>,
     step: Step,
     /// The number of the last request to the leader. Answers to earlier ones are ignored.
     asked: u64,
@@ -72,10 +71,9 @@ pub(super) struct Merging {
 }
 
 impl Merging {
-    pub(super) fn new(id: String) -> Self {
+    pub(super) fn new(id: Arc<str>) -> Self {
         Self {
             id,
-            periods: 0,
             step: Step::Idle,
             asked: 0,
             unsent: None,
@@ -94,10 +92,6 @@ impl Merging {
             Step::Pause(until, _) => Some(until),
             _ => None,
         }
-    }
-
-    fn id(&self) -> Arc<str> {
-        format!("{} {}", self.id, self.periods).into()
     }
 }
 
@@ -225,7 +219,7 @@ impl Member {
             return;
         }
         let ask = Ask {
-            id: self.merging.id(),
+            id: self.merging.id.clone(),
             seq: self.merging.judged_up_to,
             calls,
         };
@@ -318,9 +312,8 @@ impl Member {
         let (sent, lost) = (self.merging.sent, self.merging.lost_count);
         self.report_news(News::Merged { sent, lost });
         self.merging = Merging {
-            periods: self.merging.periods + 1,
             asked: self.merging.asked,
-            ..Merging::new(std::mem::take(&mut self.merging.id))
+            ..Merging::new(self.merging.id.clone())
         };
         self.cut_off.sent();
         self.chores.publish_entry_by(now);

@@ -86,7 +86,7 @@ pub(super) struct Etcd {
     pub(super) lost_at: u64,
     /// Whether no new journal has begun since.
     pub(super) is_lost: bool,
-    /// When an older copy was restored last.
+    /// When etcd answered again after an older copy had been restored.
     pub(super) replaced_at: u64,
     /// Whether an older copy was restored, and no computer has led with it yet or begun a new journal.
     pub(super) is_old: bool,

@@ -572,20 +572,24 @@ impl History {
                 same && (call.reported || brought_back(call))
             })
         };
+        let several = |read: &&Read| {
+            let same = self.calls.iter();
+            let same = same.filter(|of| of.key == key && Some(of.value) == read.value);
+            same.count() > 1
+        };
         // The same value may also come from a write that is in no journal, or was answered while cut off. Then it is
-        // unknown which write a read shows.
+        // unknown which write a read shows. A value in a whole state may come from another call.
         let in_vain = |read: &&Read| {
-            let mut calls = self.calls.iter().zip(&places.of);
+            let places_of = match several(read) {
+                true => &places.changed,
+                false => &places.of,
+            };
+            let mut calls = self.calls.iter().zip(places_of);
             calls.any(|(call, places)| {
                 let same = call.key == key && Some(call.value) == read.value;
                 let in_vain = places.is_empty() || call.alone.is_some();
                 same && in_vain && Some(call.made) <= read.done
             })
-        };
-        let several = |read: &&Read| {
-            let same = self.calls.iter();
-            let same = same.filter(|of| of.key == key && Some(of.value) == read.value);
-            same.count() > 1
         };
         let unknown = |read: &&Read| lost(read.value) || several(read) && in_vain(read);
         let counts = |read: &&&Read| !unknown(read);

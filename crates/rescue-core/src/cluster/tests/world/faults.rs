@@ -312,7 +312,7 @@ impl World {
         self.etcd.restore(is_bumped);
         self.etcd.lost_at = self.now + time.as_micros() as u64;
         self.etcd.is_lost = true;
-        self.etcd.replaced_at = self.now;
+        self.etcd.replaced_at = self.etcd.lost_at;
         self.counts.restored += 1;
         self.term = 0;
     }
