@@ -10,6 +10,8 @@ use ros1_master::{
     xmlrpc::Value,
 };
 
+use super::mutant::Mutant;
+
 /// The calls that the present master was given and has not answered.
 #[derive(Default)]
 pub(super) enum Outstanding {
@@ -92,7 +94,8 @@ pub(super) fn notified_once(
     for write in writes {
         let mut tells = Tells::default();
         master.apply_telling(write, &mut tells);
-        if tells.shuts_down || tells.notified.iter().any(|(subject, _)| heard.has(subject)) {
+        let shuts_down = tells.shuts_down && !Mutant::ShutsDownLate.lives();
+        if shuts_down || tells.notified.iter().any(|(subject, _)| heard.has(subject)) {
             return None;
         }
         for (subject, _) in &tells.notified {

@@ -36,6 +36,8 @@ pub(crate) enum Mutant {
     UndoesDirectChange,
     /// A pending registration of a node that has ended displaces the one that took its name.
     ReturnsEndedNodes,
+    /// A late master runs a registration that makes it shut down a node, although the mirror has answered it long ago.
+    ShutsDownLate,
     /// The master is read although it has not run all writes that the mirror has answered first.
     ReadsTooEarly,
 }

@@ -40,7 +40,7 @@ use rescue_core::{
     replay::{self, Token},
 };
 use ros1_master::{
-    master::{Kind, Master, Method, Request},
+    master::{Kind, Master, Method, Request, Write},
     xmlrpc::{self, Call, Reply, Value},
 };
 
@@ -163,6 +163,8 @@ const LONG_INJECTIONS: u64 = 1_000_000;
 const SET_BEFORE: u64 = 2_000_000;
 /// From this seed on, nothing happens to the master, and the disk may be read-only when rosrescue starts again.
 const READ_ONLY: u64 = 3_000_000;
+/// From this seed on, nodes start again while the master is late, and other nodes take the ports that they have left.
+const TAKEN_PORTS: u64 = 4_000_000;
 
 struct World {
     dice: Dice,
@@ -185,6 +187,10 @@ struct World {
     is_down: bool,
     /// Whether nothing happens to the master. Then the disk may fail without a loss: the master has what was answered.
     is_calm: bool,
+    /// Whether a node takes a port that another one has left.
+    takes_ports: bool,
+    /// Calls that a master was sent, if [`Self::takes_ports`]. It can no longer be kept from running them.
+    sent: Vec<Request>,
     /// How long an injection takes at most, in microseconds.
     injection_most: u64,
     /// How often the process of rosrescue has died.
@@ -246,7 +252,8 @@ impl World {
             true => Supervision::Ours,
             false => Supervision::Theirs,
         };
-        let may_be_read_only = seed >= READ_ONLY;
+        let may_be_read_only = (READ_ONLY..TAKEN_PORTS).contains(&seed);
+        let takes_ports = seed >= TAKEN_PORTS;
         let has_disk = may_be_read_only || dice.one_in(2);
         let disk = has_disk.then(|| Disk::new(may_be_read_only));
         let writes = match dice.one_in(2) {
@@ -260,7 +267,7 @@ impl World {
             recovery,
             ..
         } = Parts::begin(disk.as_ref(), supervision, writes, stats);
-        let is_calm = has_disk && (may_be_read_only || dice.one_in(4));
+        let is_calm = has_disk && !takes_ports && (may_be_read_only || dice.one_in(4));
         let mut world = Self {
             dice,
             start: Instant::now(),
@@ -278,6 +285,8 @@ impl World {
             disk,
             is_down: false,
             is_calm,
+            takes_ports,
+            sent: Vec::new(),
             injection_most: match seed {
                 LONG_INJECTIONS..SET_BEFORE => 30_000,
                 _ => 200,
@@ -327,7 +336,8 @@ impl World {
             }
             return world;
         }
-        if seed >= SET_BEFORE {
+        let sets_before = seed >= SET_BEFORE && !takes_ports;
+        if sets_before {
             let time = 5_000 + world.dice.below(60_000);
             world.after(time, Event::SetsBefore);
         }
@@ -339,6 +349,7 @@ impl World {
                 2..5 => Event::WorkerDies,
                 5 if seed < SET_BEFORE => Event::Bypasses,
                 6 => Event::NodeRestarts,
+                _ if takes_ports => Event::NodeRestarts,
                 _ => Event::Dies,
             };
             world.after(time, event);
@@ -402,7 +413,9 @@ impl World {
         let Some(of) = self.nodes.get_mut(node) else {
             return;
         };
-        let call = of.call(&mut self.dice, self.value, !self.is_calm);
+        // A master may hold a subscription to a parameter that no read shows. It shuts the node down that has its port.
+        let subscribes = !self.is_calm && !self.takes_ports;
+        let call = of.call(&mut self.dice, self.value, subscribes);
         let pause = match self.dice.one_in(10) {
             true => self.dice.below(60_000),
             false => self.dice.below(1_500),
@@ -416,11 +429,48 @@ impl World {
         let living = living.filter(|(_, node)| !node.is_dead);
         let living: Vec<_> = living.map(|(index, _)| index).collect();
         let node = living[self.dice.below(living.len() as u64) as usize];
-        self.print(|| format!("{} starts again", self.nodes[node].name));
-        let next = self.nodes[node].restart();
+        let api = self.nodes[node].next_api();
+        if self.takes_ports {
+            let time = PATIENCE + self.dice.below(4 * PATIENCE);
+            self.stop_master(time);
+        }
+        self.node_restarts_at(node, api);
+    }
+
+    fn node_restarts_at(&mut self, node: usize, api: String) {
+        self.print(|| format!("{} starts again at {api}", self.nodes[node].name));
+        let next = self.nodes[node].restart(api);
         self.nodes.push(next);
         self.calls_left += CALLS / 4;
         self.call(self.nodes.len() - 1);
+    }
+
+    /// Another node takes the port that a node has left, if `call`, which has been answered, registers that node elsewhere
+    /// and no master was sent such a call.
+    fn port_is_taken(&mut self, call: &Request) {
+        let held = self.master.as_ref().map(Process::state);
+        let left = held.and_then(|held| held.displaced_by(call));
+        let Some(left) = left.filter(|_| self.takes_ports) else {
+            return;
+        };
+        let registers_elsewhere = |call| {
+            let (node, api) = Write::parse(call)?.registrant()?;
+            Some(node == left.node && api != left.api)
+        };
+        if self
+            .sent
+            .iter()
+            .any(|sent| registers_elsewhere(sent) == Some(true))
+        {
+            return;
+        }
+        let living = |node: &Node| !node.is_dead;
+        let is_taken = |node: &Node| living(node) && node.api == left.api;
+        let takes = |node: &Node| living(node) && node.name != left.node;
+        let taker = self.nodes.iter().position(takes);
+        if let Some(taker) = taker.filter(|_| !self.nodes.iter().any(is_taken)) {
+            self.node_restarts_at(taker, left.api);
+        }
     }
 
     fn arrives(&mut self, node: usize, call: Request) {
@@ -533,6 +583,11 @@ impl World {
             return self.after(time, Event::Broken(number, Failure::NotConnected));
         };
         master.running += 1;
+        if self.takes_ports
+            && let Some(request) = &request
+        {
+            self.sent.extend(request.calls().into_iter().cloned());
+        }
         // At the end the master must have time to recover.
         let is_over = self.calls_left == 0 && self.waiting.is_empty();
         if self.dice.one_in(12) && !self.is_calm && !is_over {
@@ -605,6 +660,7 @@ impl World {
                 self.broken.push(format!("{call:?} took {took} µs"));
             }
             self.note_value(&call);
+            self.port_is_taken(&call);
             self.answer(node, call, since, reply, delivery);
         }
     }
@@ -829,6 +885,14 @@ impl World {
         state
     }
 
+    /// The addresses that nodes have left and no other node has taken.
+    fn left_apis(&self) -> BTreeSet<&str> {
+        let (dead, living): (Vec<_>, Vec<_>) = self.nodes.iter().partition(|node| node.is_dead);
+        let is_taken = |api: &str| living.iter().any(|node| node.api == api);
+        let apis = dead.into_iter().map(|node| node.api.as_str());
+        apis.filter(|api| !is_taken(api)).collect()
+    }
+
     /// Checks the promises at the end.
     fn check(&mut self) {
         if !self.waiting.is_empty() {
@@ -837,11 +901,10 @@ impl World {
             self.broken.push(format!("never answered: {calls:?}"));
         }
         let mirror = self.ledger.with_mirror(Clone::clone);
-        let (dead, living): (Vec<_>, Vec<_>) = self.nodes.iter().partition(|node| node.is_dead);
-        let dead = dead.into_iter().map(|node| node.api.as_str()).collect();
-        let mistakes = living
-            .into_iter()
-            .flat_map(|node| node.mistakes(&mirror, &dead, &self.abandoned));
+        let dead = self.left_apis();
+        let living = self.nodes.iter().filter(|node| !node.is_dead);
+        let mistakes = living.flat_map(|node| node.mistakes(&mirror, &dead, &self.abandoned));
+        let mistakes: Vec<_> = mistakes.collect();
         self.broken.extend(mistakes);
         if !self.may_go_back {
             let gone_back = self.nodes.iter().flat_map(|node| node.gone_back.clone());
@@ -953,6 +1016,12 @@ fn every_promise_holds_when_the_disk_is_read_only_at_a_start() {
 }
 
 #[test]
+fn every_promise_holds_when_ports_are_taken() {
+    let found = mistake(None, TAKEN_PORTS, 500);
+    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+}
+
+#[test]
 fn late_masters_are_given_what_they_missed() {
     let stats: &'static Stats = Box::leak(Box::default());
     let worlds = (0..100).map(|seed| World::new(seed, stats));
@@ -995,6 +1064,7 @@ fn each_rule_is_needed() {
         (Mutant::UndoesDirectChange, 190_870),
         (Mutant::ReadsBeforeRun, 830),
         (Mutant::ReturnsEndedNodes, 783_250),
+        (Mutant::ShutsDownLate, TAKEN_PORTS),
     ];
     // Each mutant is present only in its own thread.
     let found = std::thread::scope(|scope| {

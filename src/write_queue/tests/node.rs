@@ -77,12 +77,17 @@ impl Node {
         }
     }
 
-    /// Ends this process. Returns the next one, which has another port.
-    pub(super) fn restart(&mut self) -> Self {
+    /// An address that no process has had.
+    pub(super) fn next_api(&self) -> String {
+        format!("http://n{}:{}/", self.number, self.earlier + 2)
+    }
+
+    /// Ends this process. Returns the next one, at this address.
+    pub(super) fn restart(&mut self, api: String) -> Self {
         self.is_dead = true;
         let earlier = self.earlier + 1;
         Self {
-            api: format!("http://n{}:{}/", self.number, earlier + 1),
+            api,
             earlier,
             // A master never notifies a name of a parameter that it has set itself.
             set: self.set.clone(),

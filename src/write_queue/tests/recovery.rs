@@ -368,11 +368,11 @@ impl World {
     /// Lets the examination go on until it waits for the master, and asks the master.
     fn go_on(&mut self) {
         let now = self.instant();
+        let left = self.left_apis();
+        let dead = left.into_iter().map(port_of).map(str::to_owned).collect();
         let Some(examination) = &mut self.recovery.examination else {
             return;
         };
-        let dead = self.nodes.iter().filter(|node| node.is_dead);
-        let dead = dead.map(|node| port_of(&node.api).to_owned()).collect();
         {
             let mut line = self.recovery.line.lock().unwrap();
             (line.now, line.dead) = (Some(now), dead);
