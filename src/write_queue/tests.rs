@@ -191,6 +191,9 @@ struct World {
     takes_ports: bool,
     /// Calls that a master was sent, if [`Self::takes_ports`]. It can no longer be kept from running them.
     sent: Vec<Request>,
+    /// Nodes that have moved from a port which another node has taken. They do not start again: only a
+    /// [judge](crate::write_queue::MoveJudge) keeps a call that moves them once more from shutting that node down.
+    moved: BTreeSet<String>,
     /// How long an injection takes at most, in microseconds.
     injection_most: u64,
     /// How often the process of rosrescue has died.
@@ -287,6 +290,7 @@ impl World {
             is_calm,
             takes_ports,
             sent: Vec::new(),
+            moved: BTreeSet::new(),
             injection_most: match seed {
                 LONG_INJECTIONS..SET_BEFORE => 30_000,
                 _ => 200,
@@ -426,8 +430,11 @@ impl World {
     /// The process of a node ends, and what it has not sent is lost. Its name starts again at another port.
     fn node_restarts(&mut self) {
         let living = self.nodes.iter().enumerate();
-        let living = living.filter(|(_, node)| !node.is_dead);
+        let living = living.filter(|(_, node)| !node.is_dead && !self.moved.contains(&node.name));
         let living: Vec<_> = living.map(|(index, _)| index).collect();
+        if living.is_empty() {
+            return;
+        }
         let node = living[self.dice.below(living.len() as u64) as usize];
         let api = self.nodes[node].next_api();
         if self.takes_ports {
@@ -466,9 +473,11 @@ impl World {
         }
         let living = |node: &Node| !node.is_dead;
         let is_taken = |node: &Node| living(node) && node.api == left.api;
-        let takes = |node: &Node| living(node) && node.name != left.node;
+        let may_move = |node: &Node| node.name != left.node && !self.moved.contains(&node.name);
+        let takes = |node: &Node| living(node) && may_move(node);
         let taker = self.nodes.iter().position(takes);
         if let Some(taker) = taker.filter(|_| !self.nodes.iter().any(is_taken)) {
+            self.moved.insert(left.node);
             self.node_restarts_at(taker, left.api);
         }
     }
@@ -901,8 +910,10 @@ impl World {
             self.broken.push(format!("never answered: {calls:?}"));
         }
         let mirror = self.ledger.with_mirror(Clone::clone);
-        let dead = self.left_apis();
-        let living = self.nodes.iter().filter(|node| !node.is_dead);
+        let (dead, living): (Vec<_>, Vec<_>) = self.nodes.iter().partition(|node| node.is_dead);
+        // No master tells subscribers that a displaced publisher is gone.
+        let dead = dead.into_iter().map(|node| node.api.as_str()).collect();
+        let living = living.into_iter();
         let mistakes = living.flat_map(|node| node.mistakes(&mirror, &dead, &self.abandoned));
         let mistakes: Vec<_> = mistakes.collect();
         self.broken.extend(mistakes);

@@ -405,10 +405,14 @@ impl History {
     /// Whether the write of `key` at this place of the log was lost with etcd's data, as no computer knew it or a later
     /// one that could say so when a new journal began.
     fn is_lost_with_etcd(&self, key: usize, place: usize, places: &Places) -> bool {
+        // An older copy that went on unnoticed and the journal that was lost both have later writes. A new journal continues
+        // one of them.
+        let mut before = self.beginnings.iter();
+        let is_branch = before.any(|of| of.is_unaware && of.place * 1000 <= place);
         self.beginnings.iter().any(|beginning| {
             let start = beginning.place * 1000;
-            if place >= start {
-                return false;
+            if place >= start || is_branch {
+                return place < start;
             }
             // A value that was written several times may be the oldest of these, or come from a computer that was cut off.
             let is_older = |value: Option<i32>| {
