@@ -210,9 +210,10 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// went back.
 /// 10102380, 10166911 and 11021318: an older copy went on, because its leader could not know of the loss. The simulation knew
 /// of this case only if that leader had hung.
-/// 12012029, 13226755, 13262857, 13411834 and 13600982: the simulation was wrong. It expected fewer writes to be kept, did
-/// not know of a claim that waited while etcd was away, and took a value for that of another write. In the last two, an older
-/// copy went on: a computer had the parameters in another order, and a new journal did not continue the copy.
+/// 10157522, 12012029, 13226755, 13262857, 13411834, 13600982 and 13680258: the simulation was wrong. It expected fewer writes
+/// to be kept, did not know of requests that waited while etcd was away, and took a value for that of another write. In the
+/// last three, an older copy went on: a computer had the parameters in another order, a new journal did not continue the copy, and
+/// a process that had not read etcd before claimed.
 /// 13120837: a computer merged its writes of two periods of being cut off. Those of the second were lost, because those of
 /// the first counted as changes of others.
 /// 13026844, 13027038 and 13042236: a leader whose watch had ended checked the journal, and was deposed meanwhile. It never
@@ -233,9 +234,9 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         400_220, 402_804, 407_349, 436_101, 447_756, 448_760, 477_828, 629_606, 707_429, 807_731,
         815_060, 823_187, 855_335, 857_396, 858_456, 878_245, 900_690, 1_006_696, 1_007_191,
         3_042_947, 10_022_831, 10_000_346, 10_053_294, 10_066_558, 10_070_719, 10_077_286,
-        10_102_380, 10_135_767, 10_142_857, 10_166_911, 10_176_536, 11_003_001, 11_018_319,
-        11_019_204, 11_021_318, 12_012_029, 13_026_844, 13_027_038, 13_042_236, 13_120_837,
-        13_226_755, 13_262_857, 13_411_834, 13_600_982,
+        10_102_380, 10_135_767, 10_142_857, 10_157_522, 10_166_911, 10_176_536, 11_003_001,
+        11_018_319, 11_019_204, 11_021_318, 12_012_029, 13_026_844, 13_027_038, 13_042_236,
+        13_120_837, 13_226_755, 13_262_857, 13_411_834, 13_600_982, 13_680_258,
     ] {
         play_with_data_loss(seed).check();
     }

@@ -366,6 +366,9 @@ impl World {
             }
             return;
         }
+        let is_old = self.etcd.is_old && self.lives(at, life);
+        let computer = &mut self.computers[at];
+        computer.unaware |= is_old && !computer.has_read;
         let before = self.etcd.view().clone();
         if !sent.parts.is_empty() {
             self.etcd.put(sent.parts.clone());
