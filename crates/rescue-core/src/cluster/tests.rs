@@ -218,6 +218,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// the first counted as changes of others.
 /// 13026844, 13027038 and 13042236: a leader whose watch had ended checked the journal, and was deposed meanwhile. It never
 /// followed the records that the check had read.
+/// 13765467: a computer that had been alone returned, and the leader did not notify its node again, because it had never read
+/// an entry of that computer: keys had been deleted.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]

@@ -35,8 +35,13 @@ impl Notifying {
             return false;
         };
         let marker = &entry.notifies;
-        // A first marker counts, too, if the entry had none while the leader lacked writes of that computer.
+        // A first marker counts, too, if the entry had none while the leader lacked writes of that computer, or if this is
+        // its first entry since etcd lost the others, and it has stopped before.
         let before = self.markers.insert(change.name.clone(), marker.clone());
-        !marker.is_empty() && before.is_some_and(|before| before != *marker)
+        let is_new = match before {
+            Some(before) => before != *marker,
+            None => !marker.ends_with(" 0"),
+        };
+        !marker.is_empty() && is_new
     }
 }
