@@ -299,7 +299,7 @@ impl Voice {
             rarely!(
                 warn,
                 checkpoint = %path, kept = %kept.display(),
-                "another program replaced or changed the checkpoint; its file is kept under another name, and a new checkpoint is written"
+                "the file at the checkpoint's path is not the one that this process has written; it is kept under another name, and a new checkpoint is written"
             );
         }
         let unprotected = self.ledger.unprotected();
