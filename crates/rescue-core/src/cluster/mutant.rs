@@ -36,6 +36,8 @@ pub(crate) enum Mutant {
     TrustsDeletedKeys,
     /// After an older copy of etcd was restored, its values count as changes by others.
     BelievesOldCopy,
+    /// A process that starts follows an older copy of etcd, although its checkpoint has more.
+    StartsFromOldCopy,
     /// Two computers of one name do not notice each other.
     IgnoresNamesake,
     /// A request that never ends blocks the machine forever.

@@ -12,7 +12,7 @@ use std::{
 
 use super::{Evidence, Holdings, Member, MemberEntryChange, News};
 use crate::cluster::{
-    machine::{self, EtcdAnswer, RevisionGuard, Role, View},
+    machine::{self, EtcdAnswer, Leader, RevisionGuard, Role, View},
     mutant::Mutant,
     standing::JournalPosition,
 };
@@ -159,9 +159,20 @@ impl Member {
             return older || contradicts || torn || is_unreadable;
         }
         let is_old = !self.reading.loaded && view.journal_number < self.local.journal_number;
-        let is_old = is_old || view.term() < known;
+        let is_old = is_old || view.term() < known || self.lacks_what_the_checkpoint_holds(view);
         let torn = view.is_torn() || is_old || !is_readable || is_without_end;
         older || contradicts || torn && !trusts()
+    }
+
+    /// Whether the checkpoint holds more of the journal in `view`, from the same leader, than etcd. The checkpoint of a
+    /// computer that follows has nothing that etcd did not have.
+    fn lacks_what_the_checkpoint_holds(&self, view: &View) -> bool {
+        let (own, held) = (self.settings(), self.held);
+        let same = |leader: &Leader| leader.name != own.name && leader.term == held.term;
+        let same = view.leader.as_ref().is_some_and(same);
+        let same = same && view.journal_number == held.journal_number;
+        let has_more = same && held.seq > view.seq();
+        !self.reading.loaded && has_more && !Mutant::StartsFromOldCopy.lives()
     }
 
     /// Starts over with the etcd that shows `view`, and with this computer's state.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::world::ScheduleOptions;
 use crate::cluster::{
     journal::Keys,
-    machine::Settings,
+    machine::{Leader, Settings, View},
     member::{LocalCheckpoint, Member, PartitionWrites},
     merge::wire,
     sharing::{Sharing, Source},
@@ -229,6 +229,20 @@ impl Computer {
         self.standing = Standing::Nobody { known: true };
         self.waiting.clear();
         self.answered.clear();
+    }
+
+    /// Notes that this process reads etcd, which shows `view`. `is_old` says whether that is an older copy.
+    pub(super) fn reads(&mut self, view: &View, is_old: bool) {
+        let own = &self.disk.own;
+        let kept = self.disk.kept.as_ref().map(|kept| kept.held);
+        let held = kept
+            .filter(|held| *held > 0)
+            .map_or(own.seq, |held| held.min(own.seq));
+        let is_known = |leader: &Leader| leader.name != self.name && leader.term == own.term;
+        let is_known = view.leader.as_ref().is_some_and(is_known);
+        let is_known = is_known && view.journal_number == own.journal_number;
+        let has_more = is_known && held > view.seq();
+        self.unaware |= is_old && !self.has_read && !has_more;
     }
 
     /// Notes the position in the journal that a leader's answer shows.

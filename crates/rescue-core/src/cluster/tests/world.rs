@@ -367,8 +367,8 @@ impl World {
             return;
         }
         let is_old = self.etcd.is_old && self.lives(at, life);
-        let computer = &mut self.computers[at];
-        computer.unaware |= is_old && !computer.has_read;
+        let view = self.etcd.view();
+        self.computers[at].reads(view, is_old);
         let before = self.etcd.view().clone();
         if !sent.parts.is_empty() {
             self.etcd.put(sent.parts.clone());
@@ -479,7 +479,7 @@ impl World {
         let read = match self.network.reaches_etcd(at) {
             true => {
                 let computer = &mut self.computers[at];
-                computer.unaware |= self.etcd.is_old && !computer.has_read;
+                computer.reads(self.etcd.view(), self.etcd.is_old);
                 computer.has_read = true;
                 let read = self.etcd.read(known);
                 if read.state.is_some() {
