@@ -997,6 +997,13 @@ fn mistake(mutant: Option<Mutant>, from: u64, schedules: u64) -> Option<(u64, Ve
     found
 }
 
+/// Plays schedules from this seed on, and panics at the first that breaks promises.
+#[track_caller]
+fn assert_kept(from: u64, schedules: u64) {
+    let found = mistake(None, from, schedules);
+    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+}
+
 #[test]
 fn every_promise_holds_in_every_schedule() {
     let number = |name| std::env::var(name).ok().and_then(|text| text.parse().ok());
@@ -1004,32 +1011,27 @@ fn every_promise_holds_in_every_schedule() {
     let seed = number("ROSRESCUE_SEED").unwrap_or(0);
     let schedules = number("ROSRESCUE_SCHEDULES").unwrap_or(500);
     println!("seeds from {seed} on, {schedules} schedules");
-    let found = mistake(None, seed, schedules);
-    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+    assert_kept(seed, schedules);
 }
 
 #[test]
 fn every_promise_holds_while_injections_take_long() {
-    let found = mistake(None, LONG_INJECTIONS, 500);
-    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+    assert_kept(LONG_INJECTIONS, 500);
 }
 
 #[test]
 fn every_promise_holds_when_a_parameter_is_also_set_directly() {
-    let found = mistake(None, SET_BEFORE, 500);
-    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+    assert_kept(SET_BEFORE, 500);
 }
 
 #[test]
 fn every_promise_holds_when_the_disk_is_read_only_at_a_start() {
-    let found = mistake(None, READ_ONLY, 500);
-    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+    assert_kept(READ_ONLY, 500);
 }
 
 #[test]
 fn every_promise_holds_when_ports_are_taken() {
-    let found = mistake(None, TAKEN_PORTS, 500);
-    assert!(found.is_none(), "seed and broken promises: {found:#?}");
+    assert_kept(TAKEN_PORTS, 500);
 }
 
 #[test]

@@ -168,11 +168,12 @@ impl Member {
     /// computer that follows has nothing that etcd did not have.
     fn lacks_what_the_checkpoint_holds(&self, view: &View) -> bool {
         let (own, held) = (self.settings(), self.held);
-        let same = |leader: &Leader| leader.name != own.name && leader.term == held.term;
-        let same = view.leader.as_ref().is_some_and(same);
-        let same = same && view.journal_number == held.journal_number;
-        let has_more = same && held.seq > view.seq();
-        !self.reading.loaded && has_more && !Mutant::StartsFromOldCopy.lives()
+        let follows = |leader: &Leader| leader.name != own.name && leader.term == held.term;
+        !self.reading.loaded
+            && view.leader.as_ref().is_some_and(follows)
+            && view.journal_number == held.journal_number
+            && view.seq() < held.seq
+            && !Mutant::StartsFromOldCopy.lives()
     }
 
     /// Starts over with the etcd that shows `view`, and with this computer's state.

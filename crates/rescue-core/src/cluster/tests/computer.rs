@@ -238,10 +238,11 @@ impl Computer {
         let held = kept
             .filter(|held| *held > 0)
             .map_or(own.seq, |held| held.min(own.seq));
-        let is_known = |leader: &Leader| leader.name != self.name && leader.term == own.term;
-        let is_known = view.leader.as_ref().is_some_and(is_known);
-        let is_known = is_known && view.journal_number == own.journal_number;
-        let has_more = is_known && held > view.seq();
+        let follows = |leader: &Leader| leader.name != self.name && leader.term == own.term;
+        // As production decides, but without its mutant.
+        let has_more = view.leader.as_ref().is_some_and(follows)
+            && view.journal_number == own.journal_number
+            && view.seq() < held;
         self.unaware |= is_old && !self.has_read && !has_more;
     }
 
