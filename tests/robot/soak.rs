@@ -4,7 +4,10 @@
 //! When rosrescue and the master end together, only recorded calls must survive: everything that was acknowledged
 //! before a status said that changes are recorded.
 //!
-//! `ROSRESCUE_SOAK_SECONDS` is the length. `ROSRESCUE_SEED` repeats the random numbers of an earlier run.
+//! Other tests kill at random steps of a write, on a disk that works. There every acknowledged call must survive.
+//!
+//! `ROSRESCUE_SOAK_SECONDS` is the length of the first test, `ROSRESCUE_SOAK_KILLS` the number of kills of the others.
+//! `ROSRESCUE_SEED` repeats the random numbers of an earlier run.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -14,7 +17,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::links::Dice;
 use crate::support::{
-    Client, FailingDisk, FakeNode, Finish, PATIENCE, Rescue, Scratch, Setup, State, Trouble,
+    Client, FailingDisk, FakeNode, Finish, PATIENCE, Rescue, Scratch, Setup, State, Trouble, alive,
     eventually, free_port, holds, params, signal,
 };
 use ros1_master::xmlrpc::Value;
@@ -25,6 +28,11 @@ const WRITERS: usize = 4;
 const NAMES: u64 = 4;
 /// Pause before a call is repeated.
 const AGAIN: Duration = Duration::from_millis(20);
+/// Longest pause between two calls of a writer, in µs: on a disk that fails, and before kills.
+const PAUSE_US: u64 = 4000;
+const PAUSE_BEFORE_KILLS_US: u64 = 500;
+/// Longest time from an answer to a kill, in µs. Most writes take less.
+const STEPS_US: u64 = 1500;
 /// Maximum time for which the disk stays in one state, in ms. A start waits 20 s for a disk that hangs.
 const TROUBLE_MS: u64 = 8000;
 
@@ -134,6 +142,8 @@ struct Flags {
     pause: AtomicBool,
     over: AtomicBool,
     calls: AtomicU32,
+    /// The calls that have not been answered yet.
+    open: AtomicU32,
     repeated: AtomicU32,
 }
 
@@ -152,7 +162,7 @@ impl Writer {
         }
     }
 
-    fn run(&self, mut dice: Dice, flags: &Flags) {
+    fn run(&self, mut dice: Dice, pause_us: u64, flags: &Flags) {
         for value in 1.. {
             while flags.pause.load(Ordering::SeqCst) {
                 self.parked.store(true, Ordering::SeqCst);
@@ -174,7 +184,10 @@ impl Writer {
                 6 => Step::Subscribe(name, on),
                 _ => Step::Offer(name, on),
             };
-            if !self.make(&step, flags) {
+            flags.open.fetch_add(1, Ordering::Relaxed);
+            let is_answered = self.make(&step, flags);
+            flags.open.fetch_sub(1, Ordering::Relaxed);
+            if !is_answered {
                 return;
             }
             let mut past = lock(&self.past);
@@ -184,7 +197,7 @@ impl Writer {
             past.last = Some(step);
             drop(past);
             flags.calls.fetch_add(1, Ordering::Relaxed);
-            sleep(Duration::from_micros(dice.below(4000)));
+            sleep(Duration::from_micros(dice.below(pause_us)));
         }
     }
 
@@ -275,8 +288,6 @@ impl Writer {
 
 /// rosrescue with its master, disk and callers.
 struct Stage<'a> {
-    scratch: &'a Scratch,
-    disk: &'a FailingDisk,
     rescue: Rescue,
     bare: Client,
     writers: &'a [Writer],
@@ -422,13 +433,55 @@ impl Stage<'_> {
         self.rescue.kill();
         worker.into_iter().for_each(|pid| signal(pid, Signal::KILL));
         eventually("the worker has ended", || {
-            worker.is_none_or(|pid| !crate::support::alive(pid))
+            worker.is_none_or(|pid| !alive(pid))
         });
     }
 
-    /// Causes one more death or stop.
+    /// Kills some of the processes, and waits until calls pass to a master again. Half of the kills come right after an
+    /// answer, which a process that answers too early would not survive; the others at a random step of a write.
     #[track_caller]
-    fn next(&mut self, dice: &mut Dice) {
+    fn kill_some(&mut self, dice: &mut Dice) {
+        let (what, guardian, with_worker, with_master) = match dice.below(5) {
+            0 => ("masters killed", false, false, true),
+            1 => ("workers killed", false, true, false),
+            2 => ("workers and masters killed", false, true, true),
+            3 => ("guardians and workers killed", true, true, false),
+            _ => ("everything killed", true, true, true),
+        };
+        self.count(what);
+        let worker = self.worker().filter(|_| with_worker);
+        let master = self.bare.master_pid().filter(|_| with_master);
+        let guardian = guardian.then(|| self.rescue.pid());
+        // A guardian that sees its worker die starts another.
+        let victims: Vec<_> = guardian.into_iter().chain(worker).chain(master).collect();
+        let later = Duration::from_micros(dice.below(2) * dice.below(STEPS_US));
+        let calls = || self.flags.calls.load(Ordering::SeqCst);
+        let before = calls();
+        let waiting = Instant::now();
+        while calls() == before {
+            assert!(waiting.elapsed() < PATIENCE, "no call was answered");
+            thread::yield_now();
+        }
+        let answered = Instant::now();
+        while answered.elapsed() < later {
+            thread::yield_now();
+        }
+        victims.iter().for_each(|&pid| signal(pid, Signal::KILL));
+        let open = self.flags.open.load(Ordering::SeqCst);
+        *self.tally.entry("calls open at a kill").or_default() += open;
+        eventually("the killed processes have ended", || {
+            !victims.iter().any(|&pid| alive(pid))
+        });
+        if guardian.is_some() {
+            self.rescue.wait();
+            self.start_again();
+        }
+        self.await_service(worker);
+    }
+
+    /// Causes one more death or stop. The checkpoint is on `disk`.
+    #[track_caller]
+    fn next(&mut self, disk: &FailingDisk, dice: &mut Dice) {
         self.note_what_is_owed();
         match dice.below(10) {
             0..3 => {
@@ -456,7 +509,7 @@ impl Stage<'_> {
             }
             8 => {
                 self.count("everything killed");
-                let is_whole = dice.below(2) == 0 && self.heal();
+                let is_whole = dice.below(2) == 0 && self.heal(disk);
                 let master = self.bare.master_pid();
                 self.kill_guardian_and_worker();
                 master.into_iter().for_each(|pid| signal(pid, Signal::KILL));
@@ -469,7 +522,7 @@ impl Stage<'_> {
             }
             _ => {
                 self.count("orderly stops");
-                if dice.below(2) == 0 && self.heal() {
+                if dice.below(2) == 0 && self.heal(disk) {
                     self.count("of these with everything recorded");
                 }
                 self.flags.pause.store(true, Ordering::SeqCst);
@@ -481,16 +534,16 @@ impl Stage<'_> {
     }
 
     /// Heals the disk. Returns whether everything is recorded afterwards.
-    fn heal(&self) -> bool {
-        self.disk.heal();
+    fn heal(&self, disk: &FailingDisk) -> bool {
+        disk.heal();
         !holds(Duration::from_secs(4), || !self.note_what_is_owed())
     }
 }
 
 /// Runs the troubles of the disk until the end of the test.
-fn trouble(disk: &FailingDisk, mut dice: Dice, flags: &Flags) -> BTreeMap<String, u32> {
+fn trouble(disk: &FailingDisk, mut dice: Dice, over: &AtomicBool) -> BTreeMap<String, u32> {
     let mut tally = BTreeMap::new();
-    while !flags.over.load(Ordering::SeqCst) {
+    while !over.load(Ordering::SeqCst) {
         let next = match dice.below(8) {
             0..2 => Some(Trouble::Hangs),
             2 => Some(Trouble::Slow),
@@ -506,35 +559,16 @@ fn trouble(disk: &FailingDisk, mut dice: Dice, flags: &Flags) -> BTreeMap<String
             None => disk.heal(),
         }
         let time = Duration::from_millis(100 + dice.below(TROUBLE_MS));
-        holds(time, || !flags.over.load(Ordering::SeqCst));
+        holds(time, || !over.load(Ordering::SeqCst));
     }
     disk.heal();
     tally
 }
 
-#[test]
-fn the_state_always_equals_the_acknowledged_calls_whatever_dies() {
-    soak(&[], true);
-}
-
-/// The disk works: if it fails right after such a write, the next process may let the master run the write again
-/// (decision 53).
-#[test]
-fn the_state_always_equals_the_acknowledged_calls_if_the_mirror_answers_them_first() {
-    soak(&["--writes", "mirror"], false);
-}
-
-/// Plays a while with a `core` that has these `arguments` in addition, on a disk that fails now and then or never.
-fn soak(arguments: &[&str], disk_fails: bool) {
-    let seconds = number("ROSRESCUE_SOAK_SECONDS", 30);
-    let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
-    println!("seed {seed}, {seconds} s");
-    let scratch = Scratch::new();
-    let disk = FailingDisk::new(&scratch);
-    let port = free_port();
-    let setup = Setup::core(&scratch, port).arg("--no-rosout").guarded();
-    let setup = setup.args(arguments);
-    let rescue = disk.under(setup).start();
+/// Runs `script` with a `core` that is started like `setup`, in front of a master at `port`, while writers make calls
+/// with pauses of at most `pause_us`.
+fn play(setup: Setup, port: u16, seed: u64, pause_us: u64, script: impl FnOnce(&mut Stage<'_>)) {
+    let rescue = setup.arg("--no-rosout").guarded().start();
     let writer = |index| Writer::new(index, rescue.client());
     let writers: Vec<_> = (0..WRITERS).map(writer).collect();
     let flags = Flags::default();
@@ -543,44 +577,108 @@ fn soak(arguments: &[&str], disk_fails: bool) {
         for writer in &writers {
             let dice = Dice(seed + 2 + writer.index as u64);
             let flags = &flags;
-            scope.spawn(move || writer.run(dice, flags));
+            scope.spawn(move || writer.run(dice, pause_us, flags));
         }
-        let troubles = scope.spawn(|| match disk_fails {
-            true => trouble(&disk, Dice(seed + 1), &flags),
-            false => BTreeMap::new(),
-        });
         let mut stage = Stage {
-            scratch: &scratch,
-            disk: &disk,
             rescue,
             bare: Client::new(port),
             writers: &writers,
             flags: &flags,
             tally: BTreeMap::new(),
         };
-        let (begin, mut dice) = (Instant::now(), Dice(seed));
-        let mut said = begin;
-        while begin.elapsed() < Duration::from_secs(seconds) {
-            for _ in 0..1 + dice.below(4) {
-                sleep(Duration::from_millis(dice.below(1500)));
-                stage.next(&mut dice);
-            }
-            stage.assert_state();
-            if said.elapsed() > Duration::from_secs(10) {
-                said = Instant::now();
-                println!("{:.0?}: {:?}", begin.elapsed(), stage.tally);
-            }
-        }
+        let begin = Instant::now();
+        script(&mut stage);
         flags.over.store(true, Ordering::SeqCst);
         println!(
-            "{:.0?}: {} calls, {} sent again; {:?}; the disk: {:?}",
+            "{:.0?}: {} calls, {} sent again; {:?}",
             begin.elapsed(),
             flags.calls.load(Ordering::Relaxed),
             flags.repeated.load(Ordering::Relaxed),
             stage.tally,
-            troubles.join().unwrap(),
         );
         let _ = stage.rescue.terminate();
-        assert_eq!(stage.scratch.survivors(), vec![]);
     });
+}
+
+/// Says every 10 s what has been done.
+struct Progress {
+    begin: Instant,
+    said: Instant,
+}
+
+impl Progress {
+    fn begin() -> Self {
+        let begin = Instant::now();
+        Self { begin, said: begin }
+    }
+
+    fn say(&mut self, stage: &Stage<'_>) {
+        if self.said.elapsed() > Duration::from_secs(10) {
+            self.said = Instant::now();
+            println!("{:.0?}: {:?}", self.begin.elapsed(), stage.tally);
+        }
+    }
+}
+
+fn seed() -> u64 {
+    number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20)
+}
+
+#[test]
+fn the_state_always_equals_the_acknowledged_calls_whatever_dies() {
+    let (seed, seconds) = (seed(), number("ROSRESCUE_SOAK_SECONDS", 30));
+    println!("seed {seed}, {seconds} s");
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let port = free_port();
+    let setup = disk.under(Setup::core(&scratch, port));
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let finish = Finish(&over);
+        let troubles = scope.spawn(|| trouble(&disk, Dice(seed + 1), &over));
+        play(setup, port, seed, PAUSE_US, |stage| {
+            let (mut progress, mut dice) = (Progress::begin(), Dice(seed));
+            while progress.begin.elapsed() < Duration::from_secs(seconds) {
+                for _ in 0..1 + dice.below(4) {
+                    sleep(Duration::from_millis(dice.below(1500)));
+                    stage.next(&disk, &mut dice);
+                }
+                stage.assert_state();
+                progress.say(stage);
+            }
+        });
+        drop(finish);
+        println!("the disk: {:?}", troubles.join().unwrap());
+    });
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+#[test]
+fn no_acknowledged_call_is_lost_by_a_kill_at_any_step_of_a_write() {
+    kills(&[]);
+}
+
+/// The disk works: if it fails right after such a write, the next process may let the master run the write again
+/// (decision 53).
+#[test]
+fn no_acknowledged_call_is_lost_by_a_kill_if_the_mirror_answers_first() {
+    kills(&["--writes", "mirror"]);
+}
+
+/// Kills processes of a `core` that has these `arguments` in addition, and checks the state after each kill.
+fn kills(arguments: &[&str]) {
+    let (seed, kills) = (seed(), number("ROSRESCUE_SOAK_KILLS", 25));
+    println!("seed {seed}, {kills} kills");
+    let scratch = Scratch::new();
+    let port = free_port();
+    let setup = Setup::core(&scratch, port).args(arguments);
+    play(setup, port, seed, PAUSE_BEFORE_KILLS_US, |stage| {
+        let (mut progress, mut dice) = (Progress::begin(), Dice(seed));
+        for _ in 0..kills {
+            stage.kill_some(&mut dice);
+            stage.assert_state();
+            progress.say(stage);
+        }
+    });
+    assert_eq!(scratch.survivors(), vec![]);
 }
