@@ -6,10 +6,11 @@ use std::time::Duration;
 
 use ros1_master::xmlrpc::{self, Call, Reply, Value};
 
-use super::patience::eventually;
+use super::patience::{PATIENCE, eventually};
 
-/// How long a client waits for an answer: longer than rosrescue may hold any call.
-const ANSWER: Duration = Duration::from_secs(60);
+/// How long a client waits for an answer: longer than rosrescue may hold any call, and than 20,000 changes take on a busy
+/// computer.
+const ANSWER: Duration = PATIENCE;
 
 /// Encodes the body of a call.
 pub(crate) fn encode_call(method: &str, params: Vec<Value>) -> Vec<u8> {

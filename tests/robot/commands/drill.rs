@@ -44,8 +44,7 @@ fn assert_passed(verdict: &Value) {
     assert_eq!(verdict["failures"], Value::Array(Vec::new()), "{verdict:#}");
     for calls in ["reads", "writes", "notifications"] {
         let calls = &verdict["calls"][calls];
-        assert!(calls["calls"].as_u64().unwrap() > 20, "{verdict:#}");
-        assert!(calls["longest_ms"].as_f64().unwrap() > 0.0);
+        assert!(calls["longest_ms"].as_f64().unwrap() > 0.0, "{verdict:#}");
     }
 }
 

@@ -76,6 +76,8 @@ impl Stage {
             let setup = Setup::core(&servers.scratch, free_port());
             setup
                 .args(["--cluster", &cluster, "--no-rosout"])
+                // On a busy computer etcd is late, and the master would be killed again and again.
+                .args(["--cluster-ttl", "60"])
                 .args(["--cluster-name", &format!("pc{index}")])
                 .at_checkpoint(servers.scratch.path(format!("pc{index}.yaml")))
                 .spawn()

@@ -134,7 +134,16 @@ impl Member {
             }
             _ => view.continues(before),
         };
-        !continues && !trusts()
+        (!continues || self.lacks_what_was_read(view)) && !trusts()
+    }
+
+    /// Whether `view` shows less of the journal than this computer has read of it. The watch also delivers what was added to
+    /// a journal after its keys had been seen last, and before it was lost.
+    fn lacks_what_was_read(&self, view: &View) -> bool {
+        let seen = self.view();
+        let is_late = view.revision < seen.revision;
+        let is_same = self.reading.loaded && view.origin == seen.origin && !is_late;
+        is_same && view.seq() < self.journal.progress.seq
     }
 
     /// Whether etcd has lost data, if a read that began when etcd had shown `before` shows `view`.
@@ -267,8 +276,9 @@ impl Member {
         if leads && unreadable != 0 && unreadable == view.origin {
             self.reading.check_all(now);
         }
-        // This computer has not noticed the loss, because it has just started. It leaves the claim to the others.
-        if !leads && self.data_loss.present.is_none() && holds.is_some_and(|holds| holds > shown) {
+        // This computer has not noticed the loss, because it has just started. It leaves the claim to those that hold more.
+        let known = shown.max(self.held);
+        if !leads && self.data_loss.present.is_none() && holds.is_some_and(|holds| holds > known) {
             let until = now + self.settings().ttl * PATIENCE;
             self.machine.hold_claims(until);
         }
