@@ -102,20 +102,25 @@ impl Member {
             .leader
             .as_ref()
             .is_some_and(|of| of.id == self.settings().id);
-        let seq = match own {
+        let shown = match own {
             true => seq.max(self.outgoing.last()),
             false => seq,
         };
         self.position = JournalPosition {
             epoch,
             term,
-            seq,
+            seq: shown,
             lost: (0, 0),
+        };
+        // What a leader answers while it is cut off is no part of the journal.
+        let held = match own && self.keeps_writes() {
+            true => seq.max(self.held.seq),
+            false => shown,
         };
         self.held = Holdings {
             journal_number,
             term,
-            seq,
+            seq: held,
         };
     }
 }
