@@ -234,9 +234,13 @@ impl Clients {
                 .into_iter()
                 .collect();
             if told != apis {
+                let mut updates = node.calls();
+                updates.retain(|call| call.method == "publisherUpdate");
+                let updates: Vec<_> = updates.iter().collect();
+                let trail = trail(updates.iter().rev().take(12).rev());
+                let name = &node.name;
                 wrong.push(format!(
-                    "{} was told {told:?}, and there are {apis:?}",
-                    node.name
+                    "{name} was told {told:?}, and there are {apis:?}: {trail}"
                 ));
             }
             let calls = node.received("shutdown");

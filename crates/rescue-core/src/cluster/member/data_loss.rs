@@ -293,6 +293,7 @@ impl Member {
         };
         if !self.journal.own_wins || self.published.role == Role::Leading {
             self.data_loss.present = None;
+            self.machine.allow_claims();
             return self.chores.publish_entry_by(now);
         }
         let name = &self.settings().name;
@@ -309,8 +310,9 @@ impl Member {
         if self.data_loss.is_remainder(self.view()) || self.leader().is_none() {
             return;
         }
-        // Another computer has led since, so its journal counts. Those that have read it claim first.
-        let patience = self.settings().ttl * PATIENCE;
+        // Another computer has led since, so its journal counts. Those that have read it claim first. If it is still empty,
+        // nobody has, and the one that holds the most of the lost journal is the first.
+        let patience = self.settings().ttl * PATIENCE * (1 + ahead);
         if let Some(seen) = self.machine.observed() {
             self.machine.hold_claims(seen + patience);
         }
