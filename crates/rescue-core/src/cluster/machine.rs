@@ -392,11 +392,6 @@ impl Machine {
         self.claim_not_before = self.claim_not_before.max(Some(until));
     }
 
-    /// Lets this computer claim leadership again as soon as there is no leader.
-    pub fn allow_claims(&mut self) {
-        self.claim_not_before = None;
-    }
-
     /// Notes that a journal with this number has existed.
     pub fn note_journal(&mut self, journal_number: u64) {
         self.journal_number = self.journal_number.max(journal_number);

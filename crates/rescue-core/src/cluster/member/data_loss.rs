@@ -293,7 +293,6 @@ impl Member {
         };
         if !self.journal.own_wins || self.published.role == Role::Leading {
             self.data_loss.present = None;
-            self.machine.allow_claims();
             return self.chores.publish_entry_by(now);
         }
         let name = &self.settings().name;
