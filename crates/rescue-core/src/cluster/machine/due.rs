@@ -79,7 +79,9 @@ impl Machine {
                     settled: self.session.settled_by(seq),
                 }
             }
-            None if self.observed.is_none() || self.is_cut_off_from_etcd(now) => Op::Read,
+            None if self.claim_at().is_none_or(|at| now < at) || self.is_cut_off_from_etcd(now) => {
+                Op::Read
+            }
             None => {
                 self.claims += 1;
                 let claim = self.claims;
@@ -109,15 +111,27 @@ impl Machine {
     fn send_at(&self) -> Option<Instant> {
         let due = match self.leadership {
             Some(leadership) => self.beat_at(leadership)?,
-            None => match self.observed {
-                Some(observed) => {
-                    let vacant = observed + self.vacant_after();
-                    self.claim_not_before.map_or(vacant, |at| at.max(vacant))
+            None => match (self.vacant_at(), self.heard) {
+                // While the claim is held back, reads show whether etcd loses data.
+                (Some(vacant), Some(heard)) => {
+                    let read = heard + self.settings.ttl / 2;
+                    self.claim_at()?.min(read.max(vacant))
                 }
-                None => self.started?,
+                _ => self.started?,
             },
         };
         Some(self.retry_at.map_or(due, |at| at.max(due)))
+    }
+
+    /// When this computer claims leadership, unless the keys `leader` and `alive` change before. `None` before etcd has
+    /// answered.
+    fn claim_at(&self) -> Option<Instant> {
+        let vacant = self.vacant_at()?;
+        Some(self.claim_not_before.map_or(vacant, |at| at.max(vacant)))
+    }
+
+    fn vacant_at(&self) -> Option<Instant> {
+        Some(self.observed? + self.vacant_after())
     }
 
     fn beat_at(&self, leadership: Leadership) -> Option<Instant> {
