@@ -86,6 +86,8 @@ impl Ledger {
 pub(super) struct Disk {
     pub(super) own: LocalCheckpoint,
     pub(super) kept: Option<PartitionWrites>,
+    /// The term of the leader whose state this is, if the journal lacked something of it.
+    pub(super) early: Option<u64>,
 }
 
 #[derive(Debug)]
@@ -110,6 +112,8 @@ pub(super) struct Computer {
     /// Whether etcd had an older copy when this process read it first, and no new journal has begun since. The copy looks
     /// like any journal.
     pub(super) unaware: bool,
+    /// The term in which an earlier process led, if the mirror still has its state, and the journal lacked something of it.
+    pub(super) restored_early: Option<u64>,
     /// By how much the computer's clock is too fast, in millionths.
     drift: i64,
     clock: Instant,
@@ -184,6 +188,7 @@ impl Computer {
             seen_unreadable: 0,
             has_read: false,
             unaware: false,
+            restored_early: None,
             drift,
             clock: Instant::now() + Duration::from_secs(1),
             wake: 0,
@@ -213,6 +218,7 @@ impl Computer {
         self.life += 1;
         self.seen_unreadable = 0;
         (self.has_read, self.unaware) = (false, false);
+        self.restored_early = self.disk.early;
         self.up = true;
         self.hangs_until = 0;
         self.disk.own.restored = true;
@@ -279,8 +285,28 @@ impl Computer {
         u64::try_from(at).unwrap()
     }
 
+    /// The term in which this process leads, if its mirror shows something that the journal lacks.
+    pub(super) fn early(&self) -> Option<u64> {
+        let machine = self.member.machine();
+        let sharing = self.ledger.sharing.as_ref();
+        let lacks = sharing.is_some_and(|of| of.last() > machine.committed());
+        let is_early = lacks || self.member.uncommitted() > 0;
+        is_early.then(|| machine.term().unwrap_or_default())
+    }
+
+    /// Has the mirror show the journal's state.
+    pub(super) fn follow_state(&mut self, state: Master) {
+        self.ledger.mirror = state;
+        self.restored_early = None;
+    }
+
     /// Writes the ledger's present state to the disk, unsynced.
     pub(super) fn write_disk(&mut self) {
+        if self.ledger.sharing.is_some() {
+            // What the journal lacks of the restored state is recorded now.
+            self.restored_early = None;
+        }
+        self.disk.early = self.early().or(self.restored_early);
         let own = &mut self.disk.own;
         own.state = self.ledger.mirror.clone();
         own.seq = match &self.ledger.sharing {

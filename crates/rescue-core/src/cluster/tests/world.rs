@@ -625,7 +625,7 @@ impl World {
                     }
                 }
             }
-            Action::FollowState(state) => self.computers[at].ledger.mirror = state,
+            Action::FollowState(state) => self.computers[at].follow_state(state),
             Action::Acknowledge(seq) => self.agree(at, seq),
             Action::TakeAsState => {
                 let ledger = &mut self.computers[at].ledger;

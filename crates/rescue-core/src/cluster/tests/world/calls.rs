@@ -253,16 +253,12 @@ impl World {
         self.flush(at);
     }
 
-    /// What the mirror of a leader, or of one that was cut off, may show.
+    /// What the mirror of a computer that is not cut off may show.
     pub(super) fn shows(&self, at: usize) -> Shows {
         let computer = &self.computers[at];
-        let sharing = computer.ledger.sharing.as_ref();
-        let committed = computer.member.machine().committed();
-        let early =
-            sharing.is_some_and(|of| of.last() > committed) || computer.member.uncommitted() > 0;
-        match early {
-            true => Shows::Early(computer.member.machine().term().unwrap_or_default()),
-            false => Shows::Agreed,
+        match computer.early().or(computer.restored_early) {
+            Some(term) => Shows::Early(term),
+            None => Shows::Agreed,
         }
     }
 
