@@ -63,6 +63,9 @@ pub struct Machine {
     observed: Option<Instant>,
     /// When etcd last answered.
     heard: Option<Instant>,
+    /// When etcd had answered last before this process paused, until a request that was sent later is answered. What arrives
+    /// first after a pause may be old.
+    heard_before_pause: Option<Instant>,
     leadership: Option<Leadership>,
     flight: Option<Flight>,
     retry_at: Option<Instant>,
@@ -99,6 +102,7 @@ impl Machine {
             resumed: None,
             observed: None,
             heard: None,
+            heard_before_pause: None,
             leadership: None,
             flight: None,
             retry_at: None,
@@ -241,6 +245,7 @@ impl Machine {
             .is_some_and(|due| due + self.settings.ttl / BEATS < now)
         {
             self.resumed = Some(now);
+            self.heard_before_pause = self.heard_before_pause.or(self.heard);
         }
         match input {
             Input::Start(seq) => {
@@ -304,8 +309,10 @@ impl Machine {
             EtcdAnswer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
         };
         self.retry_at = None;
+        let is_new = Some(flight.sent) >= self.resumed;
         self.flight = Some(flight);
         self.see(now, view, actions);
+        self.heard_before_pause.take_if(|_| is_new);
         self.flight.take_if(|flight| flight.number == number);
     }
 
@@ -424,10 +431,11 @@ impl Machine {
 
     /// Whether etcd has been silent for so long that this computer must read it before it claims: if an older copy is
     /// restored meanwhile, etcd shows the leader that this computer knew. Twice the time to live, because a claim
-    /// follows one time to live after the last answer.
+    /// follows one time to live after the last answer; or once, if this process has paused.
     fn is_cut_off_from_etcd(&self, now: Instant) -> bool {
-        let long = 2 * self.settings.ttl;
-        self.heard.is_some_and(|at| at + long <= now)
+        let Settings { ttl, .. } = self.settings;
+        let is_long = |at: Option<Instant>, limit| at.is_some_and(|at| at + limit <= now);
+        is_long(self.heard, 2 * ttl) || is_long(self.heard_before_pause, ttl)
     }
 
     /// Handles the keys `leader` and `alive` as etcd shows them.

@@ -79,9 +79,7 @@ impl Machine {
                     settled: self.session.settled_by(seq),
                 }
             }
-            None if self.claim_at().is_none_or(|at| now < at) || self.is_cut_off_from_etcd(now) => {
-                Op::Read
-            }
+            None if self.must_read(now) => Op::Read,
             None => {
                 self.claims += 1;
                 let claim = self.claims;
@@ -111,6 +109,7 @@ impl Machine {
     fn send_at(&self) -> Option<Instant> {
         let due = match self.leadership {
             Some(leadership) => self.beat_at(leadership)?,
+            None if self.heard_before_pause.is_some() => self.resumed?,
             None => match (self.vacant_at(), self.heard) {
                 // While the claim is held back, reads show whether etcd loses data.
                 (Some(vacant), Some(heard)) => {
@@ -128,6 +127,12 @@ impl Machine {
     fn claim_at(&self) -> Option<Instant> {
         let vacant = self.vacant_at()?;
         Some(self.claim_not_before.map_or(vacant, |at| at.max(vacant)))
+    }
+
+    /// Whether etcd must be read before this computer claims leadership.
+    fn must_read(&self, now: Instant) -> bool {
+        let is_early = self.claim_at().is_none_or(|at| now < at);
+        is_early || self.heard_before_pause.is_some() || self.is_cut_off_from_etcd(now)
     }
 
     fn vacant_at(&self) -> Option<Instant> {

@@ -103,6 +103,29 @@ fn leading(alone: WhenAlone) -> (Machine, Instant) {
     (machine, now)
 }
 
+/// When the machine claims leadership, if it does `actions` at `now`, and etcd answers each read with `view`.
+fn claims(
+    machine: &mut Machine,
+    mut now: Instant,
+    mut actions: Vec<Action>,
+    view: &View,
+) -> Instant {
+    loop {
+        if actions.is_empty() {
+            now = machine.deadline().unwrap();
+            actions = machine.on(now, Input::Wake);
+            continue;
+        }
+        let (number, op) = sent(&actions);
+        if op != Op::Read {
+            assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+            return now;
+        }
+        let answer = EtcdAnswer::Is(view.clone());
+        actions = machine.on(now, Input::Answer { number, answer });
+    }
+}
+
 #[test]
 fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
     let (mut machine, now) = following(WhenAlone::Serve);
@@ -138,12 +161,23 @@ fn who_has_not_heard_of_etcd_for_twice_the_time_to_live_reads_first_and_claims_l
     assert_eq!(op, Op::Read);
     let answer = EtcdAnswer::Is(led("b", 5, 6));
     let answered = given_up + 2 * RETRY;
-    machine.on(answered, Input::Answer { number, answer });
-    let (number, op) = sent(&machine.on(answered + TTL - ms(1), Input::Wake));
+    let actions = machine.on(answered, Input::Answer { number, answer });
+    let claimed = claims(&mut machine, answered, actions, &led("b", 5, 6));
+    assert_eq!(claimed - answered, TTL);
+}
+
+/// Seed 26336186.
+#[test]
+fn who_has_paused_for_a_time_to_live_reads_first_and_claims_later() {
+    let (mut machine, now) = following(WhenAlone::Serve);
+    let resumed = now + TTL + TTL / 2;
+    // What arrives first may be old.
+    let (number, op) = sent(&machine.on(resumed, Input::View(led("b", 5, 6))));
     assert_eq!(op, Op::Read);
     let answer = EtcdAnswer::Is(led("b", 5, 6));
-    let (_, op) = sent(&machine.on(answered + TTL, Input::Answer { number, answer }));
-    assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+    let actions = machine.on(resumed, Input::Answer { number, answer });
+    let claimed = claims(&mut machine, resumed, actions, &led("b", 5, 6));
+    assert_eq!(claimed - resumed, TTL);
 }
 
 /// Its keys may just have been deleted, and this computer may not have read the journal.
@@ -157,22 +191,8 @@ fn who_starts_and_finds_an_etcd_in_use_without_a_leader_claims_after_the_time_to
             ..View::default()
         };
         let answer = EtcdAnswer::Is(bare.clone());
-        let mut actions = machine.on(now, Input::Answer { number, answer });
-        let mut waited = Duration::ZERO;
-        loop {
-            if actions.is_empty() {
-                waited = machine.deadline().unwrap() - now;
-                actions = machine.on(now + waited, Input::Wake);
-                continue;
-            }
-            let (number, op) = sent(&actions);
-            if op != Op::Read {
-                assert!(matches!(op, Op::Claim { .. }), "{op:?}");
-                return waited;
-            }
-            let answer = EtcdAnswer::Is(bare.clone());
-            actions = machine.on(now + waited, Input::Answer { number, answer });
-        }
+        let actions = machine.on(now, Input::Answer { number, answer });
+        claims(&mut machine, now, actions, &bare) - now
     };
     assert_eq!(first_claim(1), Duration::ZERO);
     assert_eq!(first_claim(29), TTL);
