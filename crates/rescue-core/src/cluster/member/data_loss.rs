@@ -127,9 +127,12 @@ impl Member {
     }
 
     fn contradicts(&self, view: &View, before: &View) -> bool {
+        // Nothing brings back a key that was deleted.
+        let is_whole_again = before.is_torn() && !view.is_torn();
+        let is_other = view.origin != before.origin || is_whole_again;
         let continues = match self.data_loss.present {
             // A new journal does not continue the lost one. Any other is an older copy.
-            Some(loss) if ![0, before.origin].contains(&view.origin) => {
+            Some(loss) if view.origin != 0 && is_other => {
                 view.journal_number > before.journal_number.max(loss.holds.journal_number)
             }
             _ => view.continues(before),
@@ -156,10 +159,13 @@ impl Member {
         let floor = before.revision.max(known);
         let older = view.revision < floor && !Mutant::TrustsLostEtcd.lives();
         let is_without_end = self.data_loss.without_end == Some(view.guard());
-        // A read that began after an earlier loss shows a later one only by what has been seen since.
+        // What has been seen since the read began counts more: this computer may have begun a new journal, or etcd may have
+        // lost that, too.
         let seen = self.view();
-        let contradicts_seen = view.revision >= seen.revision && self.contradicts(view, seen);
-        let contradicts = self.contradicts(view, before) || contradicts_seen;
+        let contradicts = match view.revision < seen.revision {
+            true => !seen.continues(view) && self.contradicts(view, before),
+            false => self.contradicts(view, seen),
+        };
         if let Some(loss) = self.data_loss.present {
             let is_torn = view.is_torn() && loss.left != Some(view.guard());
             // No other computer can repair a journal that this one is to continue.
