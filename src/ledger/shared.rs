@@ -6,6 +6,8 @@ use std::time::Instant;
 use rescue_core::cluster::sharing::Sharing;
 use tokio::sync::watch;
 
+use crate::wait;
+
 /// Which computer's writes the ledger holds.
 #[derive(Debug)]
 pub(super) enum Shared {
@@ -95,11 +97,13 @@ impl LeaderLease {
     /// stood still. Reads go on until the gate is shut, and show nothing older than this computer has shown before.
     pub(crate) fn set(&self, until: Option<Instant>) {
         self.0.send_if_modified(|lease| {
-            // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease.
+            // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease, or a first
+            // limit.
             let now = Instant::now();
             let held = lease.is_none_or(|until| now < until);
+            let limits = lease.is_none() && until.is_some();
             *lease = until;
-            !held
+            !held || limits
         });
     }
 
@@ -119,6 +123,19 @@ impl LeaderLease {
         while !self.is_held() {
             // This cannot fail: this owns the sender.
             let _ = changed.changed().await;
+        }
+    }
+
+    /// Waits until this computer may no longer act as leader.
+    pub(crate) async fn lapsed(&self) {
+        let mut changed = self.changed();
+        while self.is_held() {
+            let until = *changed.borrow_and_update();
+            tokio::select! {
+                // This cannot fail: this owns the sender.
+                _ = changed.changed() => {}
+                () = wait::sleep_until(until.map(Into::into)) => {}
+            }
         }
     }
 }
@@ -409,6 +426,25 @@ mod tests {
         assert!(ledger.lease.is_held());
         ledger.lease.set(None);
         assert!(ledger.lease.is_held());
+    }
+
+    #[tokio::test]
+    async fn a_lease_lapses_when_it_is_not_extended_or_gets_a_first_limit() {
+        let ledger = ledger();
+        let lapsed = || ledger.lease.lapsed();
+        let limits = async {
+            tokio::task::yield_now().await;
+            ledger.lease.set(Some(Instant::now()));
+        };
+        tokio::join!(lapsed(), limits);
+        let until = Instant::now() + Duration::from_millis(100);
+        ledger.lease.set(Some(until));
+        let extends = async {
+            tokio::task::yield_now().await;
+            ledger.lease.set(Some(until + Duration::from_millis(100)));
+        };
+        tokio::join!(lapsed(), extends);
+        assert!(Instant::now() >= until + Duration::from_millis(100));
     }
 
     #[tokio::test]

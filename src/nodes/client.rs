@@ -2,6 +2,7 @@
 
 use std::{
     net::{IpAddr, SocketAddr},
+    pin::pin,
     time::Duration,
 };
 
@@ -30,19 +31,40 @@ pub(crate) async fn call_for_value(
     call: &Call,
     limit: Duration,
 ) -> (Reaction, Option<Value>) {
+    let answer = call_unless(api, call, limit, std::future::pending()).await;
+    answer.unwrap_or((Reaction::Silent, None))
+}
+
+/// Like [`call_for_value`], but gives up once `withdrawn` ends, and returns `None`. The node then does not get what it has
+/// not received yet.
+pub(super) async fn call_unless(
+    api: &str,
+    call: &Call,
+    limit: Duration,
+    withdrawn: impl Future<Output = ()>,
+) -> Option<(Reaction, Option<Value>)> {
+    let silent = (Reaction::Silent, None);
     let Ok(address) = MasterUri::parse(api) else {
-        return (Reaction::Silent, None);
+        return Some(silent);
     };
-    let question = async {
-        let mut connection = match connect(&address, limit).await {
-            Ok(connection) => connection,
-            Err(sign) => return (sign, None),
+    let mut withdrawn = pin!(withdrawn);
+    let exchange = async {
+        let connection = tokio::select! {
+            connection = connect(&address, limit) => connection,
+            () = &mut withdrawn => return None,
         };
-        put(&mut connection, call).await
+        let mut connection = match connection {
+            Ok(connection) => connection,
+            Err(sign) => return Some((sign, None)),
+        };
+        tokio::select! {
+            answer = put(&mut connection, call) => return Some(answer),
+            () = &mut withdrawn => {}
+        }
+        connection.reset();
+        None
     };
-    timeout(limit, question)
-        .await
-        .unwrap_or((Reaction::Silent, None))
+    timeout(limit, exchange).await.unwrap_or(Some(silent))
 }
 
 /// The host of `api`, resolved to its first address. `None` if it has no address within `limit`.
@@ -129,5 +151,33 @@ async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Valu
         // The node lacks the method.
         Ok(Reply::Fault { .. }) => (Reaction::Alive, None),
         Ok(Reply::Value(_)) | Err(_) => (Reaction::Silent, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::{io::AsyncReadExt, net::TcpListener};
+
+    use super::*;
+
+    /// The rest of a call that is only given up would still arrive.
+    #[tokio::test]
+    async fn what_a_node_has_not_received_of_a_withdrawn_call_is_not_sent() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let api = format!("http://{}/", listener.local_addr().unwrap());
+        let call = master::param_update("/k", Value::String("x".repeat(64 << 20)));
+        let (began, begins) = tokio::sync::oneshot::channel();
+        let node = async {
+            let (stream, _) = listener.accept().await.unwrap();
+            assert_eq!(stream.peek(&mut [0]).await.unwrap(), 1);
+            began.send(()).unwrap();
+            stream
+        };
+        let withdrawn = async { begins.await.unwrap() };
+        let limit = Duration::from_secs(60);
+        let (sign, mut stream) = tokio::join!(call_unless(&api, &call, limit, withdrawn), node);
+        assert_eq!(sign, None);
+        let error = stream.read_to_end(&mut Vec::new()).await.unwrap_err();
+        assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset);
     }
 }

@@ -144,13 +144,20 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             true => MUTE.min(nodes.timeout),
             false => nodes.timeout,
         };
-        let mut asked = pin!(client::call(&port, &call, limit));
-        let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
-            Ok(sign) => sign,
+        // Behind a cut cable, the connection may be made much later, when another leader has told newer news.
+        let withdrawn = nodes.ledger.lease.lapsed();
+        let mut asked = pin!(client::call_unless(&port, &call, limit, withdrawn));
+        let answer = match tokio::time::timeout(PROMPT, &mut asked).await {
+            Ok(answer) => answer,
             Err(_) => {
                 let _room = notifications.slow.try_acquire().ok().or(permit);
                 asked.await
             }
+        };
+        let Some((sign, _)) = answer else {
+            let withdraw = |order: &mut Order, _: &Master| order.notification_withdrawn(number);
+            nodes.ledger.with_order(withdraw);
+            continue;
         };
         nodes
             .ledger

@@ -5,6 +5,7 @@ use std::{
     net::SocketAddr,
     pin::Pin,
     task::{Context, Poll, Waker},
+    time::Duration,
 };
 
 use bytes::Bytes;
@@ -23,6 +24,7 @@ use ros1_master::{
     master,
     xmlrpc::{self, Python, Reply},
 };
+use socket2::SockRef;
 use tokio::{net::TcpStream, time::timeout};
 
 use super::{
@@ -131,6 +133,15 @@ impl Connection {
         let (sender, driver) = handshake(connecting.await??, self.silence).await?;
         (self.sender, self.driver) = (sender, Drive(Some((driver, None))));
         Ok(())
+    }
+
+    /// Ends the connection. What the other end has not received yet is not sent any more.
+    pub(crate) fn reset(mut self) {
+        if let Some((driver, _)) = self.driver.0.take() {
+            let stream = driver.into_parts().io.into_inner();
+            // If this fails, the connection has ended.
+            let _ = SockRef::from(&stream).set_linger(Some(Duration::ZERO));
+        }
     }
 
     /// Whether the connection has ended.

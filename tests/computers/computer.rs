@@ -252,6 +252,17 @@ impl Computer {
         eventually_some("there is a guardian", || child_of(rescue))
     }
 
+    /// Kills this computer's rosmaster with SIGKILL.
+    #[track_caller]
+    pub(crate) fn kill_master(&self) {
+        let is_master = |pid: &u32| {
+            let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+            String::from_utf8_lossy(&line).contains("/rosmaster")
+        };
+        let master = self.processes().into_iter().find(is_master);
+        signal(master.expect("a rosmaster"), Signal::KILL);
+    }
+
     /// Removes the data of this computer's etcd, which must not run.
     pub(crate) fn wipe_etcd(&self) {
         assert!(self.etcd.is_none(), "etcd runs");

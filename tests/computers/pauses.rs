@@ -208,3 +208,43 @@ fn no_old_notification_arrives_after_a_cut() {
     fleet.await_whole();
     fleet.assert_nodes_live();
 }
+
+/// The mirror of a leader without a master notifies a node whose answers do not arrive. The connection would be made when
+/// the cable is mended, after the next leader has told the node something newer.
+#[test]
+fn no_old_notification_of_the_mirror_arrives_after_a_cut() {
+    let _turn = turn();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    let (first, cut, next) = (
+        &fleet.computers[leader],
+        &fleet.computers[rest[0]],
+        &fleet.computers[rest[1]],
+    );
+    let watcher = watch(cut);
+    let last = || {
+        told(watcher.it())
+            .get(&key(0))
+            .and_then(|of| of.last().copied())
+    };
+    first.set_param(&key(0), 1);
+    eventually("the node is told", || last() == Some(1));
+    fleet.network.cut_way(rest[0], leader);
+    first.kill_master();
+    first.set_param(&key(0), 2);
+    eventually("the mirror connects to the node", || {
+        is_sending_to(first, watcher.it().port())
+    });
+    let (status, said) = first.rosrescue(&["handover", "--to", next.name]);
+    assert_eq!(status, Some(0), "{said}");
+    fleet.await_leader_of(&[rest[1]]);
+    next.set_param(&key(0), 3);
+    eventually("the node is told 3", || last() == Some(3));
+    fleet.network.mend_way(rest[0], leader);
+    // The kernel tries again after 1 and 3 seconds, and rosrescue waits 3 seconds for a node.
+    holds(Duration::from_secs(5), || last() == Some(3));
+    assert_eq!(last(), Some(3), "{:?}", told(watcher.it()));
+    fleet.await_whole();
+    fleet.assert_nodes_live();
+}

@@ -413,6 +413,14 @@ impl Order {
         std::mem::take(&mut self.awaited)
     }
 
+    /// Notes that the notification `number` was given up before the node took it, because another computer may notify nodes
+    /// now. If this one still does, the node is told the state.
+    pub fn notification_withdrawn(&mut self, number: u64) {
+        for Recipient { port, subject } in self.under_way.remove(number) {
+            self.notify_of_state(&port, subject);
+        }
+    }
+
     /// Drops all waiting notifications for the node at `port`.
     pub fn drop_port(&mut self, port: &str) {
         self.outbox.remove(port);

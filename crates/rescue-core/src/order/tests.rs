@@ -169,6 +169,25 @@ fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
 }
 
 #[test]
+fn what_was_withdrawn_is_told_as_the_state_unless_another_computer_notifies_nodes() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    mirror.apply(&publish("/b", "/t"));
+    order.notify(now, A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
+    let (_, number) = sent(order.next_notification(now, A, &mirror));
+    mirror.apply(&publish("/c", "/t"));
+    order.notification_withdrawn(number);
+    let (list, number) = sent(order.next_notification(now, A, &mirror));
+    assert_eq!(list, mirror.publisher_update("/t").params[2]);
+    order.notification_withdrawn(number);
+    order.forget_notifications();
+    assert_eq!(
+        order.next_notification(now, A, &mirror),
+        NextNotification::Idle
+    );
+}
+
+#[test]
 fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));

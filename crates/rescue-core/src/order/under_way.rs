@@ -116,19 +116,17 @@ impl UnderWay {
         }
     }
 
-    /// Removes an answer or a notification.
-    pub(super) fn remove(&mut self, number: u64) {
-        for recipient in self
-            .deliveries
-            .remove(&number)
-            .into_iter()
-            .flat_map(|delivery| delivery.recipients)
-        {
+    /// Removes an answer or a notification. Returns its recipients.
+    pub(super) fn remove(&mut self, number: u64) -> Vec<Recipient> {
+        let delivery = self.deliveries.remove(&number);
+        let recipients = delivery.map_or_else(Vec::new, |delivery| delivery.recipients);
+        for recipient in &recipients {
             self.by_subject.remove(&recipient.subject, number);
-            if self.newest.get(&recipient) == Some(&number) {
-                self.newest.remove(&recipient);
+            if self.newest.get(recipient) == Some(&number) {
+                self.newest.remove(recipient);
             }
         }
+        recipients
     }
 
     /// Drops the answers that were written at least [`RECENT`] ago.
