@@ -121,8 +121,10 @@ impl Member {
     pub(super) fn give_up(&mut self) {
         if self.records() {
             self.chores.notifying.stop();
-            // Its own state is the only one, as long as it is not in the journal.
-            self.journal.own_wins |= self.reading.loaded && self.journal.is_empty();
+            // Its own state is the only one, as long as it is not in the journal. After a loss, the journal need not have been
+            // read for that.
+            let is_known = self.reading.loaded || self.data_loss.times > 0;
+            self.journal.own_wins |= is_known && self.journal.is_empty();
         }
         // A computer that is cut off and serves has its own history.
         let binds = !self.keeps_writes();
