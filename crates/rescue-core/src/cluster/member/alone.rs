@@ -19,7 +19,7 @@ impl Member {
         let led = self.records();
         self.end_master();
         let base = match led || self.follows() {
-            true => &self.journal.state,
+            true => self.known_state(),
             false => &self.local.state,
         };
         // The nodes continue from what they wrote in earlier periods of being cut off.
@@ -74,6 +74,14 @@ impl Member {
         self.all_ready();
     }
 
+    /// The journal's state as far as it has been read. An empty journal says nothing, so this computer's own state counts.
+    fn known_state(&self) -> &Master {
+        match self.journal.is_empty() {
+            true => &self.local.state,
+            false => &self.journal.state,
+        }
+    }
+
     /// From now on, keeps answered writes for the leader. `base` is the present state.
     fn begin_cut_off(&mut self, base: Master) {
         let first = self.cut_off.is_empty();
@@ -95,7 +103,7 @@ impl Member {
         let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
         let answered: Vec<_> = changes.iter().filter(answered).collect();
         if !answered.is_empty() {
-            let base = self.journal.state.clone();
+            let base = self.known_state().clone();
             self.begin_cut_off(base);
             let kept = self.cut_off.add(answered, true);
             self.also_send(&kept);

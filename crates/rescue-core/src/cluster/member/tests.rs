@@ -264,3 +264,41 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
     };
     assert_eq!(followed(late), Some(2.into()));
 }
+
+/// A computer begins a journal, and is cut off before the journal has its state. Compared with the empty journal,
+/// everything in the next leader's state would be a change of others.
+#[test]
+fn who_is_cut_off_from_an_empty_journal_begins_in_its_own_state() {
+    let mut state = Master::default();
+    state.apply(&set(1));
+    let own = LocalCheckpoint {
+        state: state.clone(),
+        restored: true,
+        ..LocalCheckpoint::default()
+    };
+    let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
+    let mut member = Member::new(settings, keys, own, None, "a-1".to_owned());
+    let mut now = Instant::now();
+    let mut inputs = VecDeque::from([Input::Begin]);
+    while member.role() != Role::Alone {
+        let input = inputs.pop_front().unwrap_or_else(|| {
+            now = member.deadline().unwrap();
+            Input::Wake
+        });
+        for action in member.on(now, input) {
+            match action {
+                Action::Load(_) => inputs.push_back(Input::Loaded(Some(Read::empty()))),
+                Action::Send { number, op, .. } => {
+                    let answer = match op {
+                        machine::Op::Read => EtcdAnswer::Is(View::default()),
+                        machine::Op::Claim { seq, .. } => EtcdAnswer::Applied { revision: 1, seq },
+                        machine::Op::Beat { .. } => continue,
+                    };
+                    inputs.push_back(Input::Answer { number, answer });
+                }
+                _ => {}
+            }
+        }
+    }
+    assert_eq!(member.partition_writes().unwrap().base, state);
+}
