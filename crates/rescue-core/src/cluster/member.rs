@@ -408,6 +408,7 @@ impl Member {
         self.update_standing();
         self.update_probes(now);
         self.update_merge(now);
+        self.update_release();
         self.update_chores(now);
     }
 }

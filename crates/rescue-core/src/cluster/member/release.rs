@@ -28,6 +28,8 @@ pub(super) struct Release {
     pub(super) why: Why,
     /// The time limit of the handover or the stop.
     pub(super) by: Option<Instant>,
+    /// The computer that is to lead next, until the machine knows of the release. Empty for any.
+    to: Option<String>,
 }
 
 impl Release {
@@ -75,7 +77,17 @@ impl Member {
         self.release.why = why;
         let term = self.machine.term().unwrap_or_default();
         self.publish_leading(term);
-        self.queue_input(machine::Input::HandOver(to));
+        self.release.to = Some(to);
+    }
+
+    /// Has the machine give up leadership once it knows of all changes. A state that is still being prepared may be all
+    /// that a new journal is to have, and the next leader may hold less.
+    pub(super) fn update_release(&mut self) {
+        if self.outgoing.last() <= self.outgoing.ready()
+            && let Some(to) = self.release.to.take()
+        {
+            self.queue_input(machine::Input::HandOver(to));
+        }
     }
 
     /// Ends a handover: another computer may lead now.
