@@ -155,8 +155,9 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             }
         };
         let Some((sign, _)) = answer else {
-            let withdraw = |order: &mut Order, _: &Master| order.notification_withdrawn(number);
-            nodes.ledger.with_order(withdraw);
+            nodes
+                .ledger
+                .release(|order| order.notification_withdrawn(number));
             continue;
         };
         nodes

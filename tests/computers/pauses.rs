@@ -166,6 +166,11 @@ fn is_sending_to(computer: &Computer, port: u16) -> bool {
     })
 }
 
+/// The last value of the parameter that the node was told.
+fn last_told(watcher: &Named) -> Option<i32> {
+    told(watcher.it()).get(&key(0))?.last().copied()
+}
+
 /// A rosmaster notifies a node whose cable is cut, and is killed. Its kernel would send the notification again and again
 /// until the cable is mended, and then the node would get it after the next leader's.
 #[test]
@@ -180,11 +185,7 @@ fn no_old_notification_arrives_after_a_cut() {
         &fleet.computers[rest[1]],
     );
     let watcher = watch(cut);
-    let last = || {
-        told(watcher.it())
-            .get(&key(0))
-            .and_then(|of| of.last().copied())
-    };
+    let last = || last_told(&watcher);
     // Each thread of rosmaster has its own connection to the node. Soon all of them exist.
     for value in -50..=1 {
         first.set_param(&key(0), value);
@@ -223,11 +224,7 @@ fn no_old_notification_of_the_mirror_arrives_after_a_cut() {
         &fleet.computers[rest[1]],
     );
     let watcher = watch(cut);
-    let last = || {
-        told(watcher.it())
-            .get(&key(0))
-            .and_then(|of| of.last().copied())
-    };
+    let last = || last_told(&watcher);
     first.set_param(&key(0), 1);
     eventually("the node is told", || last() == Some(1));
     fleet.network.cut_way(rest[0], leader);

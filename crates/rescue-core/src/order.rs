@@ -414,11 +414,12 @@ impl Order {
     }
 
     /// Notes that the notification `number` was given up before the node took it, because another computer may notify nodes
-    /// now. If this one still does, the node is told the state.
-    pub fn notification_withdrawn(&mut self, number: u64) {
+    /// now. If this one still does, the node is told the state. Returns whether a call or a notification waits for this one.
+    pub fn notification_withdrawn(&mut self, number: u64) -> bool {
         for Recipient { port, subject } in self.under_way.remove(number) {
             self.notify_of_state(&port, subject);
         }
+        std::mem::take(&mut self.awaited)
     }
 
     /// Drops all waiting notifications for the node at `port`.
