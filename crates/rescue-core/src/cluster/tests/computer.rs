@@ -112,6 +112,9 @@ pub(super) struct Computer {
     /// Whether etcd had an older copy when this process read it first, and no new journal has begun since. The copy looks
     /// like any journal.
     pub(super) unaware: bool,
+    /// Whether an older journal has gone on with a leader that did not know of the loss, and this process has not followed
+    /// it yet. Answers of that leader may be newer than what this process shows.
+    pub(super) follows_lost: bool,
     /// The term in which an earlier process led, if the mirror still has its state, and the journal lacked something of it.
     pub(super) restored_early: Option<u64>,
     /// By how much the computer's clock is too fast, in millionths.
@@ -188,6 +191,7 @@ impl Computer {
             seen_unreadable: 0,
             has_read: false,
             unaware: false,
+            follows_lost: false,
             restored_early: None,
             drift,
             clock: Instant::now() + Duration::from_secs(1),
@@ -218,6 +222,7 @@ impl Computer {
         self.life += 1;
         self.seen_unreadable = 0;
         (self.has_read, self.unaware) = (false, false);
+        self.follows_lost = false;
         self.restored_early = self.disk.early;
         self.up = true;
         self.hangs_until = 0;

@@ -41,6 +41,28 @@ pub(super) enum Held {
     Damaged,
 }
 
+/// An entry that was added to the journal.
+#[derive(Debug)]
+pub(super) struct LogEntry {
+    pub(super) added: u64,
+    /// The number of its last record.
+    pub(super) seq: u64,
+    pub(super) term: u64,
+    /// The computer that added it.
+    pub(super) writer: usize,
+    pub(super) held: Held,
+}
+
+impl LogEntry {
+    /// The number of one of its records.
+    pub(super) fn seq_of(&self, part: usize) -> u64 {
+        match &self.held {
+            Held::Records(records) => records[part].seq,
+            Held::State(_) | Held::Damaged => self.seq,
+        }
+    }
+}
+
 /// A copy of etcd's data.
 #[derive(Clone, Debug)]
 struct Copy {
@@ -73,12 +95,8 @@ pub(super) struct Etcd {
     members: BTreeMap<String, (MemberEntry, u64)>,
     /// The computers whose claims have succeeded, in order.
     pub(super) claims: Vec<usize>,
-    /// All entries that were added to the journal, and when.
-    pub(super) log: Vec<(u64, Held)>,
-    /// The term of each entry of the log.
-    pub(super) terms: Vec<u64>,
-    /// The computer that added each entry of the log.
-    pub(super) writers: Vec<usize>,
+    /// All entries that were added to the journal.
+    pub(super) log: Vec<LogEntry>,
     pub(super) now: u64,
     /// Whether all data was lost once.
     pub(super) lost: bool,
@@ -90,6 +108,8 @@ pub(super) struct Etcd {
     pub(super) replaced_at: u64,
     /// Whether an older copy was restored, and no computer has led with it yet or begun a new journal.
     pub(super) is_old: bool,
+    /// Whether the leader of a new journal without a state could not know of the last loss.
+    begins_unaware: bool,
     /// The places in the log where a new journal began, or an older one went on, and whether its leader could not know of
     /// the loss.
     pub(super) beginnings: Vec<(usize, bool)>,
@@ -111,21 +131,20 @@ impl Etcd {
             members: BTreeMap::new(),
             claims: Vec::new(),
             log: Vec::new(),
-            terms: Vec::new(),
-            writers: Vec::new(),
             now: 0,
             lost: false,
             lost_at: 0,
             is_lost: false,
             replaced_at: 0,
             is_old: false,
+            begins_unaware: false,
             beginnings: Vec::new(),
         }
     }
 
     /// Whether the journal has this call.
     pub(super) fn holds(&self, call: &Request) -> bool {
-        self.log.iter().rev().any(|(_, held)| match held {
+        self.log.iter().rev().any(|entry| match &entry.held {
             Held::Records(records) => records.iter().any(|record| match &record.entry {
                 JournalEntry::Call { call: of, .. } => of.params() == call.params(),
                 JournalEntry::Session(_) => false,
@@ -136,7 +155,7 @@ impl Etcd {
 
     /// When the entry at this place of the log was added. 0 if there is none yet.
     pub(super) fn added(&self, place: usize) -> u64 {
-        self.log.get(place).map_or(0, |(at, _)| *at)
+        self.log.get(place).map_or(0, |entry| entry.added)
     }
 
     pub(super) fn view(&self) -> &View {
@@ -152,8 +171,6 @@ impl Etcd {
         *self = Self {
             claims: std::mem::take(&mut self.claims),
             log: std::mem::take(&mut self.log),
-            terms: std::mem::take(&mut self.terms),
-            writers: std::mem::take(&mut self.writers),
             beginnings: std::mem::take(&mut self.beginnings),
             now: self.now,
             lost: true,
@@ -301,10 +318,13 @@ impl Etcd {
                     );
                 }
                 self.claims.push(sent.from);
-                if std::mem::take(&mut self.is_old) && begins.is_none() {
-                    // A process that started after the copy was restored, and one whose claim the network held up since
-                    // before that, take it for the journal.
-                    self.goes_on(sent.unaware || sent.sent_at < self.replaced_at);
+                let was_old = std::mem::take(&mut self.is_old);
+                // A process whose claim the network held up since before a copy was restored takes it for the journal. So
+                // does one that started after that.
+                let is_late = was_old && sent.sent_at < self.replaced_at;
+                self.begins_unaware = is_late;
+                if was_old && begins.is_none() {
+                    self.goes_on(sent.unaware || is_late);
                 }
                 let of = sent.settings.clone();
                 self.view.leader = Some(Leader {
@@ -379,7 +399,7 @@ impl Etcd {
         match &held {
             Held::State(state) => {
                 if self.entries.is_empty() && self.snapshot.is_none() {
-                    self.beginnings.push((self.log.len(), false));
+                    self.beginnings.push((self.log.len(), self.begins_unaware));
                     self.is_lost = false;
                 }
                 self.state = (**state).clone();
@@ -396,7 +416,7 @@ impl Etcd {
             Held::Damaged => {}
         }
         if !matches!(held, Held::Damaged) {
-            self.log(held.clone());
+            self.log(seq, held.clone());
         }
         let revision = self.view.revision;
         self.puts.push((revision, seq, held.clone(), bytes));
@@ -408,13 +428,17 @@ impl Etcd {
     fn goes_on(&mut self, is_unaware: bool) {
         self.beginnings.push((self.log.len(), is_unaware));
         self.is_lost = false;
-        self.log(Held::State(Box::new(self.state.clone())));
+        self.log(self.seq(), Held::State(Box::new(self.state.clone())));
     }
 
-    fn log(&mut self, held: Held) {
-        self.log.push((self.now, held));
-        self.terms.push(self.view.guard().leader);
-        self.writers.push(*self.claims.last().unwrap());
+    fn log(&mut self, seq: u64, held: Held) {
+        self.log.push(LogEntry {
+            added: self.now,
+            seq,
+            term: self.view.guard().leader,
+            writer: *self.claims.last().unwrap(),
+            held,
+        });
     }
 
     /// Deletes the journal's last entry, and nothing else.

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use super::{
-    etcd::{Etcd, Held},
+    etcd::{Etcd, Held, LogEntry},
     world::COMPUTERS,
 };
 use crate::{checkpoint::format::RecordContent as JournalEntry, cluster::machine::Commit};
@@ -227,7 +227,7 @@ impl History {
             let of = self.find(of).map(|of| &self.calls[of]);
             of.is_some_and(|of| (of.key, of.value) == (call.key, call.value))
         };
-        let in_log = etcd.log.iter().any(|(_, held)| match held {
+        let in_log = etcd.log.iter().any(|entry| match &entry.held {
             Held::State(state) => value_of(state, call.key) == Some(call.value),
             Held::Records(records) => records.iter().any(|record| match &record.entry {
                 JournalEntry::Call { call, .. } => same(call.params()),
@@ -429,6 +429,15 @@ impl History {
         })
     }
 
+    /// Whether a computer that held the log before `cut` takes the record at `place` for one that it holds: an older journal
+    /// went on with a leader that did not know of the loss, and gave out the same numbers again.
+    fn is_overlooked(&self, place: usize, cut: usize, etcd: &Etcd) -> bool {
+        let held = etcd.log[..cut].last().map_or(0, |entry| entry.seq);
+        let mut branches = self.beginnings.iter().filter(|of| of.is_unaware);
+        let is_branch = branches.any(|of| cut <= of.place && of.place * 1000 <= place);
+        is_branch && etcd.log[place / 1000].seq_of(place % 1000) <= held
+    }
+
     /// Whether a computer compared two states between `since` and `moment`, because it had not read each change of the
     /// others.
     fn compared(&self, computer: usize, since: u64, moment: u64) -> bool {
@@ -490,9 +499,9 @@ impl History {
                     continue;
                 }
                 let first = places.changed[of].first();
-                let first = first.filter(|at| etcd.writers[*at / 1000] != call.computer);
+                let first = first.filter(|at| etcd.log[*at / 1000].writer != call.computer);
                 let is_lost = |at: &usize| self.is_lost_with_etcd(other.key, *at, places);
-                let first = first.filter(|at| !is_lost(at));
+                let first = first.filter(|at| !is_lost(at) && !self.is_overlooked(**at, cut, etcd));
                 if first.is_some_and(|at| *at >= cut * 1000 && *at < merged) {
                     return Err(format!("{call:?} has replaced {other:?} of others"));
                 }
@@ -547,7 +556,8 @@ impl History {
             // With `interval`, a leader may die before the journal has what it answered. The next one runs the call again.
             let first = places.changed[number].first().or(in_state);
             let first = first.filter(|first| {
-                commit != Commit::Interval || call.by == etcd.writers.get(**first / 1000).copied()
+                commit != Commit::Interval
+                    || call.by == etcd.log.get(**first / 1000).map(|of| of.writer)
             });
             if let Some(first) = first {
                 floors.push(Floor {
@@ -603,13 +613,13 @@ impl History {
                 // again, it may have been gone in between.
                 let entry = first / 1000;
                 let done = read.done.unwrap();
-                let since = done.max(etcd.log[entry].0);
+                let since = done.max(etcd.log[entry].added);
                 let of_other =
-                    matches!(read.shows, Shows::Early(term) if term != etcd.terms[entry]);
+                    matches!(read.shows, Shows::Early(term) if term != etcd.log[entry].term);
                 // The leader may have been deposed, and lead again since an older copy was restored.
                 let is_back = self.beginnings.iter().any(|of| {
                     let place = of.place;
-                    of.is_unaware && place <= entry && done < etcd.log[place].0
+                    of.is_unaware && place <= entry && done < etcd.log[place].added
                 });
                 let lost = of_other || read.shows != Shows::Agreed && is_back;
                 if !lost {
@@ -631,7 +641,7 @@ impl History {
             for floor in &floors {
                 // The floor's write may have been shown before the journal had it, or by a leader that has started
                 // again.
-                let (added, held) = &etcd.log[floor.place / 1000];
+                let LogEntry { added, held, .. } = &etcd.log[floor.place / 1000];
                 let early = *added >= read.began || matches!(held, Held::State(_));
                 let mut restarts = self.skipped.iter();
                 let between = |at: &u64| floor.shown <= *at && *at <= read.done.unwrap();
@@ -697,15 +707,15 @@ impl Places {
         let mut of = vec![Vec::new(); history.calls.len()];
         let mut changed = of.clone();
         let (mut state, mut values) = (Master::default(), Vec::new());
-        for (index, (moment, held)) in etcd.log.iter().enumerate() {
-            let records = match held {
+        for (index, entry) in etcd.log.iter().enumerate() {
+            let records = match &entry.held {
                 Held::Records(records) => records,
                 Held::Damaged => continue,
                 Held::State(whole) => {
                     state = (**whole).clone();
                     values.push((index * 1000, values_of(&state)));
                     let made = history.calls.iter().enumerate();
-                    let made = made.filter(|(_, call)| call.made < *moment);
+                    let made = made.filter(|(_, call)| call.made < entry.added);
                     for (number, call) in made {
                         if value_of(&state, call.key) == Some(call.value) {
                             of[number].push(index * 1000);

@@ -377,7 +377,7 @@ impl World {
         let begun = self.etcd.beginnings.len();
         let answer = self.etcd.run(&sent);
         if self.etcd.beginnings.len() > begun {
-            self.note_beginning();
+            self.note_beginning(at);
         }
         if *self.etcd.view() != before {
             self.show_watches();
@@ -399,9 +399,12 @@ impl World {
         self.after(delay, Event::Input(at, life, answer));
     }
 
-    /// Notes what the computers held when a new journal began.
-    fn note_beginning(&mut self) {
+    /// Notes what the computers held when `leader` began a new journal, or went on with an older one.
+    fn note_beginning(&mut self, leader: usize) {
         let (place, is_unaware) = self.etcd.beginnings[self.etcd.beginnings.len() - 1];
+        for (at, computer) in self.computers.iter_mut().enumerate() {
+            computer.follows_lost |= is_unaware && at != leader;
+        }
         let lost_at = self.etcd.lost_at;
         let patience = 3 * self.plan.ttl.as_micros() as u64 + 1000 * MS;
         let knew = self.computers.iter().map(|computer| {
@@ -530,6 +533,10 @@ impl World {
             computer.followed = computer.member.position();
             let follows = computer.member.view().origin == self.etcd.view().origin;
             computer.unaware &= self.etcd.is_old || !follows || computer.member.seq() == 0;
+            let leader = computer.member.view().guard().leader;
+            let is_current = leader == self.etcd.view().guard().leader
+                && computer.member.seq() == self.etcd.seq();
+            computer.follows_lost &= !is_current;
             computer.write_disk();
             if inputs.is_empty()
                 && let Some(sharing) = &mut computer.ledger.sharing
@@ -759,8 +766,12 @@ impl World {
         let computer = &mut self.computers[at];
         if standing == Standing::Alone {
             computer.ledger.unanswered.retain(|of| of.origin == at);
-            let cut = computer.member.seq();
-            computer.cut = (cut, self.etcd.log.len());
+            let begun = self.etcd.beginnings.last();
+            let log = match begun.filter(|_| computer.follows_lost) {
+                Some((place, _)) => *place,
+                None => self.etcd.log.len(),
+            };
+            computer.cut = (computer.member.seq(), log);
         }
         computer.standing = standing;
         for (_, missed) in &mut computer.waiting {

@@ -307,7 +307,8 @@ impl World {
         );
         if may {
             let value = self.value(at, key);
-            let uncounted = alone || self.computers[at].unaware;
+            let computer = &self.computers[at];
+            let uncounted = alone || computer.unaware || computer.follows_lost;
             let shows = if uncounted {
                 Shows::Alone
             } else {
