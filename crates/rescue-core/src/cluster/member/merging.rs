@@ -321,9 +321,7 @@ impl Member {
             self.store_all_writes();
         }
         self.adopt();
-        if let (Role::Leading, Some(term)) = (self.published.role, self.machine.term()) {
-            self.publish_leading(term);
-        }
+        self.publish_leading();
         self.update_standing();
     }
 }

@@ -75,15 +75,17 @@ impl Member {
     /// Gives up leadership. From now on writes wait for the next leader.
     fn begin_release(&mut self, why: Why, to: String) {
         self.release.why = why;
-        let term = self.machine.term().unwrap_or_default();
-        self.publish_leading(term);
+        self.publish_leading();
         self.release.to = Some(to);
     }
 
     /// Has the machine give up leadership once it knows of all changes. A state that is still being prepared may be all
-    /// that a new journal is to have, and the next leader may hold less.
+    /// that a new journal is to have, and the next leader may hold less. A computer that has been cut off meanwhile has
+    /// nothing to give up before it leads again.
     pub(super) fn update_release(&mut self) {
-        if self.outgoing.last() <= self.outgoing.ready()
+        let may = self.outgoing.last() <= self.outgoing.ready();
+        if may
+            && self.machine.role() == Role::Leading
             && let Some(to) = self.release.to.take()
         {
             self.queue_input(machine::Input::HandOver(to));
@@ -102,10 +104,14 @@ impl Member {
         if self.release.by.is_some_and(|by| by <= now) {
             self.release.by = None;
             match self.release.why {
-                // The request may still reach etcd, so writes keep waiting.
                 Why::Asked => {
                     let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
                     self.act(Action::HandedOver(Err(why)));
+                    // A request that was sent may still reach etcd, so writes keep waiting.
+                    if self.release.to.is_some() {
+                        self.release = Release::default();
+                        self.publish_leading();
+                    }
                 }
                 Why::EndingRosout | Why::Stops => self.end(),
                 Why::No => {}

@@ -47,7 +47,7 @@ impl Member {
             }
         }
         self.store_term(term);
-        self.publish_leading(term);
+        self.publish_leading();
     }
 
     /// Has the checkpoint name the present term.

@@ -15,8 +15,12 @@ impl Member {
         }
     }
 
-    /// Publishes that this computer leads. Calls wait while partition writes are being merged.
-    pub(super) fn publish_leading(&mut self, term: u64) {
+    /// Publishes that this computer leads, if it does. Calls wait while partition writes are being merged.
+    pub(super) fn publish_leading(&mut self) {
+        let term = self.machine.term();
+        let Some(term) = term.filter(|_| self.published.role == Role::Leading) else {
+            return;
+        };
         let answers = match (self.cut_off.is_empty(), self.release.is_begun()) {
             (false, _) => AnsweredCalls::None,
             (true, true) => AnsweredCalls::Reads,

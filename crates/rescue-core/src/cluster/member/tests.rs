@@ -6,6 +6,8 @@ use crate::{
     cluster::{
         machine::{Alive, Commit, EtcdAnswer, Leader},
         merge::wire::{Ask, MergeAnswer, WriteOutcome},
+        sharing::{Change, Source},
+        standing::AnsweredCalls,
     },
 };
 use ros1_master::{
@@ -301,4 +303,54 @@ fn who_is_cut_off_from_an_empty_journal_begins_in_its_own_state() {
         }
     }
     assert_eq!(member.partition_writes().unwrap().base, state);
+}
+
+/// etcd takes no parts of a large value, so a handover cannot begin. Its time runs out, and calls do not wait any longer.
+#[test]
+fn a_handover_of_which_etcd_never_hears_ends_in_time() {
+    let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
+    let own = LocalCheckpoint::default();
+    let mut member = Member::new(settings, keys, own, None, "a-1".to_owned());
+    let mut now = Instant::now();
+    let mut inputs = VecDeque::from([Input::Begin]);
+    let (mut revision, mut refused) = (0, false);
+    while !refused {
+        let input = inputs.pop_front().unwrap_or_else(|| {
+            now = member.deadline().unwrap();
+            Input::Wake
+        });
+        for action in member.on(now, input) {
+            match action {
+                Action::Load(_) => inputs.push_back(Input::Loaded(Some(Read::empty()))),
+                Action::Send { number, op, .. } => {
+                    revision += 1;
+                    let answer = match op {
+                        machine::Op::Read => EtcdAnswer::Is(View::default()),
+                        machine::Op::Claim { seq, .. } | machine::Op::Beat { seq, .. } => {
+                            EtcdAnswer::Applied { revision, seq }
+                        }
+                    };
+                    inputs.push_back(Input::Answer { number, answer });
+                }
+                Action::StartRecording { seq, .. } => {
+                    let value = "x".repeat(4 << 20);
+                    let params = [Value::from("/n"), "/k".into(), (&*value).into()];
+                    let entry = RecordContent::call(Request::new(Method::SetParam, params));
+                    let seq = seq + 1;
+                    let change = Change::Call(Record { seq, entry }, Source::Here);
+                    inputs.push_back(Input::Recorded(vec![change]));
+                    let (to, none) = (String::new(), None);
+                    inputs.push_back(Input::HandOver { to, refused: none });
+                }
+                Action::HandedOver(result) => {
+                    assert!(result.is_err());
+                    refused = true;
+                }
+                _ => {}
+            }
+        }
+    }
+    let answers = AnsweredCalls::All;
+    let term = member.machine().term().unwrap();
+    assert_eq!(*member.standing(), Standing::Leads { term, answers });
 }
