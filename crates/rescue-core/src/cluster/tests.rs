@@ -232,6 +232,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// network held up began a journal in it; a computer still followed the lost journal when that leader answered its node; and a
 /// computer took others' records for its own of the same numbers. The simulation did not know these consequences.
 /// 40038214: a leader was cut off before it had all changes for a handover. When it led again, its writes waited forever.
+/// 40151097: a watch had delivered more of a lost journal than a read that began before and ended after an older copy was
+/// restored. It never delivered what was added to that copy.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -253,7 +255,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         13_120_837, 13_226_755, 13_262_857, 13_411_834, 13_600_982, 13_680_258, 13_765_467,
         16_287_775, 16_429_276, 18_002_370, 20_283_882, 20_312_723, 22_067_401, 22_131_170,
         22_189_077, 22_266_011, 26_145_280, 26_336_186, 26_357_598, 26_360_602, 28_204_361,
-        32_379_207, 32_410_306, 32_593_162, 32_792_019, 40_038_214,
+        32_379_207, 32_410_306, 32_593_162, 32_792_019, 40_038_214, 40_151_097,
     ] {
         play_with_data_loss(seed).check();
     }
@@ -630,12 +632,12 @@ fn broken(seed: u64, mutant: Mutant, lives: bool) -> Option<String> {
 /// without the mutant shows nothing.
 fn found(mutant: Mutant, most: u64) -> Option<(u64, String)> {
     let mut seeds = match mutant {
-        // These show once in thousands of schedules: at 1,074, 4,670, 8,212 and 16,955. In a debug build the way there takes
+        // These show once in thousands of schedules: at 1,150, 4,670, 11,704 and 18,770. In a debug build the way there takes
         // minutes.
-        Mutant::StartsFromOldCopy => 1_070..11_070,
+        Mutant::StartsFromOldCopy => 1_150..11_150,
         Mutant::KeepsForwarded => 4_660..14_660,
-        Mutant::ActsWithoutLease => 8_210..18_210,
-        Mutant::LeavesOldNews => 16_950..26_950,
+        Mutant::ActsWithoutLease => 11_700..21_700,
+        Mutant::LeavesOldNews => 18_770..28_770,
         _ => first()..first() + most,
     };
     seeds.find_map(|seed| {

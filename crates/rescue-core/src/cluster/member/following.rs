@@ -37,6 +37,8 @@ pub(super) struct Reading {
     /// How many reads must still end until one has ended that began after [`Self::refresh`] was called.
     fresh: Option<u8>,
     watching: bool,
+    /// The revision up to which the watch has delivered changes.
+    watched: u64,
     /// Whether `app/cluster` is finding out if the session in etcd continues.
     pub(super) deciding: bool,
     /// The keys `leader` and `alive` as etcd showed them last, also before the machine starts.
@@ -148,6 +150,7 @@ impl Member {
             self.reading.check_all(now);
             self.reading.is_doubtful = true;
         }
+        self.reading.watched = self.reading.watched.max(view.revision);
         let (known, origin) = (self.view().origin, view.origin);
         // What the watch delivers late is older than the answers to requests, and says nothing.
         if view.revision >= self.view().revision && self.doubts(now, &view) {
@@ -303,8 +306,10 @@ impl Member {
         if !earlier {
             self.reading.fresh = self.reading.fresh.map(|_| 0);
         }
-        if !self.reading.watching {
-            self.reading.watching = true;
+        // The watch waits for later revisions than it has delivered. In an older copy they are given out again, and the watch
+        // would miss what is added until then.
+        if !self.reading.watching || read.view.revision < self.reading.watched {
+            (self.reading.watching, self.reading.watched) = (true, read.view.revision);
             self.act(Action::Watch(read.view.clone()));
         }
         match std::mem::replace(&mut self.reading.loaded, true) {

@@ -380,6 +380,9 @@ impl World {
     /// Ends all failures and allows no new ones.
     pub(in super::super) fn heal(&mut self) {
         self.network.healed = Some(self.now);
+        for restored in [&mut self.etcd.lost_at, &mut self.etcd.replaced_at] {
+            *restored = self.now.min(*restored);
+        }
         (self.network.slow_until, self.network.etcd_slow_until) = (0, 0);
         for at in 0..COMPUTERS {
             self.computers[at].hangs_until = self.computers[at].hangs_until.min(self.now);
