@@ -234,6 +234,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// 40038214: a leader was cut off before it had all changes for a handover. When it led again, its writes waited forever.
 /// 40151097: a watch had delivered more of a lost journal than a read that began before and ended after an older copy was
 /// restored. It never delivered what was added to that copy.
+/// 40519044: a leader had seen that a journal could not be read. The simulation took a copy of that journal, which was restored
+/// later, for the one that it had seen.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -255,7 +257,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         13_120_837, 13_226_755, 13_262_857, 13_411_834, 13_600_982, 13_680_258, 13_765_467,
         16_287_775, 16_429_276, 18_002_370, 20_283_882, 20_312_723, 22_067_401, 22_131_170,
         22_189_077, 22_266_011, 26_145_280, 26_336_186, 26_357_598, 26_360_602, 28_204_361,
-        32_379_207, 32_410_306, 32_593_162, 32_792_019, 40_038_214, 40_151_097,
+        32_379_207, 32_410_306, 32_593_162, 32_792_019, 40_038_214, 40_151_097, 40_519_044,
     ] {
         play_with_data_loss(seed).check();
     }

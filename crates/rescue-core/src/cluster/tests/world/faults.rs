@@ -315,6 +315,10 @@ impl World {
         self.etcd.replaced_at = self.etcd.lost_at;
         self.counts.restored += 1;
         self.term = 0;
+        for computer in &mut self.computers {
+            // The copy may have the origin of the journal that was unreadable.
+            computer.seen_unreadable = 0;
+        }
     }
 
     /// Deletes all keys of a living etcd, or some.
