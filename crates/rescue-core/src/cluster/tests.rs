@@ -236,6 +236,8 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// restored. It never delivered what was added to that copy.
 /// 40519044: a leader had seen that a journal could not be read. The simulation took a copy of that journal, which was restored
 /// later, for the one that it had seen.
+/// 40915585: with `interval`, a leader that was cut off kept what it had answered. In the lost journal others set a value and set
+/// it back. The simulation did not know that a comparison of states hides that from a former leader, too.
 /// 402804 and 400220: a read that had begun before keys were deleted ended while their leader still had to check the journal, and
 /// it acknowledged writes.
 #[test]
@@ -258,6 +260,7 @@ fn losses_of_etcd_that_broke_a_promise_in_the_past_do_so_no_more() {
         16_287_775, 16_429_276, 18_002_370, 20_283_882, 20_312_723, 22_067_401, 22_131_170,
         22_189_077, 22_266_011, 26_145_280, 26_336_186, 26_357_598, 26_360_602, 28_204_361,
         32_379_207, 32_410_306, 32_593_162, 32_792_019, 40_038_214, 40_151_097, 40_519_044,
+        40_915_585,
     ] {
         play_with_data_loss(seed).check();
     }
