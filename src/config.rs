@@ -138,8 +138,7 @@ impl MasterConfig {
         let Self::Supervised(supervised) = self else {
             return None;
         };
-        let limit = Duration::try_from_secs_f64(supervised.timeout).ok();
-        limit.filter(|limit| !limit.is_zero())
+        supervised.socket_timeout()
     }
 }
 
@@ -155,6 +154,14 @@ pub struct SupervisedConfig {
     /// Socket timeout of the master in seconds; 0 for none.
     pub timeout: f64,
     pub rosout: bool,
+}
+
+impl SupervisedConfig {
+    /// After which time rosmaster gives up a node that does not answer. `None` for never.
+    pub(crate) fn socket_timeout(&self) -> Option<Duration> {
+        let limit = Duration::try_from_secs_f64(self.timeout).ok();
+        limit.filter(|limit| !limit.is_zero())
+    }
 }
 
 impl Config {

@@ -6,6 +6,7 @@ use std::{
     net::{Ipv4Addr, SocketAddrV4},
     path::{Path, PathBuf},
     process::Stdio,
+    time::Duration,
 };
 
 use socket2::{Domain, Socket, Type};
@@ -59,6 +60,11 @@ pub(crate) struct Rosmaster {
 }
 
 impl Rosmaster {
+    /// After which time the program gives up a node that does not answer. `None` for never.
+    pub(crate) fn socket_timeout(&self) -> Option<Duration> {
+        self.config.socket_timeout()
+    }
+
     /// Finds the rosmaster program. Its output and PID files are created next to `checkpoint`.
     pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
         Ok(Self {
@@ -198,7 +204,7 @@ mod tests {
         drop(socket);
         // A process that another test is starting holds the socket until it runs its program.
         while !is_free(port) {
-            std::thread::sleep(std::time::Duration::from_millis(1));
+            std::thread::sleep(Duration::from_millis(1));
         }
     }
 }

@@ -85,12 +85,23 @@ impl MasterProcess {
         self.current.is_some()
     }
 
-    /// Waits for `end` in a task, then reports how `pid` ended.
+    /// Waits for `end` in a task, then reports how `pid` ended. Meanwhile limits what the process sends to other computers.
     fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
         let ends = self.ends.0.clone();
+        let timeout = self.rosmaster.socket_timeout();
         crate::task::spawn(async move {
+            let limited = async {
+                match timeout {
+                    Some(timeout) => process::unsent::keep_limited(pid, timeout).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let how = tokio::select! {
+                how = end => how,
+                never = limited => match never {},
+            };
             // The receiver is gone only at shutdown.
-            let _ = ends.send((pid, end.await)).await;
+            let _ = ends.send((pid, how)).await;
         });
     }
 

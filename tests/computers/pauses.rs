@@ -157,13 +157,33 @@ fn no_read_goes_back_on_a_follower_without_etcd_while_the_leader_is_paused() {
     fleet.assert_nodes_live();
 }
 
-/// Whether a connection from this computer to `port` of another one has unsent data.
-fn is_sending_to(computer: &Computer, port: u16) -> bool {
+/// A connection to another computer that has unsent data.
+struct Sending {
+    /// Whether its process has it open.
+    is_open: bool,
+    /// When the kernel sends the data again.
+    again: Duration,
+}
+
+/// The connections from this computer to `port` of another one that have unsent data. The table's format is in
+/// `proc_net_tcp.rst` of Linux.
+fn sending_to(computer: &Computer, port: u16) -> Vec<Sending> {
     let table = computer.within(|| fs::read_to_string("/proc/thread-self/net/tcp").unwrap());
-    table.lines().skip(1).any(|line| {
+    let sending = table.lines().skip(1).filter_map(|line| {
         let columns: Vec<_> = line.split_whitespace().collect();
-        columns[2].ends_with(&format!(":{port:04X}")) && !columns[4].starts_with("00000000:")
-    })
+        let is_there = columns[2].ends_with(&format!(":{port:04X}"));
+        let (_, ticks) = columns[5].split_once(':')?;
+        let ticks = u64::from_str_radix(ticks, 16).unwrap();
+        (is_there && !columns[4].starts_with("00000000:")).then(|| Sending {
+            is_open: columns[9] != "0",
+            again: Duration::from_millis(ticks * 10),
+        })
+    });
+    sending.collect()
+}
+
+fn is_sending_to(computer: &Computer, port: u16) -> bool {
+    !sending_to(computer, port).is_empty()
 }
 
 /// The last value of the parameter that the node was told.
@@ -243,6 +263,42 @@ fn no_old_notification_of_the_mirror_arrives_after_a_cut() {
     fleet.network.mend_way(rest[0], leader);
     // The kernel tries again after 1 and 3 seconds, and rosrescue waits 3 seconds for a node.
     holds(Duration::from_secs(5), || last() == Some(3));
+    assert_eq!(last(), Some(3), "{:?}", told(watcher.it()));
+    fleet.await_whole();
+    fleet.assert_nodes_live();
+}
+
+/// rosmaster gives up a node that does not answer for 5 s, and closes the connection. Its kernel would go on sending the
+/// notification, and the node would get it after newer ones, although rosmaster lives.
+#[test]
+fn no_old_notification_arrives_after_rosmaster_has_given_up() {
+    let _turn = turn();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    let cut = fleet.others(leader)[0];
+    let first = &fleet.computers[leader];
+    let watcher = watch(&fleet.computers[cut]);
+    let last = || last_told(&watcher);
+    for value in -50..=1 {
+        first.set_param(&key(0), value);
+        eventually("the node is told", || last() == Some(value));
+    }
+    let port = watcher.it().port();
+    fleet.network.cut_cable(cut);
+    first.set_param(&key(0), 2);
+    eventually("rosmaster has notified the node", || {
+        is_sending_to(first, port)
+    });
+    // The next value is on its way in less time.
+    eventually("rosmaster has given up, and the kernel pauses", || {
+        let late = |of: &Sending| !of.is_open && of.again > Duration::from_secs(4);
+        sending_to(first, port).iter().all(late)
+    });
+    first.set_param(&key(0), 3);
+    fleet.network.mend_cable(cut);
+    eventually("the node is told 3", || last() == Some(3));
+    // The kernel doubles its pause each time, so it sends once more within the time for which the cable was cut.
+    holds(Duration::from_secs(15), || last() == Some(3));
     assert_eq!(last(), Some(3), "{:?}", told(watcher.it()));
     fleet.await_whole();
     fleet.assert_nodes_live();
