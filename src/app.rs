@@ -100,8 +100,7 @@ pub async fn run(
     say(&format!("checkpoint: {}", config.checkpoint.display()));
     say(&beginning.story);
     let restored = beginning.restored;
-    let rosmaster = supervised.as_ref().map(|supervised| &supervised.rosmaster);
-    let last = last_master(&config, &beginning, rosmaster).await;
+    let last = last_master(&config, &beginning);
     let (context, drain) = assemble(&config, beginning, last.clone()).await;
     let context = Arc::new(context);
     let notified = notify::start(guard, context.clone(), stop.clone());

@@ -17,7 +17,6 @@ use crate::{
     guardian::handover,
     ledger::Ledger,
     nodes::{Nodes, local::LocalNodes, served::Served},
-    process::Rosmaster,
     recovery::report_file,
     ros_env::MasterUri,
     server::{
@@ -39,28 +38,12 @@ use crate::{
 
 /// How long a start waits for the reports of earlier rescues. Calls wait during this time.
 const REPORTS: Duration = Duration::from_secs(1);
-/// How long a start without a checkpoint searches all processes for a rosmaster. Reading one process's environment can
-/// take 200 ms on a busy computer.
-const SEARCH: Duration = Duration::from_secs(10);
 
 /// Where the last master of the session was. `None` if it was at rosrescue's own port, where no master can be.
-///
-/// If the disk does not answer, the session is unknown, and only a master that an earlier rosrescue left running has
-/// the state: then this is where that master listens.
-pub(super) async fn last_master(
-    config: &Config,
-    beginning: &Beginning,
-    rosmaster: Option<&Rosmaster>,
-) -> Option<MasterUri> {
-    if let Some(uri) = &beginning.session.master_uri {
-        let uri = MasterUri::parse(uri).ok()?;
-        return (uri.port != config.advertised.port).then_some(uri);
-    }
-    let is_alone = beginning.store.is_none() && config.cluster.is_none();
-    let rosmaster = rosmaster.filter(|_| is_alone)?.clone();
-    let port = wait::within(SEARCH, move || rosmaster.orphan_port()).await??;
-    let host = "127.0.0.1".to_owned();
-    Some(MasterUri { host, port })
+pub(super) fn last_master(config: &Config, beginning: &Beginning) -> Option<MasterUri> {
+    let uri = beginning.session.master_uri.as_deref()?;
+    let uri = MasterUri::parse(uri).ok()?;
+    (uri.port != config.advertised.port).then_some(uri)
 }
 
 /// Creates what the tasks of this process share, and the task that carries writes to the master.

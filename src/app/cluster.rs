@@ -273,7 +273,7 @@ impl ClusterDriver {
                 });
             }
             Action::BeginMaster(cause) => {
-                let process = MasterProcess::new(self.setup.rosmaster.clone(), None, None);
+                let process = MasterProcess::new(self.setup.rosmaster.clone(), None);
                 let cause = report::cause(cause);
                 self.duties = Some(context.begin(process, Some(self.setup.rosout), cause));
             }

@@ -21,8 +21,13 @@ use crate::{
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
     upstream::Upstream,
+    wait,
     write_queue::WriteQueue,
 };
+
+/// How long a start searches all processes for a rosmaster that an earlier rosrescue left running. Reading one process's
+/// environment can take 200 ms on a busy computer.
+const SEARCH: Duration = Duration::from_secs(10);
 
 /// What the tasks of this process share, and the settings of the tasks that manage the master.
 pub(super) struct Context {
@@ -105,14 +110,14 @@ impl Context {
     ) -> (Driver, Vec<Step>) {
         let process = match rosmaster {
             Some(rosmaster) => {
-                let starter = rosmaster.clone();
-                let orphan =
-                    crate::task::spawn_blocking(move || rosmaster.claim_orphan(port)).await;
-                Some(MasterProcess::new(
-                    starter,
-                    port,
-                    orphan.unwrap_or_default(),
-                ))
+                let mut process = MasterProcess::new(rosmaster.clone(), port);
+                if let Some(orphan) = wait::within(SEARCH, move || rosmaster.claim_orphan(port))
+                    .await
+                    .flatten()
+                {
+                    process.adopt(orphan, &self.ledger, &self.upstream);
+                }
+                Some(process)
             }
             None => None,
         };

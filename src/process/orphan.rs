@@ -36,63 +36,80 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 
 /// A rosmaster that an earlier rosrescue left running.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Orphan {
-    /// The rosmaster listens at the port of the session's last master.
-    Serving(u32),
-    /// The rosmaster was given the port of the session's last master but does not listen yet, so it has no state.
-    Starting(u32),
+pub(crate) struct Orphan {
+    /// Its process id.
+    pub(crate) pid: u32,
+    /// The port at which it listens or will listen.
+    pub(crate) port: u16,
+    /// Whether it listens. Otherwise it has no state yet.
+    pub(crate) serves: bool,
 }
 
 impl Rosmaster {
-    /// The port of a rosmaster that an earlier rosrescue with this checkpoint left running. Blocks for long, because it
-    /// searches all processes.
-    pub(crate) fn orphan_port(&self) -> Option<u16> {
-        let all = find(&self.owner).into_iter();
-        let mut masters = all.filter(|pid| !runs(*pid, "rosout"));
-        masters.find_map(|pid| listeners::ports(pid).first().copied())
-    }
-
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
-    /// rosmasters. Blocks for long if it has to search all processes.
+    /// rosmasters. If it is not known where the session's last master listened, `port` is `None`: then a rosmaster that
+    /// listens anywhere is the only one that may have the state. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
         self.claim(self.pid_file.last(), port)
     }
 
+    /// Kills the rosmasters that an earlier rosrescue with this checkpoint left running. Blocks like
+    /// [`Self::claim_orphan`].
+    pub(crate) fn kill_orphans(&self) {
+        let all = self.orphans(self.pid_file.last());
+        self.kill(&all, "they may have an old state");
+    }
+
     /// See [`Self::claim_orphan`]. `last` is what the PID file says.
     fn claim(&self, last: Last, port: Option<u16>) -> Option<Orphan> {
-        let owner = &self.owner;
-        let all = match last {
-            Last::Running { pid, .. } if is_in_our_network(pid) => vec![pid],
-            Last::Running { .. } | Last::Ended => Vec::new(),
-            Last::Unknown => {
-                let mut all = find(owner);
-                all.retain(|pid| !runs(*pid, "rosout"));
-                all
-            }
-        };
+        let all = self.orphans(last);
         let was_started_for = |pid, port| match last {
             Last::Running { port: told, .. } => told == port,
             _ => was_started_for(pid, port),
         };
-        if let Some(port) = port
-            && let Some(left) = choose(port, &all, owner, was_started_for)
+        let listens = || {
+            all.iter()
+                .find_map(|pid| listeners::ports(*pid).first().copied())
+        };
+        if let Some(port) = port.or_else(listens)
+            && let Some(left) = choose(port, &all, &self.owner, was_started_for)
         {
-            let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
             if !matches!(last, Last::Running { .. }) {
-                self.pid_file.write(pid, port);
+                self.pid_file.write(left.pid, port);
             }
             return Some(left);
         }
+        self.kill(
+            &all,
+            "it does not listen at the port of this session's last master",
+        );
+        None
+    }
+
+    /// The rosmasters that an earlier rosrescue with this checkpoint left running. `last` is what the PID file says.
+    fn orphans(&self, last: Last) -> Vec<u32> {
+        match last {
+            Last::Running { pid, .. } if is_in_our_network(pid) => vec![pid],
+            Last::Running { .. } | Last::Ended => Vec::new(),
+            Last::Unknown => {
+                let mut all = find(&self.owner);
+                all.retain(|pid| !runs(*pid, "rosout"));
+                all
+            }
+        }
+    }
+
+    fn kill(&self, orphans: &[u32], why: &str) {
         let name = self.program.file_name().unwrap_or_default();
         let name = name.to_string_lossy();
-        for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
+        for &pid in orphans.iter().filter(|pid| runs(**pid, &name)) {
             tracing::info!(
                 pid,
-                "killing a rosmaster that an earlier rosrescue left running: it does not listen at the port of this session's last master"
+                why,
+                "killing a rosmaster that an earlier rosrescue left running"
             );
             unsent::kill(pid);
         }
-        None
     }
 }
 
@@ -106,18 +123,18 @@ fn choose(
     was_started_for: impl Fn(u32, u16) -> bool,
 ) -> Option<Orphan> {
     let sockets = listeners::sockets(port);
+    let serves = !sockets.is_empty();
     let mut known = all.iter().copied();
-    if sockets.is_empty() {
-        let starting = known.find(|pid| was_started_for(*pid, port));
-        return starting.map(Orphan::Starting);
-    }
-    let serving = known
-        .find(|pid| listeners::holds_one(*pid, &sockets))
-        .or_else(|| {
-            let mut others = listeners::listeners_at(port).into_iter();
-            others.find(|pid| is_orphan(*pid, owner))
-        });
-    serving.map(Orphan::Serving)
+    let pid = match serves {
+        false => known.find(|pid| was_started_for(*pid, port)),
+        true => known
+            .find(|pid| listeners::holds_one(*pid, &sockets))
+            .or_else(|| {
+                let mut others = listeners::listeners_at(port).into_iter();
+                others.find(|pid| is_orphan(*pid, owner))
+            }),
+    };
+    pid.map(|pid| Orphan { pid, port, serves })
 }
 
 /// Whether the process `pid` was started with `port` as its port.
@@ -255,8 +272,12 @@ mod tests {
             pid: orphan,
             port: 1,
         };
-        let starting = Some(Orphan::Starting(orphan));
-        assert_eq!(rosmaster.claim(last, Some(1)), starting);
+        let starting = Orphan {
+            pid: orphan,
+            port: 1,
+            serves: false,
+        };
+        assert_eq!(rosmaster.claim(last, Some(1)), Some(starting));
         assert_eq!(rosmaster.claim(Last::Unknown, Some(1)), None);
         while Stat::read(orphan).is_some_and(Stat::is_alive) {
             std::thread::sleep(Duration::from_millis(1));
@@ -280,11 +301,12 @@ mod tests {
             std::thread::sleep(Duration::from_millis(1));
         }
         let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), was_started_for);
-        assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
+        let orphan = |pid, serves| Some(Orphan { pid, port, serves });
+        assert_eq!(choose(port, &[pid, own]), orphan(own, true));
         assert_eq!(choose(port, &[pid]), None, "its port is taken");
         drop(listener);
         listeners::wait_closed(port);
-        assert_eq!(choose(port, &[own, pid]), Some(Orphan::Starting(pid)));
+        assert_eq!(choose(port, &[own, pid]), orphan(pid, false));
         assert_eq!(choose(1, &[own, pid]), None, "it is for another port");
         starting.kill().unwrap();
         starting.wait().unwrap();

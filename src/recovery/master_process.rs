@@ -38,10 +38,9 @@ pub(crate) struct MasterProcess {
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`. The last one was at `port`, and `left` is a master that an earlier rosrescue
-    /// left running.
-    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Orphan>) -> Self {
-        let mut this = Self {
+    /// Starts masters with `rosmaster`. The last one was at `port`.
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
+        Self {
             rosmaster,
             port,
             current: None,
@@ -50,29 +49,42 @@ impl MasterProcess {
             ends: mpsc::channel(4),
             end: None,
             killed: false,
-        };
-        let pid = match left {
-            None => return this,
-            Some(Orphan::Serving(pid)) => {
-                tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
-                this.current = Some(pid);
-                pid
-            }
-            Some(Orphan::Starting(pid)) => {
-                tracing::info!(
-                    pid,
-                    port,
-                    "using a rosmaster that an earlier rosrescue had just started"
-                );
-                this.starting = Some(pid);
-                pid
-            }
-        };
-        this.watch(pid, async move {
+        }
+    }
+
+    /// Takes over `orphan` before any other master is started.
+    pub(crate) fn adopt(&mut self, orphan: Orphan, ledger: &Ledger, upstream: &Upstream) {
+        let Orphan { pid, port, serves } = orphan;
+        if serves {
+            tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
+            self.current = Some(pid);
+        } else {
+            tracing::info!(
+                pid,
+                port,
+                "using a rosmaster that an earlier rosrescue had just started"
+            );
+            self.starting = Some(pid);
+        }
+        self.is_at(port, ledger, upstream);
+        self.watch(pid, async move {
             process::wait_until_ended(pid).await;
             "exit status unknown: an earlier rosrescue started it".to_owned()
         });
-        this
+    }
+
+    /// Notes that the master is at `port`, and records it.
+    fn is_at(&mut self, port: u16, ledger: &Ledger, upstream: &Upstream) {
+        let address = MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port,
+        };
+        let uri = address.to_string();
+        upstream.relocate(address);
+        if ledger.session().master_uri.as_ref() != Some(&uri) {
+            ledger.update_session(|session| session.master_uri = Some(uri));
+        }
+        self.port = Some(port);
     }
 
     /// Process id of the present master.
@@ -112,7 +124,6 @@ impl MasterProcess {
         upstream: &Upstream,
     ) -> Result<(), ProcessError> {
         let pid = match self.starting.take() {
-            // `upstream` already has this master's address, from the checkpoint.
             Some(pid) => pid,
             None => self.start(ledger, upstream).await?,
         };
@@ -123,16 +134,8 @@ impl MasterProcess {
     /// Starts a master and returns its process id.
     async fn start(&mut self, ledger: &Ledger, upstream: &Upstream) -> Result<u32, ProcessError> {
         let port = self.rosmaster.choose_port(self.port)?;
-        let address = MasterUri {
-            host: "127.0.0.1".to_owned(),
-            port,
-        };
-        let uri = address.to_string();
-        upstream.relocate(address);
-        if ledger.session().master_uri.as_ref() != Some(&uri) {
-            // Recorded before the master runs. If rosrescue dies now, its successor can find the master.
-            ledger.update_session(|session| session.master_uri = Some(uri));
-        }
+        // Recorded before the master runs. If rosrescue dies now, its successor can find the master.
+        self.is_at(port, ledger, upstream);
         let mut child = self.rosmaster.start(port).await?;
         let pid = child.id().unwrap_or_default();
         all_clear!(info, ENDED, pid, port, "started rosmaster");
@@ -142,7 +145,6 @@ impl MasterProcess {
                 Err(error) => error.to_string(),
             }
         });
-        self.port = Some(port);
         self.new = i32::try_from(pid).ok();
         Ok(pid)
     }
@@ -263,7 +265,7 @@ mod tests {
             rosout: true,
         };
         let rosmaster = Rosmaster::find(&config, Path::new("checkpoint.yaml")).unwrap();
-        let mut master = MasterProcess::new(rosmaster, Some(1), None);
+        let mut master = MasterProcess::new(rosmaster, Some(1));
         for (has_ended, killed) in [(true, false), (false, true)] {
             let mut child = Command::new("sleep").arg("60").spawn().unwrap();
             if has_ended {

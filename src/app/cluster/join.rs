@@ -86,7 +86,7 @@ pub(in crate::app) async fn join(
     let context = &setup.context;
     context.ledger.leave();
     // A master left by an earlier process may have outdated state.
-    block_in_place(|| setup.rosmaster.claim_orphan(None));
+    block_in_place(|| setup.rosmaster.kill_orphans());
     let known = setup.restored;
     let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);

@@ -70,3 +70,28 @@ fn calls_are_answered_on_a_read_only_disk_and_recorded_when_it_is_writable_again
     is_protected_again(&mut rescue);
     assert_eq!(rescue.terminate().code(), Some(0));
 }
+
+/// The first time, the next process finds nothing at the checkpoint's path. The disk stays full.
+#[test]
+fn a_living_master_is_used_again_although_nothing_was_ever_recorded() {
+    let scratch = Scratch::new();
+    let disk = SmallDisk::new(&scratch, "1m");
+    disk.fill();
+    let mut rescue = disk.rescue(&scratch);
+    let client = rescue.client();
+    let master = client.master_pid();
+    for value in 1..3 {
+        assert!(unprotected(&rescue));
+        client.set_param("/last", value);
+        rescue.kill();
+        rescue.start_again();
+        rescue.wait_serving();
+        assert_eq!(
+            client.param("/last"),
+            Some(value.into()),
+            "{}",
+            rescue.log()
+        );
+        assert_eq!(client.master_pid(), master, "{}", rescue.log());
+    }
+}
