@@ -1,6 +1,7 @@
 //! Another computer at the end of a cable: a network namespace, with a way to make packets to it or from it
 //! vanish. Needs root and iproute2.
 
+use std::net::Ipv6Addr;
 use std::process::Command;
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -103,10 +104,11 @@ impl Netns {
         self.far6(1)
     }
 
-    /// An IPv6 address of the other side.
+    /// An IPv6 address of the other side, in the form in which programs print it.
     pub(crate) fn far6(&self, host: u8) -> String {
         let net = self.net.replace('.', ":");
-        format!("fd00:{net}::{host}")
+        let address: Ipv6Addr = format!("fd00:{net}::{host}").parse().unwrap();
+        address.to_string()
     }
 
     /// Makes packets to that address vanish.
