@@ -31,7 +31,7 @@ fn no_node_notices_that_another_computer_dies_and_comes_back() {
         fleet.computers[dies].power_off();
         let late = format!("late_{round}");
         let (mut node, next, took) = scope(|scope| {
-            let library = [Library::Roscpp, Library::Rospy][round / 2 % 2];
+            let library = [Library::Roscpp, Library::Rospy][round % 2];
             let name = format!("__name:={late}");
             let computer = &fleet.computers[rest[round % 2]];
             let node = scope.spawn(move || computer.node(library, "talker", &["30", &name]));

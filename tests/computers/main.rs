@@ -9,9 +9,6 @@
     reason = "a test"
 )]
 
-use std::sync::{Condvar, Mutex, PoisonError};
-use std::thread;
-
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -49,34 +46,15 @@ mod starts;
 /// Tests of the simulated computers themselves.
 mod wiring;
 
-/// Number of tests that run now.
-static RUNNING: Mutex<usize> = Mutex::new(0);
-static ENDED: Condvar = Condvar::new();
-
-/// The turn of a test. It ends on drop.
-struct Turn;
-
-impl Drop for Turn {
-    fn drop(&mut self) {
-        *RUNNING.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
-        ENDED.notify_one();
-    }
-}
-
-/// Waits until another test may run. A test does this first, so that its turn ends after everything that it started has
-/// ended.
-fn turn() -> Turn {
-    let most = 2 * thread::available_parallelism().map_or(1, usize::from);
-    let running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
-    let running = ENDED.wait_while(running, |running| *running >= most);
-    *running.unwrap_or_else(PoisonError::into_inner) += 1;
-    Turn
+/// Waits for the turn of a test; see [`support::turn`].
+fn turn() -> support::Turn {
+    support::turn(2)
 }
 
 /// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.
 fn rounds() -> usize {
     let rounds = std::env::var("ROSRESCUE_ROUNDS");
-    rounds.map_or(3, |rounds| {
+    rounds.map_or(2, |rounds| {
         rounds.parse().expect("ROSRESCUE_ROUNDS is a number")
     })
 }

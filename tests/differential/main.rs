@@ -52,9 +52,9 @@ use script::{Script, Step, shrink, simpler};
 use stage::Failure;
 use support::Servers;
 
-const SEQUENCES: u64 = 100;
-const CRASH_SEQUENCES: u64 = 30;
-const TAKEOVER_SEQUENCES: u64 = 8;
+const SEQUENCES: u64 = 60;
+const CRASH_SEQUENCES: u64 = 20;
+const TAKEOVER_SEQUENCES: u64 = 6;
 const CALLS: u64 = 200;
 const CRASHES: u64 = 3;
 /// Starting a core takes long, so only every sixth sequence uses one.

@@ -667,7 +667,7 @@ fn no_acknowledged_call_is_lost_by_a_kill_if_the_mirror_answers_first() {
 
 /// Kills processes of a `core` that has these `arguments` in addition, and checks the state after each kill.
 fn kills(arguments: &[&str]) {
-    let (seed, kills) = (seed(), number("ROSRESCUE_SOAK_KILLS", 25));
+    let (seed, kills) = (seed(), number("ROSRESCUE_SOAK_KILLS", 15));
     println!("seed {seed}, {kills} kills");
     let scratch = Scratch::new();
     let port = free_port();

@@ -42,6 +42,7 @@ mod servers;
 mod state;
 mod status;
 mod streams;
+mod turn;
 mod twins;
 pub(crate) mod writers;
 
@@ -71,6 +72,7 @@ pub(crate) use servers::{LIMIT, Servers};
 pub(crate) use state::State;
 pub(crate) use status::{names, open_to, status};
 pub(crate) use streams::{LIBRARIES, Streams, port_of};
+pub(crate) use turn::{Turn, turn};
 pub(crate) use twins::{Twins, assert_form};
 
 /// `value` as text for a message, shortened if it is long.

@@ -135,7 +135,7 @@ impl Drivers {
 in_both_modes!(no_driver_stalls_when_its_master_is_killed);
 
 fn no_driver_stalls_when_its_master_is_killed(mode: Mode) {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let mut robot = Robot::start(mode);
     let mut drivers = Drivers::start(&robot);
     for kill in 1..=3 {
@@ -147,7 +147,7 @@ fn no_driver_stalls_when_its_master_is_killed(mode: Mode) {
 
 #[test]
 fn no_driver_stalls_while_there_is_no_master() {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let mut robot = Robot::start(Mode::Proxy);
     let mut drivers = Drivers::start(&robot);
     drivers.assert_no_stall("no master for a while", PASS, || {
@@ -162,7 +162,7 @@ fn no_driver_stalls_while_there_is_no_master() {
 in_both_modes!(no_driver_stalls_while_the_master_dies_again_and_again);
 
 fn no_driver_stalls_while_the_master_dies_again_and_again(mode: Mode) {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let seconds = std::env::var("ROSRESCUE_LOOP_SECONDS");
     let seconds = seconds.map_or(LOOP_SECONDS, |text| text.parse().unwrap());
     let mut robot = Robot::start(mode);
@@ -192,7 +192,7 @@ fn no_driver_stalls_while_the_master_dies_again_and_again(mode: Mode) {
 in_both_modes!(no_driver_stalls_behind_a_master_that_hangs);
 
 fn no_driver_stalls_behind_a_master_that_hangs(mode: Mode) {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let hangs = std::env::var("ROSRESCUE_HANGS");
     let hangs = hangs.map_or(2, |text| text.parse().unwrap());
     let robot = Robot::start_with(mode, &["--stand-in-after", "100"]);

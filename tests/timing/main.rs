@@ -1,5 +1,5 @@
-//! Tests of the whole program for short times. They run one at a time, because otherwise the processes of another test
-//! would be measured too. `tests/robot` has the tests that can run side by side.
+//! Tests of the whole program for short times. One test runs at a time for each core, because otherwise mostly the
+//! processes of other tests would be measured. `tests/robot` has the tests of which many run side by side.
 
 #![allow(
     clippy::unwrap_used,
@@ -7,8 +7,6 @@
     clippy::indexing_slicing,
     reason = "a test"
 )]
-
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 #[path = "../support/mod.rs"]
 mod support;
@@ -20,9 +18,7 @@ mod notifications;
 /// Nodes that cannot be reached delay no other node.
 mod unreachable;
 
-/// Lock for tests that must not run side by side. A test takes it first, so that it is released after everything that
-/// the test started has ended.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+/// Waits for the turn of a test; see [`support::turn`].
+fn turn() -> support::Turn {
+    support::turn(1)
 }

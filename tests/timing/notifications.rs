@@ -32,7 +32,7 @@ fn assert_heard(client: &Client, publisher: &FakeNode, subscriber: &FakeNode) {
 /// limit.
 #[test]
 fn unreachable_subscribers_delay_no_other_node() {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let net = Netns::new();
     let (_robot, client) = robot_without_master();
     net.cut(2);
@@ -54,7 +54,7 @@ fn unreachable_subscribers_delay_no_other_node() {
 /// The node accepts calls and does not answer them.
 #[test]
 fn a_subscriber_that_does_not_answer_delays_no_other_node() {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let (_robot, client) = robot_without_master();
     let [silent, living] = ["/silent", "/living"].map(FakeNode::start);
     for node in [&silent, &living] {

@@ -82,7 +82,7 @@ in_both_modes!(with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon
 
 /// rosmaster has its default settings: three threads that notify nodes, and no timeout.
 fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode) {
-    let _alone = crate::alone();
+    let _turn = crate::turn();
     let net = Netns::new();
     let mut robot = Robot::start(mode);
     let client = robot.client();

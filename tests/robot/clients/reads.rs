@@ -9,7 +9,7 @@ use crate::support::{Mode, Robot, tree};
 
 const WRITERS: usize = 6;
 const READERS: usize = 4;
-const ROUNDS: i32 = 300;
+const ROUNDS: i32 = 60;
 
 /// This holds whichever connection makes the read, and for small and large answers.
 fn a_read_returns_every_acknowledged_write(mode: Mode) {

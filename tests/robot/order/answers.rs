@@ -49,13 +49,7 @@ const SUBJECTS: [Subject; 4] = [
 ];
 
 #[test]
-fn no_notification_overtakes_an_older_answer_in_core() {
-    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
-    no_notification_overtakes_an_answer(&robot.client());
-}
-
-#[test]
-fn no_notification_overtakes_an_older_answer_in_proxy() {
+fn no_notification_overtakes_an_older_answer_beside_a_living_master() {
     let robot = Robot::start(Mode::Proxy);
     no_notification_overtakes_an_answer(&robot.client());
 }
