@@ -111,10 +111,9 @@ impl Context {
         let process = match rosmaster {
             Some(rosmaster) => {
                 let mut process = MasterProcess::new(rosmaster.clone(), port);
-                if let Some(orphan) = wait::within(SEARCH, move || rosmaster.claim_orphan(port))
-                    .await
-                    .flatten()
-                {
+                let writable = self.ledger.seen_store().is_some();
+                let claim = move || rosmaster.claim_orphan(port, writable);
+                if let Some(orphan) = wait::within(SEARCH, claim).await.flatten() {
                     process.adopt(orphan, &self.ledger, &self.upstream);
                 }
                 Some(process)

@@ -48,9 +48,14 @@ pub(crate) struct Orphan {
 impl Rosmaster {
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`, and kills its other
     /// rosmasters. If it is not known where the session's last master listened, `port` is `None`: then a rosmaster that
-    /// listens anywhere is the only one that may have the state. Blocks for long if it has to search all processes.
-    pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
-        self.claim(self.pid_file.last(), port)
+    /// listens anywhere is the only one that may have the state. `writable` says whether the PID file can be written;
+    /// otherwise it may name an earlier rosmaster. Blocks for long if it has to search all processes.
+    pub(crate) fn claim_orphan(&self, port: Option<u16>, writable: bool) -> Option<Orphan> {
+        let last = match writable {
+            true => self.pid_file.last(),
+            false => Last::Unknown,
+        };
+        self.claim(last, port)
     }
 
     /// Kills the rosmasters that an earlier rosrescue with this checkpoint left running. Blocks like

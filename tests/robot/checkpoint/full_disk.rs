@@ -71,13 +71,9 @@ fn calls_are_answered_on_a_read_only_disk_and_recorded_when_it_is_writable_again
     assert_eq!(rescue.terminate().code(), Some(0));
 }
 
-/// The first time, the next process finds nothing at the checkpoint's path. The disk stays full.
-#[test]
-fn a_living_master_is_used_again_although_nothing_was_ever_recorded() {
-    let scratch = Scratch::new();
-    let disk = SmallDisk::new(&scratch, "1m");
-    disk.fill();
-    let mut rescue = disk.rescue(&scratch);
+/// Kills rosrescue twice, and checks that the next one uses the living master and its state, although the disk has
+/// neither.
+fn keeps_its_master(mut rescue: Rescue) {
     let client = rescue.client();
     let master = client.master_pid();
     for value in 1..3 {
@@ -94,4 +90,25 @@ fn a_living_master_is_used_again_although_nothing_was_ever_recorded() {
         );
         assert_eq!(client.master_pid(), master, "{}", rescue.log());
     }
+}
+
+#[test]
+fn a_living_master_is_used_again_although_nothing_was_ever_recorded() {
+    let scratch = Scratch::new();
+    let disk = SmallDisk::new(&scratch, "1m");
+    disk.fill();
+    keeps_its_master(disk.rescue(&scratch));
+}
+
+/// The disk says that the last master has ended, and where it listened.
+#[test]
+fn a_living_master_is_used_again_although_the_disk_names_the_one_before() {
+    let scratch = Scratch::new();
+    let disk = SmallDisk::new(&scratch, "1m");
+    let mut rescue = disk.rescue(&scratch);
+    assert_eq!(rescue.terminate().code(), Some(0));
+    disk.remount("remount,ro");
+    rescue.start_again();
+    rescue.wait_serving();
+    keeps_its_master(rescue);
 }
