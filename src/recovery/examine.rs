@@ -522,6 +522,8 @@ impl Examiner {
 
     /// The addresses of ended nodes that pending writes would register again in a master with the state `found`, although
     /// it has these nodes elsewhere: they have started again, and only the master was told.
+    ///
+    /// If another node has the address where the master has such a node, the pending write is newer than that.
     async fn ended(
         &self,
         master: &mut impl Contact,
@@ -532,11 +534,19 @@ impl Examiner {
         if bears == TokenState::Nothing || Mutant::ReturnsEndedNodes.lives() {
             return Ok(ended);
         }
+        let pending = self.ledger.pending_registrants();
+        let is_taken = |node: &str, at: &str| {
+            let pending = pending.iter().map(|(other, api)| (&**other, &**api));
+            found
+                .nodes()
+                .chain(pending)
+                .any(|(other, api)| other != node && api == at)
+        };
         let mut elsewhere = BTreeSet::new();
         let mut hidden = Vec::new();
-        for (node, api) in self.ledger.pending_registrants() {
-            match found.api_of(&node) {
-                Some(now) if now == api => {}
+        for (node, api) in &pending {
+            match found.api_of(node) {
+                Some(now) if now == api || is_taken(node, now) => {}
                 Some(_) => {
                     elsewhere.insert(api);
                 }
@@ -545,16 +555,18 @@ impl Examiner {
         }
         // No inspection shows nodes that only subscribe to parameters.
         if !hidden.is_empty() {
-            let call = Inspection::ask_addresses(hidden.iter().map(|(node, _)| &**node));
+            let call = Inspection::ask_addresses(hidden.iter().map(|(node, _)| &***node));
             let reply = master.call(call).await?;
             let now = Inspection::read_addresses(&reply);
-            let moved = hidden.into_iter().zip(now);
-            let moved = moved.filter(|((_, api), now)| now.as_ref().is_some_and(|now| now != api));
-            elsewhere.extend(moved.map(|((_, api), _)| api));
+            for ((node, api), now) in hidden.into_iter().zip(now) {
+                if now.is_some_and(|now| now != *api && !is_taken(node, &now)) {
+                    elsewhere.insert(api);
+                }
+            }
         }
         for api in elsewhere.into_iter().take(ASKED_MOST) {
-            if master.is_dead(port_of(&api)).await {
-                ended.insert(api);
+            if master.is_dead(port_of(api)).await {
+                ended.insert(api.clone());
             }
         }
         Ok(ended)

@@ -1029,9 +1029,12 @@ fn every_promise_holds_when_the_disk_is_read_only_at_a_start() {
     assert_kept(READ_ONLY, 500);
 }
 
+/// * 7206070: a node starts again twice behind a stopped master. The one in between has registered and ended, and its call
+///   is pending; the port at which the master has the node is another node's by then.
 #[test]
 fn every_promise_holds_when_ports_are_taken() {
     assert_kept(TAKEN_PORTS, 500);
+    assert_kept(7_206_070, 1);
 }
 
 #[test]
