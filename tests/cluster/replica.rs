@@ -99,11 +99,20 @@ impl Leader {
             let entry = journal::pack(&self.replica.keys, rest).unwrap().entry;
             let settings = settings("a");
             let answer = self.replica.run(&settings, &beat, entry.as_ref(), None);
-            let answer = answer.await.unwrap();
-            let EtcdAnswer::Applied { revision, seq } = answer else {
-                panic!("{answer:?}");
+            let seq = match answer.await.unwrap() {
+                EtcdAnswer::Applied { revision, seq } => {
+                    (self.guard.alive, self.guard.seq) = (revision, seq);
+                    seq
+                }
+                // On a busy computer an answer of etcd may be lost. The request is then sent again, and finds itself done.
+                EtcdAnswer::Is(view)
+                    if (view.alive.as_ref()).is_some_and(|alive| alive.beat == self.beat) =>
+                {
+                    self.guard = view.guard();
+                    view.seq()
+                }
+                answer => panic!("{answer:?}"),
             };
-            (self.guard.alive, self.guard.seq) = (revision, seq);
             rest = &rest[rest.iter().take_while(|record| record.seq <= seq).count()..];
         }
     }
