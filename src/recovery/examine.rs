@@ -555,7 +555,7 @@ impl Examiner {
         }
         // No inspection shows nodes that only subscribe to parameters.
         if !hidden.is_empty() {
-            let call = Inspection::ask_addresses(hidden.iter().map(|(node, _)| &***node));
+            let call = Inspection::ask_addresses(hidden.iter().map(|(node, _)| node.as_str()));
             let reply = master.call(call).await?;
             let now = Inspection::read_addresses(&reply);
             for ((node, api), now) in hidden.into_iter().zip(now) {
