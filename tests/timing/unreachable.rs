@@ -80,7 +80,7 @@ fn crash(robot: &mut Robot) -> f64 {
 
 in_both_modes!(with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon);
 
-/// rosmaster has its default settings: three threads that notify nodes, and no timeout.
+/// More nodes cannot be reached than a master has threads that notify nodes: three, or eight of a core.
 fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode) {
     let _turn = crate::turn();
     let net = Netns::new();
@@ -158,7 +158,8 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
             !watcher.received("paramUpdate").is_empty()
         });
     });
-    // If the master sends an outdated list late, it is corrected soon.
+    // The nodes that cannot be reached hold up each of the master's threads, so the master may send an outdated list after
+    // rosrescue has sent a newer one. It is corrected soon.
     let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
     eventually("all nodes know all publishers", || {
         let fakes = living.fakes.iter().map(|fake| fake.updates("/chatter"));
@@ -168,12 +169,6 @@ fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode)
             .all(|updates| updates.last() == Some(&all))
     });
     for fake in &living.fakes {
-        let updates = fake.updates("/chatter");
-        // A core has more notifying threads than there are nodes to hold them up.
-        assert!(
-            mode == Mode::Proxy || updates.is_sorted_by_key(Vec::len),
-            "{updates:?}"
-        );
         assert_eq!(fake.received("shutdown").len(), 0);
     }
 }
