@@ -43,8 +43,8 @@ default_hup=
 if env --default-signal=HUP true 2>/dev/null; then
     default_hup="env --default-signal=HUP"
 fi
-# Tests with real ROS mostly wait for processes, so four times as many as there are cores run at once. Tests that
-# measure times (tests/timing) always run one at a time.
+# Tests with real ROS mostly wait for processes, so four times as many as there are cores run at once. Of those that
+# measure times (tests/timing), as many run as there are cores.
 export RUST_TEST_THREADS="${RUST_TEST_THREADS:-$((4 * $(nproc)))}"
 log=$(mktemp)
 trap 'rm -f "$log" "$log.failed"' EXIT

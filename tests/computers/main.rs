@@ -48,7 +48,7 @@ mod wiring;
 
 /// Waits for the turn of a test; see [`support::turn`].
 fn turn() -> support::Turn {
-    support::turn(2 * std::thread::available_parallelism().map_or(1, usize::from))
+    support::turn(2)
 }
 
 /// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.

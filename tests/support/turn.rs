@@ -1,6 +1,7 @@
 //! Turns: how many tests of one program run at once.
 
 use std::sync::{Condvar, Mutex, PoisonError};
+use std::thread;
 
 /// Number of tests that run now.
 static RUNNING: Mutex<usize> = Mutex::new(0);
@@ -16,9 +17,10 @@ impl Drop for Turn {
     }
 }
 
-/// Waits until fewer than `most` of this program's tests run. A test does this first, so that its turn ends after
-/// everything that it started has ended.
-pub(crate) fn turn(most: usize) -> Turn {
+/// Waits until fewer than `tests` of this program's tests run for each core. A test does this first, so that its turn
+/// ends after everything that it started has ended.
+pub(crate) fn turn(tests: usize) -> Turn {
+    let most = tests * thread::available_parallelism().map_or(1, usize::from);
     let running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
     let running = ENDED.wait_while(running, |running| *running >= most);
     *running.unwrap_or_else(PoisonError::into_inner) += 1;

@@ -1,5 +1,5 @@
-//! Tests of the whole program for short times. They run one at a time, because otherwise the processes of another test
-//! would be measured too. `tests/robot` has the tests that can run side by side.
+//! Tests of the whole program for short times. One test runs at a time for each core, because otherwise mostly the
+//! processes of other tests would be measured. `tests/robot` has the tests of which many run side by side.
 
 #![allow(
     clippy::unwrap_used,
