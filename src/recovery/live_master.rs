@@ -51,6 +51,9 @@ pub(crate) struct Reach {
 
 /// A connection to the master that `sentinel` is connected to. If the sentinel is still open afterwards, everything that
 /// was read and written concerns that one master.
+///
+/// A rosmaster closes a connection that has been silent for as long as its `-t`. To plan the injection of a large state
+/// takes longer on a busy computer, so the connection is made again.
 pub(crate) struct LiveMaster {
     reach: Reach,
     sentinel: Arc<Sentinel>,
@@ -162,6 +165,7 @@ impl Contact for LiveMaster {
     }
 
     async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
+        self.connection.reopen_if_closed().await?;
         let look = inspect::read_first(&mut self.connection, token);
         self.reach.while_alive(look).await
     }
@@ -171,17 +175,20 @@ impl Contact for LiveMaster {
         first: Inspection,
         previous: &Master,
     ) -> Result<Master, ExamineError> {
+        self.connection.reopen_if_closed().await?;
         let look = inspect::read_second(first, &mut self.connection, previous);
         self.reach.while_alive(look).await
     }
 
     async fn call(&mut self, call: Request) -> Result<Reply, ExamineError> {
+        self.connection.reopen_if_closed().await?;
         let reply = self.connection.call(&call);
         self.reach.while_alive(reply).await
     }
 
     async fn inject(&mut self, plan: &Plan) -> Result<RawReply, ExamineError> {
         let (request, answer) = (plan.request().clone(), plan.answer());
+        self.connection.reopen_if_closed().await?;
         let reply = self.connection.call_expecting(request, answer);
         match self.catches_up {
             true => within(CATCH_UP_LIMIT, reply).await,
@@ -255,5 +262,59 @@ async fn within<T, E: Into<ExamineError>>(
     match tokio::time::timeout(limit, work).await {
         Ok(result) => result.map_err(Into::into),
         Err(_) => Err(ExamineError::Silent { limit }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros1_master::xmlrpc::Value;
+    use tokio::{
+        io::{AsyncReadExt, AsyncWriteExt},
+        net::TcpListener,
+    };
+
+    use super::*;
+    use crate::ros_env::MasterUri;
+
+    #[tokio::test]
+    async fn a_connection_that_the_master_has_closed_is_made_again() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let uri = MasterUri::parse(&format!("http://{address}")).unwrap();
+        let timeout = Duration::from_secs(20);
+        let reach = Reach {
+            upstream: Arc::new(Upstream::new(uri, timeout, 3)),
+            supervision: Supervision::Theirs,
+            probing: Probing {
+                interval: timeout,
+                count: 1,
+                patience: timeout,
+                start_limit: timeout,
+            },
+            probe_timeout: timeout,
+        };
+        let sentinel = Arc::new(reach.upstream.connect_sentinel().await.unwrap());
+        let mut master = reach.to_examine(&sentinel).await.unwrap();
+        let (_sentinel, _) = listener.accept().await.unwrap();
+        let (closed, _) = listener.accept().await.unwrap();
+        drop(closed);
+        while !master.connection.is_closed() {
+            tokio::task::yield_now().await;
+        }
+        let answer = async {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let mut request = Vec::new();
+            while !request.ends_with(b"</methodCall>") {
+                stream.read_buf(&mut request).await.unwrap();
+            }
+            let body = ros1_master::xmlrpc::encode_reply(&Reply::Value(Value::Int(7)));
+            let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n", body.len());
+            stream.write_all(head.as_bytes()).await.unwrap();
+            stream.write_all(&body).await.unwrap();
+            stream
+        };
+        let both = async { tokio::join!(master.call(replay::has_run_id()), answer) };
+        let (reply, _stream) = tokio::time::timeout(timeout, both).await.unwrap();
+        assert_eq!(reply.unwrap(), Reply::Value(Value::Int(7)));
     }
 }

@@ -127,6 +127,15 @@ impl Connection {
         })
     }
 
+    /// Opens a new connection to the same address if a server that answers more than one call has closed this one. The
+    /// caller makes sure that the same process listens there.
+    pub(crate) async fn reopen_if_closed(&mut self) -> Result<(), CallError> {
+        if self.keeps_alive != Some(false) && self.is_closed() {
+            self.reopen().await.map_err(CallError::NotConnected)?;
+        }
+        Ok(())
+    }
+
     /// Opens the next connection to the same address.
     async fn reopen(&mut self) -> io::Result<()> {
         let connecting = timeout(CONNECT_LIMIT, TcpStream::connect(self.peer));

@@ -5,6 +5,7 @@ use std::{io, mem::MaybeUninit, net::SocketAddr, sync::Arc, time::Duration};
 
 use socket2::SockRef;
 use tokio::{net::TcpStream, sync::watch};
+use tokio_util::task::AbortOnDropHandle;
 
 use super::{ConnectError, Upstream, is_local};
 
@@ -60,19 +61,22 @@ impl Sentinel {
         Ok(())
     }
 
-    /// Runs `work` and keeps renewing the connection.
-    pub(crate) async fn during<T>(&self, upstream: &Upstream, work: impl Future<Output = T>) -> T {
-        let renewing = async {
+    /// Runs `work` and keeps renewing the connection. A task of its own does that, because the work may occupy its thread
+    /// for seconds.
+    pub(crate) async fn during<T>(
+        self: &Arc<Self>,
+        upstream: &Arc<Upstream>,
+        work: impl Future<Output = T>,
+    ) -> T {
+        let (sentinel, upstream) = (self.clone(), upstream.clone());
+        let _renewing = AbortOnDropHandle::new(crate::task::spawn(async move {
             loop {
                 tokio::time::sleep(RENEWAL).await;
                 // If this fails, the end of the connection shows why.
-                let _ = self.renew(upstream).await;
+                let _ = sentinel.renew(&upstream).await;
             }
-        };
-        tokio::select! {
-            done = work => done,
-            () = renewing => std::future::pending().await,
-        }
+        }));
+        work.await
     }
 
     /// Waits until the connection has ended, or until the other end sends data without a request, which no master does.
@@ -144,5 +148,29 @@ mod tests {
         // The process is gone, so a connection to its successor is not trusted.
         sentinel.renew(&upstream).await.unwrap();
         assert!(!sentinel.is_open());
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+    async fn it_is_renewed_while_the_work_occupies_its_thread() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let uri = crate::ros_env::MasterUri::parse(&format!("http://{address}")).unwrap();
+        let upstream = Arc::new(Upstream::new(uri, Duration::from_secs(1), 3));
+        let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
+        let (accepted, connections) = std::sync::mpsc::sync_channel(2);
+        std::thread::spawn(move || {
+            for connection in listener.incoming() {
+                let _ = accepted.send(connection);
+            }
+        });
+        let work = async {
+            tokio::task::block_in_place(|| {
+                for connection in ["the first", "the renewed"] {
+                    let next = connections.recv_timeout(Duration::from_secs(20));
+                    next.expect(connection).unwrap();
+                }
+            });
+        };
+        sentinel.during(&upstream, work).await;
     }
 }
