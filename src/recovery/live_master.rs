@@ -1,6 +1,7 @@
 //! The connection to a master that is examined, with the limits of each request.
 
 use std::{
+    io,
     net::SocketAddr,
     sync::Arc,
     time::{Duration, Instant},
@@ -24,7 +25,8 @@ use crate::{
     process::{self, listeners},
     status::software,
     upstream::{
-        Connection, RawReply, Upstream, inspect, sentinel::Sentinel, sockets, verify::Verification,
+        CallError, Connection, RawReply, Upstream, inspect, sentinel::Sentinel, sockets,
+        verify::Verification,
     },
 };
 
@@ -51,9 +53,6 @@ pub(crate) struct Reach {
 
 /// A connection to the master that `sentinel` is connected to. If the sentinel is still open afterwards, everything that
 /// was read and written concerns that one master.
-///
-/// A rosmaster closes a connection that has been silent for as long as its `-t`. To plan the injection of a large state
-/// takes longer on a busy computer, so the connection is made again.
 pub(crate) struct LiveMaster {
     reach: Reach,
     sentinel: Arc<Sentinel>,
@@ -135,6 +134,17 @@ impl LiveMaster {
     fn keeps_alive(&self) -> bool {
         self.connection.keeps_alive() != Some(false)
     }
+
+    /// Makes the connection again if the master has closed it: after each answer, or because it was silent for as long as
+    /// a rosmaster's `-t`. To plan the injection of a large state takes longer on a busy computer.
+    async fn connected(&mut self) -> Result<(), ExamineError> {
+        // While the sentinel is open, no other process can have accepted the new connection.
+        if self.connection.reopen_if_closed().await? && !self.sentinel.is_open() {
+            let ended = io::Error::other("the master has ended");
+            return Err(CallError::NotConnected(ended).into());
+        }
+        Ok(())
+    }
 }
 
 impl Contact for LiveMaster {
@@ -165,7 +175,7 @@ impl Contact for LiveMaster {
     }
 
     async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
-        self.connection.reopen_if_closed().await?;
+        self.connected().await?;
         let look = inspect::read_first(&mut self.connection, token);
         self.reach.while_alive(look).await
     }
@@ -175,20 +185,20 @@ impl Contact for LiveMaster {
         first: Inspection,
         previous: &Master,
     ) -> Result<Master, ExamineError> {
-        self.connection.reopen_if_closed().await?;
+        self.connected().await?;
         let look = inspect::read_second(first, &mut self.connection, previous);
         self.reach.while_alive(look).await
     }
 
     async fn call(&mut self, call: Request) -> Result<Reply, ExamineError> {
-        self.connection.reopen_if_closed().await?;
+        self.connected().await?;
         let reply = self.connection.call(&call);
         self.reach.while_alive(reply).await
     }
 
     async fn inject(&mut self, plan: &Plan) -> Result<RawReply, ExamineError> {
         let (request, answer) = (plan.request().clone(), plan.answer());
-        self.connection.reopen_if_closed().await?;
+        self.connected().await?;
         let reply = self.connection.call_expecting(request, answer);
         match self.catches_up {
             true => within(CATCH_UP_LIMIT, reply).await,
@@ -267,6 +277,7 @@ async fn within<T, E: Into<ExamineError>>(
 
 #[cfg(test)]
 mod tests {
+    use rescue_core::lifecycle::Input;
     use ros1_master::xmlrpc::Value;
     use tokio::{
         io::{AsyncReadExt, AsyncWriteExt},
@@ -276,8 +287,14 @@ mod tests {
     use super::*;
     use crate::ros_env::MasterUri;
 
+    async fn seen_closed(master: &mut LiveMaster) {
+        while !master.connection.is_closed() {
+            tokio::task::yield_now().await;
+        }
+    }
+
     #[tokio::test]
-    async fn a_connection_that_the_master_has_closed_is_made_again() {
+    async fn a_connection_is_made_again_only_to_the_same_master() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let uri = MasterUri::parse(&format!("http://{address}")).unwrap();
@@ -295,26 +312,34 @@ mod tests {
         };
         let sentinel = Arc::new(reach.upstream.connect_sentinel().await.unwrap());
         let mut master = reach.to_examine(&sentinel).await.unwrap();
-        let (_sentinel, _) = listener.accept().await.unwrap();
+        let (watched, _) = listener.accept().await.unwrap();
+        // Both masters close the connection before the call, and after their answer.
+        for head in ["HTTP/1.1 200 OK", "HTTP/1.0 200 OK"] {
+            let (closed, _) = listener.accept().await.unwrap();
+            drop(closed);
+            seen_closed(&mut master).await;
+            let answer = async {
+                let (mut stream, _) = listener.accept().await.unwrap();
+                let mut request = Vec::new();
+                while !request.ends_with(b"</methodCall>") {
+                    stream.read_buf(&mut request).await.unwrap();
+                }
+                let body = ros1_master::xmlrpc::encode_reply(&Reply::Value(Value::Int(7)));
+                let head = format!("{head}\r\nContent-Length: {}\r\n\r\n", body.len());
+                stream.write_all(head.as_bytes()).await.unwrap();
+                stream.write_all(&body).await.unwrap();
+            };
+            let both = async { tokio::join!(master.call(replay::has_run_id()), answer) };
+            let (reply, ()) = tokio::time::timeout(timeout, both).await.unwrap();
+            assert_eq!(reply.unwrap(), Reply::Value(Value::Int(7)), "{head}");
+            seen_closed(&mut master).await;
+            master.connection.reopen_if_closed().await.unwrap();
+        }
+        drop(watched);
         let (closed, _) = listener.accept().await.unwrap();
         drop(closed);
-        while !master.connection.is_closed() {
-            tokio::task::yield_now().await;
-        }
-        let answer = async {
-            let (mut stream, _) = listener.accept().await.unwrap();
-            let mut request = Vec::new();
-            while !request.ends_with(b"</methodCall>") {
-                stream.read_buf(&mut request).await.unwrap();
-            }
-            let body = ros1_master::xmlrpc::encode_reply(&Reply::Value(Value::Int(7)));
-            let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n", body.len());
-            stream.write_all(head.as_bytes()).await.unwrap();
-            stream.write_all(&body).await.unwrap();
-            stream
-        };
-        let both = async { tokio::join!(master.call(replay::has_run_id()), answer) };
-        let (reply, _stream) = tokio::time::timeout(timeout, both).await.unwrap();
-        assert_eq!(reply.unwrap(), Reply::Value(Value::Int(7)));
+        seen_closed(&mut master).await;
+        let error = master.call(replay::has_run_id()).await.unwrap_err();
+        assert_eq!(error.as_input(), Input::ConnectionLost, "{error}");
     }
 }

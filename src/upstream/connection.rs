@@ -127,13 +127,15 @@ impl Connection {
         })
     }
 
-    /// Opens a new connection to the same address if a server that answers more than one call has closed this one. The
-    /// caller makes sure that the same process listens there.
-    pub(crate) async fn reopen_if_closed(&mut self) -> Result<(), CallError> {
-        if self.keeps_alive != Some(false) && self.is_closed() {
+    /// Opens the next connection to the same address if the server has closed this one. Returns whether it did. Another
+    /// process may listen at the address.
+    pub(crate) async fn reopen_if_closed(&mut self) -> Result<bool, CallError> {
+        let is_closed = self.keeps_alive == Some(false) || self.is_closed();
+        if is_closed {
             self.reopen().await.map_err(CallError::NotConnected)?;
+            self.keeps_alive = None;
         }
-        Ok(())
+        Ok(is_closed)
     }
 
     /// Opens the next connection to the same address.
