@@ -1,6 +1,10 @@
 //! A cluster of etcd servers.
 
-use std::{fs::File, process::Child, process::Command, time::Duration};
+use std::{
+    fs::File,
+    process::{Child, Command},
+    time::{Duration, Instant},
+};
 
 use rescue_core::cluster::journal::Keys;
 use rosrescue::cluster::etcd::{Credentials, Etcd, Options};
@@ -56,7 +60,14 @@ impl Servers {
         (0..count).for_each(|index| servers.start(index));
         if scheme == "http" {
             let keys = Keys::new("robot");
-            servers.client().view(&keys, LIMIT).await.unwrap();
+            let client = servers.client();
+            client.view(&keys, LIMIT).await.unwrap();
+            // A member answers only after the others have got to know its address.
+            let start = Instant::now();
+            while let Some(error) = client.status(LIMIT).await.into_iter().find_map(Result::err) {
+                assert!(start.elapsed() < LIMIT, "{error}");
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
         }
         servers
     }
