@@ -8,7 +8,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rescue_core::health::port_of;
 use rustix::{
     io::Errno,
     net::{AddressFamily, SocketFlags, SocketType, bind, netlink::SocketAddrNetlink, socket_with},
@@ -182,15 +181,14 @@ async fn check_addresses(nodes: &Arc<Nodes>) {
 
 fn names_at(nodes: &Nodes, ports: &[String]) -> Vec<String> {
     nodes.ledger.with_mirror(|mirror| {
-        let nodes = mirror.nodes();
-        let at = nodes.filter(|(_, api)| ports.iter().any(|port| port == port_of(api)));
+        let at = ports.iter().flat_map(|port| mirror.nodes_at(port));
         at.map(|(name, _)| name.to_owned()).collect()
     })
 }
 
 /// Tells the nodes at `ports`, and the subscribers of their topics, the present state.
 fn notify_returned(nodes: &Arc<Nodes>, ports: &[String]) {
-    notifications::notify_ports(nodes, |of| ports.iter().any(|port| port == of));
+    notifications::notify_ports(nodes, ports);
     let names = names_at(nodes, ports);
     let topics: Vec<String> = nodes.ledger.with_mirror(|mirror| {
         let topics = names.iter().flat_map(|name| mirror.publications(name));

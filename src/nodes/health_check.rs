@@ -198,7 +198,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
                 refused = None;
                 if nodes.clear(port) {
                     // Notifications to this node were held back until now.
-                    notifications::notify_ports(nodes, |of| of == port);
+                    notifications::notify_ports(nodes, &[port]);
                 }
             }
         }
@@ -261,7 +261,7 @@ impl Asked {
     fn registered_at(nodes: &Nodes, port: &str, reaches: &BTreeMap<String, Reach>) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
             let mut all = BTreeMap::<_, Self>::new();
-            for (node, api) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
+            for (node, api) in mirror.nodes_at(port) {
                 let reach = reaches.get(node);
                 let Some(reach) = reach.filter(|reach| reach.answer_counts()) else {
                     continue;

@@ -245,8 +245,7 @@ async fn probe_port(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) 
     // Nothing is logged while the mirror stands in: the health check afterwards reports dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
         let names: Vec<_> = nodes.ledger.with_activity(|mirror, activity| {
-            let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
-            let dead = nodes.filter(|(name, api)| {
+            let dead = mirror.nodes_at(&port).filter(|(name, api)| {
                 let answered = activity.pid_of(name, api).is_some();
                 let reach = reaches.get(*name);
                 reach.is_some_and(|reach| reach.refusal_proves(answered))

@@ -64,13 +64,20 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
 
 /// Notifies each node of every topic and parameter that it subscribes to.
 pub(crate) fn notify_all(nodes: &Arc<Nodes>) {
-    notify_ports(nodes, |_| true);
+    notify_of_all_subjects(nodes, |mirror| mirror.nodes().collect());
 }
 
 /// Notifies the nodes at these ports of every topic and parameter that they subscribe to.
-pub(super) fn notify_ports(nodes: &Arc<Nodes>, ports: impl Fn(&str) -> bool) {
+pub(super) fn notify_ports(nodes: &Arc<Nodes>, ports: &[impl AsRef<str>]) {
+    notify_of_all_subjects(nodes, |mirror| {
+        let nodes = ports.iter().flat_map(|port| mirror.nodes_at(port.as_ref()));
+        nodes.collect()
+    });
+}
+
+fn notify_of_all_subjects(nodes: &Arc<Nodes>, select: impl Fn(&Master) -> Vec<(&str, &str)>) {
     nodes.ledger.with_order(|order, mirror| {
-        for (name, api) in mirror.nodes().filter(|(_, api)| ports(port_of(api))) {
+        for (name, api) in select(mirror) {
             let port = port_of(api);
             for topic in mirror.subscriptions(name) {
                 order.notify_of_state(port, Subject::Topic(topic.to_owned()));
@@ -258,5 +265,5 @@ async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
 fn is_taken(nodes: &Nodes, api: &str) -> bool {
     nodes
         .ledger
-        .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
+        .with_mirror(|mirror| mirror.nodes_at(port_of(api)).any(|(_, at)| at == api))
 }

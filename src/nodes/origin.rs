@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use rescue_core::health::{Reach, port_of};
+use rescue_core::health::Reach;
 use tokio::time::timeout;
 
 use super::Nodes;
@@ -28,8 +28,9 @@ impl Nodes {
     /// The names registered at `port`, each with the computer from which it has registered; `None` for this one.
     fn origins(&self, port: &str) -> BTreeMap<String, Option<IpAddr>> {
         self.ledger.with_mirror(|mirror| {
-            let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
-            let origins = nodes.map(|(node, _)| (node.to_owned(), mirror.registered_from(node)));
+            let origins = mirror
+                .nodes_at(port)
+                .map(|(node, _)| (node.to_owned(), mirror.registered_from(node)));
             origins.collect()
         })
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use rescue_core::replay::{accepted, difference};
 use ros1_master::{
-    master::{Master, Notice, Request},
+    master::{Master, Notice, Request, port_of},
     xmlrpc::{Call, Reply, Value},
 };
 
@@ -231,6 +231,11 @@ impl<'n> Stage<'n> {
         let keys = model.params().keys().filter(|key| !key.is_empty());
         calls.extend(keys.map(|key| one("/test", "getParam", key)));
         calls.extend(KEYS.iter().map(|key| one("/n0", "getParam", key)));
+        for (node, api) in model.nodes() {
+            let at: BTreeSet<_> = model.nodes_at(port_of(api)).collect();
+            let shares = |(_, other): &(&str, &str)| port_of(other) == port_of(api);
+            assert_eq!(at, model.nodes().filter(shares).collect(), "{node}");
+        }
         let callers = CALLERS.iter().map(|caller| (*caller).to_owned());
         let known = model.nodes().map(|(caller_id, _)| caller_id.to_owned());
         let nodes: BTreeSet<String> = callers.chain(known).collect();

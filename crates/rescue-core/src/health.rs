@@ -26,6 +26,7 @@ pub use moves::{Eviction, Moving, Reap};
 pub use origin::Reach;
 pub use rates::Rates;
 pub use repeats::Repeats;
+pub use ros1_master::master::port_of;
 pub use unreachable::Unreachable;
 
 use std::collections::BTreeMap;
@@ -58,14 +59,6 @@ pub enum Reaction {
 
 /// Types by topic, as a node reports them.
 type Topics = BTreeMap<String, String>;
-
-/// The part of a node's address up to the port. Nodes whose addresses differ only behind the port are asked together.
-pub fn port_of(api: &str) -> &str {
-    let api = api.trim();
-    let host = api.find("//").map_or(0, |at| at + 2);
-    let end = api.match_indices('/').find(|(at, _)| *at >= host);
-    end.map_or(api, |(end, _)| api.split_at(end).0)
-}
 
 /// The topics that a node says it publishes and subscribes to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

@@ -35,7 +35,7 @@ pub use names::CALLER_ID;
 pub use names::{name_for, param_name_for};
 pub use notice::{Notice, NoticeSink};
 pub use ordered_map::{Iter, OrderedMap};
-pub use registry::{Node, Registrations, Registry};
+pub use registry::{Node, Registrations, Registry, port_of};
 pub use request::{Entry, Malformed, Request};
 pub use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};

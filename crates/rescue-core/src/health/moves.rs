@@ -52,12 +52,10 @@ impl Moving {
                 continue;
             }
             // The same address given by another computer may lead to another port.
-            let same_port = |other: &str, api: &str| {
-                port_of(api) == port_of(from)
+            let others = mirror.nodes_at(port_of(from)).filter(|(other, _)| {
+                *other != node
                     && mirror.registered_from(other) == mirror.registered_from(node)
-            };
-            let others = mirror.nodes().filter(|(other, api)| {
-                *other != node && same_port(other, api) && !Token::is_ours(other)
+                    && !Token::is_ours(other)
             });
             all.push(Self {
                 node: node.to_owned(),

@@ -42,20 +42,6 @@ fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<I
 }
 
 #[test]
-fn addresses_that_differ_only_after_the_port_share_it() {
-    for (api, port) in [
-        ("http://n:1/", "http://n:1"),
-        ("http://n:1", "http://n:1"),
-        (" http://n:1/a/b", "http://n:1"),
-        ("http://[::1]:1/", "http://[::1]:1"),
-        ("n", "n"),
-        ("", ""),
-    ] {
-        assert_eq!(port_of(api), port);
-    }
-}
-
-#[test]
 fn a_different_process_id_means_another_node() {
     use IdentityVerdict::{Another, Itself};
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);

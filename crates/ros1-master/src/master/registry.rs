@@ -17,6 +17,15 @@ pub(crate) enum SharedRegistration {
     ParamSubscribers,
 }
 
+/// The part of a node's address up to the port. Nodes whose addresses differ only behind the port are one program, or
+/// programs of which at most one is alive.
+pub fn port_of(api: &str) -> &str {
+    let api = api.trim();
+    let host = api.find("//").map_or(0, |at| at + 2);
+    let end = api.match_indices('/').find(|(at, _)| *at >= host);
+    end.map_or(api, |(end, _)| api.split_at(end).0)
+}
+
 /// A reference to a node. rosmaster drops it when the node has no registration left.
 #[derive(Clone, Default)]
 pub struct Node {
@@ -76,6 +85,8 @@ impl Node {
 pub struct Registry {
     /// References to nodes by caller id. No reply shows their order.
     pub nodes: OrderedMap<Node>,
+    /// The caller ids of the nodes at each port, so that no question about a port searches all nodes.
+    pub(super) at_port: Registrations,
     /// The publishers of each topic.
     pub publishers: Registrations,
     /// The subscribers of each topic.
@@ -89,6 +100,15 @@ pub struct Registry {
 }
 
 impl Registry {
+    /// The caller ids and addresses of the nodes at `port`; see [`port_of`].
+    pub(crate) fn nodes_at(&self, port: &str) -> impl Iterator<Item = (&str, &str)> {
+        let callers = self.at_port.get(port).into_iter().flatten();
+        callers.filter_map(|caller_id| {
+            let node = self.nodes.get(caller_id)?;
+            Some((caller_id.as_str(), node.api.as_str()))
+        })
+    }
+
     pub(crate) fn shared(&self, kind: SharedRegistration) -> &Registrations {
         match kind {
             SharedRegistration::Publishers => &self.publishers,
@@ -126,11 +146,7 @@ impl Registry {
         let bumped = self.add_node(caller_id, caller_api);
         let node = self.nodes.get_mut(caller_id);
         if node.is_some_and(|node| node.keys(kind).insert(key.to_owned())) {
-            let registrations = self.shared_mut(kind);
-            match registrations.get_mut(key) {
-                Some(callers) => callers.push(caller_id.to_owned()),
-                None => registrations.insert(key.to_owned(), vec![caller_id.to_owned()]),
-            }
+            push_caller(self.shared_mut(kind), key, caller_id);
         }
         bumped
     }
@@ -164,18 +180,21 @@ impl Registry {
             api: caller_api.to_owned(),
             ..Node::default()
         };
-        match self.nodes.get(caller_id) {
-            Some(node) if node.api == caller_api => None,
+        let old = match self.nodes.get(caller_id) {
+            Some(node) if node.api == caller_api => return None,
             Some(_) => {
                 let old = std::mem::replace(self.nodes.get_mut(caller_id)?, fresh());
                 self.drop_registrations(caller_id, &old);
+                drop_caller(&mut self.at_port, port_of(&old.api), caller_id);
                 Some(old.api)
             }
             None => {
                 self.nodes.insert(caller_id.to_owned(), fresh());
                 None
             }
-        }
+        };
+        push_caller(&mut self.at_port, port_of(caller_api), caller_id);
+        old
     }
 
     fn drop_registrations(&mut self, caller_id: &str, node: &Node) {
@@ -251,9 +270,26 @@ impl Registry {
     }
 
     fn forget_if_empty(&mut self, caller_id: &str) {
-        if self.nodes.get(caller_id).is_some_and(Node::is_empty) {
+        if let Some(node) = self.nodes.get(caller_id).filter(|node| node.is_empty()) {
+            drop_caller(&mut self.at_port, port_of(&node.api), caller_id);
             self.nodes.remove(caller_id);
         }
+    }
+}
+
+/// The caller ids of `nodes` by port.
+pub(super) fn by_port(nodes: &OrderedMap<Node>) -> Registrations {
+    let mut at_port = Registrations::default();
+    for (caller_id, node) in nodes {
+        push_caller(&mut at_port, port_of(&node.api), caller_id);
+    }
+    at_port
+}
+
+fn push_caller(registrations: &mut Registrations, key: &str, caller_id: &str) {
+    match registrations.get_mut(key) {
+        Some(callers) => callers.push(caller_id.to_owned()),
+        None => registrations.insert(key.to_owned(), vec![caller_id.to_owned()]),
     }
 }
 

@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use super::notice::NoticeSink;
 use super::params::Params;
-use super::registry::{Node, Registry, SharedRegistration};
+use super::registry::{self, Node, Registry, SharedRegistration};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
 use super::write::Write;
@@ -184,6 +184,11 @@ impl Master {
     pub fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
         let nodes = self.registry.nodes.iter();
         nodes.map(|(caller_id, node)| (caller_id.as_str(), node.api.as_str()))
+    }
+
+    /// Caller ids and addresses of the nodes at `port`, the part of an address that [`port_of`](super::port_of) returns.
+    pub fn nodes_at(&self, port: &str) -> impl Iterator<Item = (&str, &str)> {
+        self.registry.nodes_at(port)
     }
 
     pub fn api_of(&self, caller_id: &str) -> Option<&str> {
@@ -443,6 +448,7 @@ impl Master {
         }
         Ok(Self {
             registry: Registry {
+                at_port: registry::by_port(&nodes),
                 nodes,
                 publishers: snapshot.publishers,
                 subscribers: snapshot.subscribers,

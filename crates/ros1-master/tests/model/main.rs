@@ -3,6 +3,7 @@
 mod costs;
 mod exact;
 mod params;
+mod ports;
 mod quirks;
 
 use ros1_master::{
