@@ -5,7 +5,7 @@
 //! is done.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, HashSet},
     net::{IpAddr, SocketAddr},
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
@@ -27,7 +27,7 @@ use rescue_core::{
     replay::Token,
 };
 use ros1_master::{
-    master::{self, CALLER_ID, Kind, Method, Request, question},
+    master::{self, CALLER_ID, Kind, Master, Method, Request, question},
     xmlrpc::{Reply, Value},
 };
 use tracing::Instrument;
@@ -45,6 +45,8 @@ use crate::{
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
 /// Maximum number of questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
+/// Number of nodes after which calls go on while the visits of all nodes begin, which takes 20 microseconds each.
+const BEGUN_AT_ONCE: usize = 64;
 
 /// The result of asking the nodes at one port.
 #[derive(Debug)]
@@ -74,7 +76,7 @@ pub(crate) async fn after_recovery(
     barrier(&nodes).await;
     let mut notified = super::notify_owed(&nodes, outage, telling);
     notified.sort();
-    let visits = begin_visits(&nodes);
+    let visits = begin_visits(&nodes).await;
     drop(waiting);
     let check = collect(visits).await;
     drop(under_way);
@@ -95,19 +97,22 @@ async fn barrier(nodes: &Nodes) {
 
 /// Asks all nodes at the same time, with the limits of [`Visits`](super::visits::Visits).
 pub(crate) async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
-    collect(begin_visits(nodes)).await
+    collect(begin_visits(nodes).await).await
 }
 
-fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
-    let ports: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
-        let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-        // The master cannot call addresses that rosrescue cannot call.
-        let nodes = nodes.filter(|(_, api)| MasterUri::parse(api).is_ok());
-        nodes.map(|(_, api)| port_of(api).to_owned()).collect()
-    });
+async fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
+    let mirror = nodes.ledger.with_mirror(Master::clone);
     let mut visits = JoinSet::new();
-    for port in ports {
-        visits.spawn(boxed(visit(nodes, port, true)));
+    let mut visited = HashSet::new();
+    for (index, (name, api)) in mirror.nodes().enumerate() {
+        if index % BEGUN_AT_ONCE == 0 {
+            tokio::task::yield_now().await;
+        }
+        // The master cannot call addresses that rosrescue cannot call.
+        let is_asked = !Token::is_ours(name) && MasterUri::parse(api).is_ok();
+        if is_asked && visited.insert(port_of(api)) {
+            visits.spawn(boxed(visit(nodes, port_of(api).to_owned(), true)));
+        }
     }
     visits
 }
