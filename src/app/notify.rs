@@ -191,7 +191,10 @@ async fn report_status(context: Arc<Context>, stop: CancellationToken) {
     let mut fed = None;
     loop {
         let now = ticks.tick().await;
-        let line = context.line();
+        // With many nodes, it takes long to say how they are.
+        let looking = context.clone();
+        let line = crate::task::spawn_blocking(move || looking.line()).await;
+        let line = line.unwrap_or_else(|_| last.clone());
         if !stop.is_cancelled() && line != last {
             last.clone_from(&line);
             send(move || sd_notify::notify(&[NotifyState::Status(&line)])).await;

@@ -37,8 +37,10 @@ use crate::{
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// Pause before it is noted again since when each node's health has been the same. It costs as much as a look.
 const NOTE_AGAIN: Duration = Duration::from_secs(5);
-/// Pause before the table is read again because nodes register.
+/// Pause before the table is read again because nodes register, at least.
 const SETTLE: Duration = Duration::from_millis(100);
+/// The same pause as a multiple of the time that the last look took: a look at 10,000 nodes takes longer than [`SETTLE`].
+const SETTLE_LOOKS: u32 = 10;
 /// Number of nodes asked at the same time.
 const AT_ONCE: usize = 8;
 
@@ -159,46 +161,54 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     let mut next = Instant::now();
     let mut noted = None;
     loop {
-        tokio::select! {
+        let find_owners = tokio::select! {
             () = nodes.local.moved.notified() => {
                 nodes.local.report_moves();
                 continue;
             }
-            _ = looks.tick() => {
-                let unowned = nodes.local.unowned();
-                if !unowned.is_empty() {
-                    let local = nodes.local.clone();
-                    drop(crate::task::spawn_blocking(move || local.find_owners(&unowned)).await);
-                }
-            }
+            _ = looks.tick() => true,
             () = async {
                 tokio::time::sleep_until(next.into()).await;
                 nodes.local.registered.notified().await;
-            } => {}
+            } => false,
+        };
+        let start = Instant::now();
+        let note = noted.is_none_or(|noted| noted + NOTE_AGAIN <= start);
+        if note {
+            noted = Some(start);
         }
-        let now = Instant::now();
-        next = now + SETTLE;
-        check_nodes(&nodes);
-        if noted.is_none_or(|noted| noted + NOTE_AGAIN <= now) {
-            nodes.note_lives();
-            noted = Some(now);
-        }
+        let looking = nodes.clone();
+        let look = crate::task::spawn_blocking(move || {
+            if find_owners {
+                looking.local.find_owners();
+            }
+            check_nodes(&looking);
+            if note {
+                looking.note_lives();
+            }
+        });
+        // If it panics, the next look may succeed.
+        drop(look.await);
+        next = start + SETTLE.max(start.elapsed() * SETTLE_LOOKS);
     }
 }
 
-/// Checks all nodes once.
+/// Checks all nodes once. Blocks for some 15 microseconds per node.
 fn check_nodes(nodes: &Arc<Nodes>) {
+    let since = Instant::now();
     let names = local::names(&nodes.ledger);
     nodes.local.report_moves();
     let registered: BTreeSet<_> = names.iter().map(|name| name.port.clone()).collect();
-    // This blocks for less than a millisecond: the kernel generates some kilobytes.
     let listening = match registered.is_empty() {
         true => HashMap::new(),
         false => sockets::listening(),
     };
-    let listens = nodes
-        .local
-        .update(&names, &listening, nodes.gate.state() != State::Elsewhere);
+    let listens = nodes.local.update(
+        &names,
+        since,
+        &listening,
+        nodes.gate.state() != State::Elsewhere,
+    );
     let due = nodes.liveness.lock().liveness.round(
         &registered,
         |port| listens.get(port).copied(),

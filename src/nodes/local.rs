@@ -4,7 +4,7 @@ mod moves;
 mod unregister_dead;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet},
     net::{IpAddr, SocketAddr},
     sync::{Mutex, MutexGuard, PoisonError},
     time::Instant,
@@ -50,16 +50,16 @@ pub(crate) struct LocalNodes {
 
 #[derive(Debug, Default)]
 struct KernelFacts {
-    /// For each port of a node, the addresses to which it led when it was last looked up.
-    at: BTreeMap<String, Vec<IpAddr>>,
+    /// For each port of a node, the addresses to which it led when it was last looked up, and when that was.
+    at: HashMap<String, (Vec<IpAddr>, Instant)>,
     /// For each port that leads to this computer, the addresses at which a node may listen.
-    here: BTreeMap<String, Vec<SocketAddr>>,
+    here: HashMap<String, Vec<SocketAddr>>,
     /// Nodes of other computers that are registered under an address of this one, and that nobody can reach there.
     misaddressed: BTreeMap<String, Misaddressed>,
     registrants: Registrants,
-    evidence: BTreeMap<String, Evidence>,
+    evidence: HashMap<String, Evidence>,
     /// Dead nodes that were reported or unregistered, each with the number of its last registration.
-    handled: BTreeMap<String, u64>,
+    handled: HashMap<String, u64>,
     addresses: NodeAddresses,
 }
 
@@ -123,7 +123,7 @@ impl LocalNodes {
         let here = liveness::local_addresses(&addresses);
         let at = addresses.iter().map(SocketAddr::ip).collect();
         let mut known = self.lock();
-        known.at.insert(port.to_owned(), at);
+        known.at.insert(port.to_owned(), (at, Instant::now()));
         known.addresses.set(port, here.iter().map(SocketAddr::ip));
         match here.is_empty() {
             true => known.here.remove(port),
@@ -145,30 +145,31 @@ impl LocalNodes {
         self.lock().misaddressed.values().cloned().collect()
     }
 
-    /// Updates what is known of all nodes. `listening` is the socket table, which must be read after `names`. Returns
-    /// whether a process listens at each port of this computer. Without `proves`, as on a computer that does not see all
-    /// registrations, the table proves nothing about single names.
+    /// Updates what is known of all nodes. `names` are those of `since`, and `listening` is the socket table of a later
+    /// moment. Returns whether a process listens at each port of this computer. Without `proves`, as on a computer that
+    /// does not see all registrations, the table proves nothing about single names.
     pub(super) fn update(
         &self,
         names: &[Named],
+        since: Instant,
         listening: &Listening,
         proves: bool,
-    ) -> BTreeMap<String, bool> {
+    ) -> HashMap<String, bool> {
         let now = Instant::now();
         let known = &mut *self.lock();
         if !proves {
             known.registrants = Registrants::default();
         }
-        let registered: BTreeSet<_> = names.iter().map(|name| name.port.as_str()).collect();
+        let registered: HashSet<_> = names.iter().map(|name| name.port.as_str()).collect();
+        // A node that has registered meanwhile may need what was looked up for it.
         known
             .at
-            .retain(|port, _| registered.contains(port.as_str()));
-        known
-            .here
-            .retain(|port, _| registered.contains(port.as_str()));
-        known.addresses.retain(|port| registered.contains(port));
+            .retain(|port, (_, when)| registered.contains(port.as_str()) || *when >= since);
+        let at = &known.at;
+        known.here.retain(|port, _| at.contains_key(port));
+        known.addresses.retain(|port| at.contains_key(port));
         let here = known.here.iter();
-        let sockets: BTreeMap<_, _> = here
+        let sockets: HashMap<_, _> = here
             .map(|(port, addresses)| (port.as_str(), accepting(listening, addresses)))
             .collect();
         // The sockets at the address of a node that is elsewhere are not the node's.
@@ -238,14 +239,14 @@ impl LocalNodes {
         self.lock().addresses.update(is_own, Instant::now())
     }
 
-    /// The sockets of nodes whose owners have not been looked for yet.
-    pub(super) fn unowned(&self) -> BTreeSet<u64> {
-        self.lock().registrants.unowned()
-    }
-
-    /// Finds the owners of these sockets. Blocks for some milliseconds.
-    pub(super) fn find_owners(&self, sockets: &BTreeSet<u64>) {
-        for (socket, owner) in listeners::owners(sockets) {
+    /// Finds the owners of the nodes' sockets that have not been looked for yet. Blocks for some milliseconds if there
+    /// are any.
+    pub(super) fn find_owners(&self) {
+        let unowned = self.lock().registrants.unowned();
+        if unowned.is_empty() {
+            return;
+        }
+        for (socket, owner) in listeners::owners(&unowned) {
             self.lock().registrants.set_owner(socket, owner);
         }
     }
@@ -284,7 +285,7 @@ impl LocalNodes {
 
 impl KernelFacts {
     fn reach(&self, port: &str, from: Option<IpAddr>) -> Reach {
-        let at = self.at.get(port).map_or(&[][..], Vec::as_slice);
+        let at = self.at.get(port).map_or(&[][..], |(at, _)| at);
         Reach::classify(from, at, resolver::is_own)
     }
 
@@ -327,4 +328,24 @@ fn accepting(listening: &Listening, addresses: &[SocketAddr]) -> Vec<u64> {
         .flat_map(|address| sockets::accepting(listening, *address))
         .collect();
     sockets.into_iter().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_looked_up_for_a_node_that_registers_during_a_look_is_kept() {
+        let stats = Box::leak(Box::default());
+        let local = LocalNodes::new(Reap::Local, stats);
+        let from = "10.0.0.9".parse().ok();
+        let reach = || local.reach("http://localhost:1", from);
+        let look = |since| local.update(&[], since, &HashMap::new(), true);
+        let before = Instant::now();
+        local.set_addresses("http://localhost:1", vec![([127, 0, 0, 1], 1).into()]);
+        look(before);
+        assert_eq!(reach(), Reach::Elsewhere { loopback: true });
+        look(Instant::now() + std::time::Duration::from_secs(1));
+        assert_eq!(reach(), Reach::Doubtful);
+    }
 }

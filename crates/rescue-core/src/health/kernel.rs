@@ -9,7 +9,7 @@
 //! any of them.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeSet, HashMap, HashSet},
     time::Instant,
 };
 
@@ -93,9 +93,9 @@ struct Registrant {
 /// The process behind each registered name on this computer.
 #[derive(Debug, Default)]
 pub struct Registrants {
-    of: BTreeMap<String, Registrant>,
+    of: HashMap<String, Registrant>,
     /// The owners of the sockets of all names. `None` if the kernel hides the owner.
-    owners: BTreeMap<u64, Option<Owner>>,
+    owners: HashMap<u64, Option<Owner>>,
 }
 
 impl Registrants {
@@ -106,7 +106,7 @@ impl Registrants {
         names: &[LocalName<'a>],
         sockets: impl Fn(&'a str) -> Option<&'a [u64]>,
     ) {
-        let registered: BTreeSet<_> = names.iter().map(|name| name.node).collect();
+        let registered: HashSet<_> = names.iter().map(|name| name.node).collect();
         self.of.retain(|node, _| registered.contains(node.as_str()));
         for name in names {
             let Some(sockets) = sockets(name.port) else {

@@ -2,7 +2,7 @@
 //! unregistered because of it.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeSet, HashMap},
     time::{Duration, Instant},
 };
 
@@ -38,7 +38,7 @@ pub struct Seen {
 
 /// The last [`Reaction`] of each port at which a node is registered.
 #[derive(Debug, Default)]
-pub struct Liveness(BTreeMap<String, Port>);
+pub struct Liveness(HashMap<String, Port>);
 
 #[derive(Debug)]
 struct Port {
