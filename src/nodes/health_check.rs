@@ -46,7 +46,7 @@ const SECOND_QUESTION: Duration = Duration::from_millis(1200);
 /// Maximum number of questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
 /// Number of nodes after which calls go on while the visits of all nodes begin, which takes 20 microseconds each.
-const BEGUN_AT_ONCE: usize = 64;
+const BEGUN_AT_ONCE: usize = 8;
 
 /// The result of asking the nodes at one port.
 #[derive(Debug)]
