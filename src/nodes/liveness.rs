@@ -8,10 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rescue_core::{
-    health::{self, Evidence, Health, port_of},
-    replay::Token,
-};
+use rescue_core::health::{self, Evidence, Health};
 use ros1_master::master;
 use tokio::{
     sync::Semaphore,
@@ -91,22 +88,17 @@ impl Nodes {
         let now = Instant::now();
         // The clone releases this lock before the ledger's lock is taken.
         let unreachable = self.lock().clone();
-        let nodes: Vec<_> = self.ledger.with_activity(|mirror, activity| {
-            let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-            let nodes = nodes.map(|(name, api)| {
-                let answered = activity.pid_of(name, api).is_some();
-                let from = mirror.registered_from(name);
-                (name.to_owned(), port_of(api).to_owned(), from, answered)
-            });
-            nodes.collect()
-        });
+        let names = local::names(&self.ledger);
         let known = self.liveness.lock();
-        let lives = nodes.into_iter().map(|(name, port, from, answered)| {
+        let lives = names.into_iter().map(|named| {
+            let (name, port) = (named.node, named.port);
             let seen = known.liveness.last_seen(&port);
             let evidence = self.local.evidence(&name);
-            let reach = self.local.reach(&port, from);
+            let reach = self.local.reach(&port, named.from);
             let health = Health::from_last_seen(seen, unreachable.contains(&port), now);
-            let health = health.as_proved(reach, answered).corrected_by(evidence);
+            let health = health
+                .as_proved(reach, named.has_answered)
+                .corrected_by(evidence);
             let noted = known.since.get(&name).filter(|(noted, _)| *noted == health);
             let life = Life {
                 process: self.local.process(&name, &port),

@@ -65,35 +65,46 @@ struct KernelFacts {
 
 /// A registered name.
 pub(super) struct Named {
-    node: String,
+    pub(super) node: String,
     api: String,
     /// The address up to the port.
     pub(super) port: String,
     registered: u64,
+    /// Whether the node has ever answered at this address.
+    pub(super) has_answered: bool,
     /// The process id that the node has answered since its last registration.
     answered_pid: Option<i32>,
     /// The computer from which the node has registered; `None` for this one.
-    from: Option<IpAddr>,
+    pub(super) from: Option<IpAddr>,
 }
 
 /// All registered names, without rosrescue's own.
 pub(super) fn names(ledger: &Ledger) -> Vec<Named> {
-    ledger.with_activity(|mirror, activity| {
-        let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-        let named = nodes.map(|(node, api)| Named {
-            node: node.to_owned(),
-            api: api.to_owned(),
-            port: port_of(api).to_owned(),
-            registered: activity.last_calls(node).registered,
-            from: mirror.registered_from(node),
-            answered_pid: match activity.pid_of(node, api) {
-                Some((pid, false)) => Some(pid),
-                // An answer from before the last registration may be another process's.
-                Some((_, true)) | None => None,
-            },
+    // Calls wait for the ledger's lock, so only what the copy lacks is looked up under it.
+    let (mirror, known) = ledger.with_activity(|mirror, activity| {
+        let known = mirror.nodes().map(|(node, api)| {
+            let registered = activity.last_calls(node).registered;
+            (registered, activity.pid_of(node, api))
         });
-        named.collect()
-    })
+        let known: Vec<_> = known.collect();
+        (mirror.clone(), known)
+    });
+    let names = mirror.nodes().zip(known);
+    let names = names.filter(|((node, _), _)| !Token::is_ours(node));
+    let named = names.map(|((node, api), (registered, pid))| Named {
+        node: node.to_owned(),
+        api: api.to_owned(),
+        port: port_of(api).to_owned(),
+        registered,
+        has_answered: pid.is_some(),
+        from: mirror.registered_from(node),
+        answered_pid: match pid {
+            Some((pid, false)) => Some(pid),
+            // An answer from before the last registration may be another process's.
+            Some((_, true)) | None => None,
+        },
+    });
+    named.collect()
 }
 
 impl LocalNodes {
