@@ -108,6 +108,11 @@ impl FakeNode {
         *lock(&self.inner.ignored) = Some(method.to_owned());
     }
 
+    /// Answers everything from now on.
+    pub(crate) fn answer_all(&self) {
+        *lock(&self.inner.ignored) = None;
+    }
+
     /// The parameters of each call of `method` that the node received, in order.
     pub(crate) fn received(&self, method: &str) -> Vec<Vec<Value>> {
         let received = lock(&self.inner.received);
