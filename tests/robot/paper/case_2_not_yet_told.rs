@@ -3,7 +3,9 @@
 
 use std::ops::RangeInclusive;
 use std::thread;
+use std::time::Instant;
 
+use rescue_core::order::RECENT;
 use ros1_master::xmlrpc::Value;
 
 use crate::support::{
@@ -34,8 +36,14 @@ impl Audience {
         for fake in &fakes {
             fake.subscribe(&client, TOPIC, "std_msgs/String");
         }
+        let subscribed = Instant::now();
         let real = [Library::Rospy, Library::Roscpp]
             .map(|library| robot.node(library, "listener", &[&format!("__name:={library:?}")]));
+        // A node is told a state once more if it has just been answered. rosrescue may note an answer after the node has
+        // it, so the test waits twice as long.
+        eventually("the answers to the subscribers are old", || {
+            subscribed.elapsed() > 2 * RECENT
+        });
         Self { fakes, real }
     }
 
