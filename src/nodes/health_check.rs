@@ -45,7 +45,8 @@ use crate::{
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
 /// Maximum number of questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
-/// Number of nodes after which calls go on while the visits of all nodes begin, which takes 20 microseconds each.
+/// Number of nodes whose visits begin in one go. To begin one takes 20 µs, and calls wait meanwhile. If many begin before
+/// the first ones go on, calls wait behind all of them.
 const BEGUN_AT_ONCE: usize = 8;
 
 /// The result of asking the nodes at one port.
