@@ -8,7 +8,8 @@
 //! * The callbacks of unregistrations that are answered without a master may be lost or repeated too. The final list
 //!   may stand for several of them.
 //! * While the mirror stands in, outdated callbacks may be left out.
-//! * A node that misses a list for this reason gets a later true list.
+//! * A node that misses a list for this reason gets it later, or one that was true after it. As with a bare rosmaster,
+//!   it is not notified when a publisher is displaced.
 //! * A subscriber may get a callback again: the full list of a topic's publishers, or the value of a parameter. It
 //!   never gets a partial list, a value that was not true since the crash before the last one, or a `shutdown`. A node
 //!   that does not subscribe gets nothing.
@@ -65,7 +66,8 @@ pub(crate) struct TrueLists {
     /// Earlier states, for the values of parameters.
     states_before: Vec<Master>,
     states_since: Vec<Master>,
-    /// Lists that were true after the running call was answered.
+    /// Lists that were true since the last one that the model has sent to their subscriber, or since the crash. A list
+    /// becomes shorter without a notification when a publisher is displaced.
     after: HashSet<List>,
     /// Subscribers that have been registered all the time since then.
     faithful: Option<HashSet<(String, String)>>,
@@ -92,13 +94,16 @@ impl TrueLists {
 
     /// Notes that the call under way has led to this state.
     pub(crate) fn answered(&mut self, model: &Master) {
-        self.after.clear();
         self.faithful = None;
         self.add(model);
     }
 
     /// Notes that the model sends this call to the node at `api`.
     pub(crate) fn send(&mut self, api: &str, call: &Call) {
+        if let Some((api, topic, _)) = as_list(api, call) {
+            self.after
+                .retain(|list| (&list.0, &list.1) != (&api, &topic));
+        }
         let notice = Moment::Notice(api.to_owned(), call.clone());
         self.course.push(notice);
     }
@@ -156,7 +161,7 @@ impl TrueLists {
     }
 
     /// Whether the node at `api` must still get a replacement for a callback that the crash has lost: it subscribes,
-    /// and has not got a list that was true after the call under way.
+    /// and has not got a list that was true when the model sent its last one, or later.
     pub(crate) fn owes(&self, api: &str, swallowed: &Call, heard: &[Call]) -> bool {
         let Some((api, topic, _)) = as_list(api, swallowed) else {
             return false;
@@ -344,6 +349,36 @@ mod tests {
         lists.settled(&model);
         lists.add(&model);
         assert_eq!(lists.goes_back("http://s", &[update(1)]), None);
+    }
+
+    #[test]
+    fn a_list_that_becomes_shorter_in_silence_replaces_a_lost_one() {
+        let register = |method: &str, node: &str, api: &str| {
+            let params = vec![node.into(), "/t".into(), "a/B".into(), api.into()];
+            Call::new(method, params)
+        };
+        let mut model = Master::default();
+        let mut lists = TrueLists::default();
+        model.apply(&register("registerSubscriber", "/s", "http://s").into());
+        model.apply(&register("registerPublisher", "/p1", "http://p1").into());
+        let before = model.publisher_update("/t");
+        lists.crash(&model);
+        model.apply(&register("registerPublisher", "/p2", "http://p2").into());
+        let lost = model.publisher_update("/t");
+        lists.send("http://s", &lost);
+        lists.answered(&model);
+        let mut good = vec![lost.clone()];
+        for node in ["/p1", "/p2"] {
+            let params = vec![node.into(), "http://elsewhere".into(), "/k".into()];
+            let displacement = Call::new("subscribeParam", params);
+            model.apply(&displacement.into());
+            lists.answered(&model);
+            good.push(model.publisher_update("/t"));
+        }
+        for heard in good {
+            assert!(!lists.owes("http://s", &lost, std::slice::from_ref(&heard)));
+        }
+        assert!(lists.owes("http://s", &lost, &[before]));
     }
 
     #[test]
