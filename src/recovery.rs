@@ -19,13 +19,12 @@ use rescue_core::{
     lifecycle::{Action, Cause, Input, Supervision, evidence::Sample},
     replay::RUN_ID_AFTER,
 };
-use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use self::{
     course::{Course, Step},
-    examine::{Examination, ExamineError, Examiner, Manner, Prepared},
+    examine::{Examination, ExamineError, Examiner, InAdvance, Manner},
     live_master::Reach,
     master_process::MasterProcess,
     reporting::{LastMessage, Outage},
@@ -107,7 +106,7 @@ pub(crate) struct Driver {
     probe_deadline: Option<tokio::time::Instant>,
     /// Total delay of timers that fired late because this process had to wait for the processor.
     timers_late: Duration,
-    prepared: Option<JoinHandle<Prepared>>,
+    prepared: InAdvance,
     outage: Outage,
     last_message: Option<LastMessage>,
 }
@@ -146,7 +145,7 @@ impl Driver {
             work: None,
             probe_deadline: None,
             timers_late: Duration::ZERO,
-            prepared: None,
+            prepared: InAdvance::default(),
             last_message: None,
         }
     }
@@ -309,8 +308,7 @@ impl Driver {
             Action::Connect => {
                 // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
-                self.prepared
-                    .get_or_insert_with(|| live_master::prepare(ledger.clone()));
+                self.prepared.begin(|| live_master::prepare(ledger.clone()));
                 let upstream = self.reach.upstream.clone();
                 let new = self.process.as_ref().and_then(MasterProcess::new_one);
                 self.work = Some(Box::pin(async move {
@@ -332,7 +330,7 @@ impl Driver {
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
                 let manner = Manner {
                     known: examiner.known(new),
-                    prepared: self.prepared.take(),
+                    prepared: self.prepared.clone(),
                 };
                 let reach = self.reach.clone();
                 let master = reach.upstream.address();
@@ -546,11 +544,12 @@ impl Driver {
             ),
         }
         // The prepared injection is out of date.
-        self.prepared = None;
+        self.prepared.forget();
     }
 
     fn open_gate(&mut self) {
         self.last_message = None;
+        self.prepared.forget();
         self.examiner.ledger.open_gate();
         self.set_run_id_later();
         if let Some(number) = self.restored.take() {

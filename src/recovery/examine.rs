@@ -103,8 +103,38 @@ pub(crate) struct Examination {
 #[derive(Debug)]
 pub(crate) struct Manner {
     pub known: KnownMaster,
-    /// The call that gives an empty master the mirror's state, if it was prepared in advance.
-    pub prepared: Option<JoinHandle<Prepared>>,
+    /// The injection into an empty master, if it is prepared in advance.
+    pub prepared: InAdvance,
+}
+
+/// The injection that is prepared in another thread while the master is away. Only the examination of an empty master
+/// takes it: the first connection after a death may still be to the dying master.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct InAdvance(Arc<Mutex<Option<JoinHandle<Prepared>>>>);
+
+impl InAdvance {
+    /// Begins the preparation with `begin`, unless there is one.
+    pub(super) fn begin(&self, begin: impl FnOnce() -> JoinHandle<Prepared>) {
+        self.lock().get_or_insert_with(begin);
+    }
+
+    /// Drops the preparation. Its thread may go on, but nobody uses the result.
+    pub(super) fn forget(&self) {
+        if let Some(prepared) = self.lock().take() {
+            // To free a large plan takes time, and calls are waiting.
+            crate::task::spawn_blocking(move || drop(prepared));
+        }
+    }
+
+    /// Waits until the injection is prepared, and takes it.
+    async fn take(&self) -> Option<Prepared> {
+        let prepared = self.lock().take();
+        prepared?.await.ok()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Option<JoinHandle<Prepared>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// An *injection*: the call that gives a master the mirror's state.
@@ -354,9 +384,9 @@ impl Examiner {
             self.ledger.catch_up(number);
         }
         let fresh = bears == TokenState::Nothing && empty;
-        let mut ready = match manner.prepared {
-            Some(prepared) if fresh => prepared.await.ok(),
-            _ => None,
+        let mut ready = match fresh {
+            true => manner.prepared.take().await,
+            false => None,
         };
         let found = match fresh {
             true => Master::default(),
@@ -703,5 +733,37 @@ fn log_newer_master(difference: &[String]) {
             ?difference,
             "the master's state is newer than the checkpoint, so it is kept; possible reasons: the disk was full, the checkpoint is an old copy, or the master was changed directly"
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn an_injection_is_prepared_again_only_after_an_examination_has_taken_it() {
+        let begun = Cell::new(0);
+        let in_advance = InAdvance::default();
+        let begin = || {
+            in_advance.begin(|| {
+                begun.set(begun.get() + 1);
+                crate::task::spawn_blocking(|| Prepared {
+                    basis: None,
+                    plan: Plan::new(&Master::default(), &Master::default(), &Token::new("s", 1)),
+                    complete: true,
+                })
+            });
+        };
+        begin();
+        // The first connection was to the dying master, whose examination takes nothing.
+        begin();
+        assert_eq!(begun.get(), 1);
+        assert!(in_advance.take().await.is_some());
+        begin();
+        assert_eq!(begun.get(), 2);
+        in_advance.forget();
+        assert!(in_advance.take().await.is_none());
     }
 }

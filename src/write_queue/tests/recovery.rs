@@ -19,7 +19,7 @@ use crate::{
     ledger::{durability::Mark, owed::Telling},
     recovery::{
         course::{Course, Step},
-        examine::{Contact, Examination, ExamineError, Examiner, Manner},
+        examine::{Contact, Examination, ExamineError, Examiner, InAdvance, Manner},
     },
 };
 
@@ -290,7 +290,7 @@ impl World {
                 let is_unused = std::mem::take(&mut self.recovery.is_unused);
                 let manner = Manner {
                     known: examiner.known(is_unused.then_some(1)),
-                    prepared: None,
+                    prepared: InAdvance::default(),
                 };
                 let mut master = self.recovery.contact();
                 self.examine(SILENT_MOST, async move {
