@@ -9,9 +9,9 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::{ConnectError, Upstream, is_local};
 
-/// Pause after which the sentinel is renewed if nothing else has renewed it. A rosmaster with a sensible `-t` does not
-/// close an idle connection so soon.
-const RENEWAL: Duration = Duration::from_secs(1);
+/// Pause after which the sentinel is renewed if nothing else has renewed it. A rosmaster closes a connection that was
+/// idle for its `-t`; one second is the shortest that makes sense.
+const RENEWAL: Duration = Duration::from_millis(300);
 
 /// A connection on which nothing is ever sent. Even a master that closes each connection after one
 /// answer leaves it open. It is renewed from time to time, because a master may close idle
