@@ -69,7 +69,7 @@ pub(crate) struct TrueLists {
     /// Lists that were true since the last one that the model has sent to their subscriber, or since the crash. A list
     /// becomes shorter without a notification when a publisher is displaced.
     after: HashSet<List>,
-    /// Subscribers that have been registered all the time since then.
+    /// Subscribers that have been registered all the time since the call under way was answered.
     faithful: Option<HashSet<(String, String)>>,
     /// Events since the last comparison.
     course: Vec<Moment>,
