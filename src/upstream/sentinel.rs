@@ -9,8 +9,8 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::{ConnectError, Upstream, is_local};
 
-/// Pause after which the sentinel is renewed if nothing else has renewed it. A rosmaster closes a connection that was
-/// idle for its `-t`; one second is the shortest that makes sense.
+/// Pause between renewals during long work. A rosmaster closes a connection that was idle for its `-t`, which may be as
+/// short as one second.
 const RENEWAL: Duration = Duration::from_millis(300);
 
 /// A connection on which nothing is ever sent. Even a master that closes each connection after one
