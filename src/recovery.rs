@@ -336,8 +336,7 @@ impl Driver {
                 let master = reach.upstream.address();
                 let span = tracing::debug_span!("recovery", %master, cause = self.outage.cause);
                 let examined = async move {
-                    let examined = examine(&examiner, &reach, &sentinel, manner);
-                    let examined = sentinel.during(&reach.upstream, examined).await;
+                    let examined = examine(&examiner, &reach, &sentinel, manner).await;
                     Done::Examined(sentinel, examined)
                 };
                 self.work = Some(Box::pin(examined.instrument(span)));
@@ -345,13 +344,11 @@ impl Driver {
             Action::Probe => {
                 // A late probe continues, and its answer counts when it arrives.
                 self.probe_deadline = Some(tokio::time::Instant::now() + self.reach.probe_timeout);
-                if self.work.is_none()
-                    && let Some(sentinel) = self.sentinel.clone()
-                {
+                if self.work.is_none() && self.sentinel.is_some() {
                     let (upstream, ledger) =
                         (self.reach.upstream.clone(), self.examiner.ledger.clone());
                     self.work = Some(Box::pin(async move {
-                        Done::Probed(verify::probe(&upstream, &ledger.token(), &sentinel).await)
+                        Done::Probed(verify::probe(&upstream, &ledger.token()).await)
                     }));
                 }
             }
@@ -501,8 +498,8 @@ impl Driver {
 
     /// Keeps `sentinel` to notice the master's end.
     fn watch(&mut self, sentinel: Arc<Sentinel>) {
-        let watched = sentinel.clone();
-        self.ended = Some(Box::pin(async move { watched.wait_until_ended().await }));
+        let (upstream, renewal) = (self.reach.upstream.clone(), self.reach.renewal);
+        self.ended = Some(Box::pin(sentinel.clone().watch(upstream, renewal)));
         self.sentinel = Some(sentinel);
     }
 

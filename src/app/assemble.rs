@@ -120,6 +120,7 @@ pub(super) async fn assemble(
         supervision,
         probing: config.probing,
         probe_timeout: config.probe_timeout,
+        renewal: config.master.renewal(),
         history: config.checkpoint_bytes(),
         uri,
         checkpoint: config.checkpoint.clone(),

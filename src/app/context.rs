@@ -42,6 +42,8 @@ pub(super) struct Context {
     pub(super) supervision: Supervision,
     pub(super) probing: Probing,
     pub(super) probe_timeout: Duration,
+    /// Pause between two renewals of the sentinel.
+    pub(super) renewal: Duration,
     /// Maximum disk space for the checkpoints kept from rescues, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
@@ -63,6 +65,7 @@ impl Context {
                 supervision: self.supervision,
                 probing: self.probing,
                 probe_timeout: self.probe_timeout,
+                renewal: self.renewal,
             },
             self.write_queue.clone(),
             self.nodes.clone(),

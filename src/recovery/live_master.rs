@@ -49,6 +49,8 @@ pub(crate) struct Reach {
     pub(crate) probing: Probing,
     /// Longest time for the master to answer a probe.
     pub(crate) probe_timeout: Duration,
+    /// Pause between two renewals of the sentinel.
+    pub(crate) renewal: Duration,
 }
 
 /// A connection to the master that `sentinel` is connected to. If the sentinel is still open afterwards, everything that
@@ -309,6 +311,7 @@ mod tests {
                 start_limit: timeout,
             },
             probe_timeout: timeout,
+            renewal: timeout,
         };
         let sentinel = Arc::new(reach.upstream.connect_sentinel().await.unwrap());
         let mut master = reach.to_examine(&sentinel).await.unwrap();

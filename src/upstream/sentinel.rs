@@ -9,10 +9,6 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::{ConnectError, Upstream, is_local};
 
-/// Pause between renewals during long work. A rosmaster closes a connection that was idle for its `-t`, which may be as
-/// short as one second.
-const RENEWAL: Duration = Duration::from_millis(300);
-
 /// A connection on which nothing is ever sent. Even a master that closes each connection after one
 /// answer leaves it open. It is renewed from time to time, because a master may close idle
 /// connections.
@@ -52,7 +48,7 @@ impl Sentinel {
 
     /// Replaces the connection by a new one to the same process. The kernel closes the descriptors
     /// of a dying process one by one, mostly the newest first.
-    pub(crate) async fn renew(&self, upstream: &Upstream) -> Result<(), ConnectError> {
+    async fn renew(&self, upstream: &Upstream) -> Result<(), ConnectError> {
         let (_, stream) = upstream.bounded_stream().await?;
         // The old connection is still open, so the new one must lead to the same process.
         if self.is_open() {
@@ -61,26 +57,22 @@ impl Sentinel {
         Ok(())
     }
 
-    /// Runs `work` and keeps renewing the connection. A task of its own does that, because the work may occupy its thread
-    /// for seconds.
-    pub(crate) async fn during<T>(
-        self: &Arc<Self>,
-        upstream: &Arc<Upstream>,
-        work: impl Future<Output = T>,
-    ) -> T {
-        let (sentinel, upstream) = (self.clone(), upstream.clone());
+    /// Renews the connection every `pause` until it has ended. A task of its own renews, because the caller may occupy
+    /// its thread for seconds.
+    pub(crate) async fn watch(self: Arc<Self>, upstream: Arc<Upstream>, pause: Duration) {
+        let sentinel = self.clone();
         let _renewing = AbortOnDropHandle::new(crate::task::spawn(async move {
             loop {
-                tokio::time::sleep(RENEWAL).await;
+                tokio::time::sleep(pause).await;
                 // If this fails, the end of the connection shows why.
                 let _ = sentinel.renew(&upstream).await;
             }
         }));
-        work.await
+        self.wait_until_ended().await;
     }
 
     /// Waits until the connection has ended, or until the other end sends data without a request, which no master does.
-    pub(crate) async fn wait_until_ended(&self) {
+    async fn wait_until_ended(&self) {
         let mut renewed = self.stream.subscribe();
         loop {
             let stream = renewed.borrow_and_update().clone();
@@ -151,7 +143,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-    async fn it_is_renewed_while_the_work_occupies_its_thread() {
+    async fn it_is_renewed_while_its_watcher_occupies_its_thread() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
         let uri = crate::ros_env::MasterUri::parse(&format!("http://{address}")).unwrap();
@@ -163,14 +155,18 @@ mod tests {
                 let _ = accepted.send(connection);
             }
         });
-        let work = async {
+        let busy = async {
             tokio::task::block_in_place(|| {
-                for connection in ["the first", "the renewed"] {
+                ["the first", "the renewed"].map(|connection| {
                     let next = connections.recv_timeout(Duration::from_secs(20));
-                    next.expect(connection).unwrap();
-                }
-            });
+                    next.expect(connection).unwrap()
+                })
+            })
         };
-        sentinel.during(&upstream, work).await;
+        tokio::select! {
+            biased;
+            () = sentinel.watch(upstream, Duration::from_millis(1)) => panic!("it ended"),
+            _open = busy => {}
+        }
     }
 }

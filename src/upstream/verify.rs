@@ -112,15 +112,10 @@ pub(crate) async fn connection(
     Ok(Verified { connection, by })
 }
 
-/// Probes the master that `sentinel` is connected to. Renews the sentinel if the master has `token`.
-pub(crate) async fn probe(
-    upstream: &Upstream,
-    token: &Token,
-    sentinel: &Sentinel,
-) -> Result<(), VerifyError> {
+/// Probes whether the master has `token`.
+pub(crate) async fn probe(upstream: &Upstream, token: &Token) -> Result<(), VerifyError> {
     let _open = upstream.begin_call();
-    verify_token(&mut upstream.connect().await?, token).await?;
-    Ok(sentinel.renew(upstream).await?)
+    verify_token(&mut upstream.connect().await?, token).await
 }
 
 async fn verify_token(connection: &mut Connection, token: &Token) -> Result<(), VerifyError> {

@@ -181,15 +181,20 @@ fn a_start_after_a_kill_says_once_that_the_session_continues() {
 
 /// The gate stays open although rosmaster closes connections that were idle for four seconds.
 #[test]
-fn probes_keep_the_sentinel_from_being_idle() {
+fn the_sentinel_is_renewed_before_the_master_closes_it() {
     let scratch = Scratch::new();
-    let setup = Setup::core(&scratch, free_port());
-    let rescue = setup.args(["-t", "4", "--probe-interval", "30000"]).start();
-    let shut = || {
+    let options = ["--probe-interval", "30000"];
+    let core = Setup::core(&scratch, free_port()).args(["-t", "4"]);
+    let master = Rosmaster::start_with(&scratch, free_port(), |master| {
+        master.args(["-t", "4"]);
+    });
+    let proxy = Setup::proxy(&scratch, master.port);
+    let rescues = [core, proxy].map(|setup| setup.args(options).start());
+    let shut = |rescue: &Rescue| {
         let lines = rescue.stderr();
         lines.iter().any(|line| line.contains("the master is away"))
     };
-    assert!(holds(Duration::from_secs(9), || !shut()));
+    assert!(holds(Duration::from_secs(9), || !rescues.iter().any(shut)));
 }
 
 #[test]
