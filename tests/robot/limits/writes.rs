@@ -81,7 +81,7 @@ fn a_long_multicall_is_answered_as_by_a_bare_master() {
             ),
         ]
     };
-    let calls: Vec<_> = (0..200).flat_map(mixed).collect();
+    let calls: Vec<_> = (0..100).flat_map(mixed).collect();
     let Reply::Value(Value::Array(results)) = ({
         let Call { method, params } = Call::multicall(calls.clone());
         twins.same_call(&method, params)

@@ -3,7 +3,7 @@
 //! Service clients that look the service up for every call see no failure while masters die, and cached
 //! parameters stay up to date.
 //!
-//! `ROSRESCUE_KILLS` sets how often the master dies in each test (20 by default).
+//! `ROSRESCUE_KILLS` sets how often the master dies in each test (10 by default).
 
 use ros1_master::xmlrpc::Value;
 
@@ -71,7 +71,7 @@ fn answered(clients: &[Node]) {
 /// Number of deaths of the master, a multiple of [`KILLS_EACH`].
 fn kills() -> usize {
     let kills = std::env::var("ROSRESCUE_KILLS");
-    kills.map_or(20, |text| text.parse().unwrap())
+    kills.map_or(10, |text| text.parse().unwrap())
 }
 
 #[test]
