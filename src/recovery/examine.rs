@@ -27,6 +27,7 @@ use crate::{
     ledger::{Basis, Ledger, durability::Mark, late::CatchUp, mutant::Mutant},
     limit::rarely,
     status::{report::RecoveryOutcome, stats::Stats},
+    task::DeferredDrop,
     upstream::{CallError, ConnectError, RawReply, inspect::InspectError},
 };
 
@@ -120,10 +121,7 @@ impl InAdvance {
 
     /// Drops the preparation. Its thread may go on, but nobody uses the result.
     pub(super) fn forget(&self) {
-        if let Some(prepared) = self.lock().take() {
-            // To free a large plan takes time, and calls are waiting.
-            crate::task::spawn_blocking(move || drop(prepared));
-        }
+        *self.lock() = None;
     }
 
     /// Waits until the injection is prepared, and takes it.
@@ -143,7 +141,7 @@ pub(crate) struct Prepared {
     /// The mirror's version and the next token when this injection was prepared. `None` if it was not prepared in
     /// advance.
     basis: Option<(u64, Token)>,
-    plan: Plan,
+    plan: DeferredDrop<Plan>,
     /// Whether this injection restores the mirror's complete state.
     complete: bool,
 }
@@ -156,7 +154,7 @@ impl Prepared {
         Self {
             complete: plan.expected() == &target,
             basis: Some((version, token)),
-            plan,
+            plan: plan.into(),
         }
     }
 }
@@ -203,9 +201,6 @@ pub(crate) trait Contact: Send {
 
     /// The present time.
     fn now(&self) -> Instant;
-
-    /// Frees the memory of a plan that is not needed any more, which takes time, without making calls wait.
-    fn discard(&self, plan: Plan);
 }
 
 /// The state that a master must get, and the state that it has now.
@@ -474,11 +469,11 @@ impl Examiner {
             self.ledger.shut_gate(State::Injecting);
         }
         master.wait_for_disk(&self.ledger, announced).await;
-        let target = Target {
+        let target = DeferredDrop::from(Target {
             state,
             found,
             change,
-        };
+        });
         let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
         let held = self
             .bring(master, &target, &token, ready, examination)
@@ -508,11 +503,11 @@ impl Examiner {
                 self.ledger.shut_gate(State::Injecting);
             }
             master.wait_for_disk(&self.ledger, announced).await;
-            let target = Target {
+            let target = DeferredDrop::from(Target {
                 state: mirror,
                 found: held,
                 change: Change::Update(token),
-            };
+            });
             let skipped = std::mem::take(&mut examination.skipped);
             held = self
                 .bring(master, &target, &next, None, examination)
@@ -622,7 +617,7 @@ impl Examiner {
             Prepared {
                 basis: None,
                 complete: plan.expected() == state,
-                plan,
+                plan: plan.into(),
             }
         });
         let mut before: Option<(Master, Master)> = None;
@@ -640,7 +635,6 @@ impl Examiner {
                     self.ledger.rebase(token, held.clone());
                 }
                 self.injected(&plan, round);
-                master.discard(plan);
                 return Ok(held);
             };
             // What the master holds now replaces what was expected, and the missing part is injected again.
@@ -680,7 +674,7 @@ impl Examiner {
             next = Prepared {
                 basis: None,
                 complete: false,
-                plan: repair,
+                plan: repair.into(),
             };
             before = Some((wanted, now));
         }
@@ -751,7 +745,8 @@ mod tests {
                 begun.set(begun.get() + 1);
                 crate::task::spawn_blocking(|| Prepared {
                     basis: None,
-                    plan: Plan::new(&Master::default(), &Master::default(), &Token::new("s", 1)),
+                    plan: Plan::new(&Master::default(), &Master::default(), &Token::new("s", 1))
+                        .into(),
                     complete: true,
                 })
             });

@@ -227,10 +227,6 @@ impl Contact for LiveMaster {
     fn now(&self) -> Instant {
         Instant::now()
     }
-
-    fn discard(&self, plan: Plan) {
-        crate::task::spawn_blocking(move || drop(plan));
-    }
 }
 
 /// Prepares the injection into an empty master, in a thread of its own.

@@ -153,8 +153,6 @@ impl Contact for SimulatedMaster {
     fn now(&self) -> Instant {
         self.0.lock().unwrap().now.unwrap()
     }
-
-    fn discard(&self, _: Plan) {}
 }
 
 /// The end of a step.
