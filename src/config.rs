@@ -134,8 +134,8 @@ pub enum MasterConfig {
 }
 
 impl MasterConfig {
-    /// Pause between two renewals of the [`Sentinel`](crate::upstream::sentinel::Sentinel). It is less than half of the
-    /// time after which the master closes an idle connection.
+    /// Pause between two renewals of the [`Sentinel`](crate::upstream::sentinel::Sentinel). It is shorter for a `--timeout`
+    /// of less than 0.8 s, because that master closes idle connections sooner. The `-t` of an external master is unknown.
     pub(crate) fn renewal(&self) -> Duration {
         match self {
             Self::External(_) => RENEWAL,
