@@ -97,13 +97,14 @@ impl LeaderLease {
     /// stood still. Reads go on until the gate is shut, and show nothing older than this computer has shown before.
     pub(crate) fn set(&self, until: Option<Instant>) {
         self.0.send_if_modified(|lease| {
-            // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease, or a first
-            // limit.
+            // Extending a lease wakes no waiter: readers see it anyway, and waiters need only a new lease, or an earlier
+            // end.
             let now = Instant::now();
-            let held = lease.is_none_or(|until| now < until);
-            let limits = lease.is_none() && until.is_some();
+            let holds = |until: Option<Instant>| until.is_none_or(|until| now < until);
+            let was_held = holds(*lease);
+            let is_earlier = until.is_some_and(|until| lease.is_none_or(|before| until < before));
             *lease = until;
-            !held || limits
+            if was_held { is_earlier } else { holds(until) }
         });
     }
 
@@ -112,7 +113,7 @@ impl LeaderLease {
         self.0.borrow().is_none_or(|until| Instant::now() < until)
     }
 
-    /// Signals when this computer may act as leader again.
+    /// Signals when this computer may act as leader again, or for a shorter time than before.
     pub(crate) fn changed(&self) -> watch::Receiver<Option<Instant>> {
         self.0.subscribe()
     }
@@ -445,6 +446,21 @@ mod tests {
         };
         tokio::join!(lapsed(), extends);
         assert!(Instant::now() >= until + Duration::from_millis(100));
+    }
+
+    /// A computer that hands over stops leading before its lease ends.
+    #[tokio::test]
+    async fn a_lease_that_is_ended_early_lapses_at_once() {
+        let ledger = ledger();
+        let now = Instant::now();
+        ledger.lease.set(Some(now + Duration::from_secs(60)));
+        let ends = async {
+            tokio::task::yield_now().await;
+            ledger.lease.set(Some(now));
+        };
+        let both = async { tokio::join!(ledger.lease.lapsed(), ends) };
+        let limit = Duration::from_secs(20);
+        assert!(tokio::time::timeout(limit, both).await.is_ok());
     }
 
     #[tokio::test]
