@@ -136,6 +136,7 @@ fn unmarshal(
     let mut machine = Unmarshaller {
         writer,
         python,
+        allowance: text.len(),
         ..Unmarshaller::default()
     };
     while let Some(event) = scanner.next()? {
@@ -236,6 +237,10 @@ struct Unmarshaller<'a> {
     python: Python,
     /// Whether references in this element are plain text, because the writer does not escape its content.
     is_unescaped: bool,
+    /// How many bytes of text the remaining elements may have. Only elements within each other that repeat one text can
+    /// have more in total than the document. CPython's values share that text; here a small document would fill the
+    /// memory.
+    allowance: usize,
 }
 
 impl Unmarshaller<'_> {
@@ -263,6 +268,16 @@ impl Unmarshaller<'_> {
         let Some(tag) = Tag::named(local(name, self.python), self.python) else {
             return Ok(());
         };
+        let has_text = match tag {
+            Tag::Value => self.is_bare,
+            Tag::Params | Tag::Fault | Tag::Array | Tag::Struct => false,
+            _ => true,
+        };
+        if has_text {
+            let left = self.allowance.checked_sub(self.text.len());
+            let what = "elements within each other that repeat a long text";
+            self.allowance = left.ok_or(DecodeError::Unsupported { at, what })?;
+        }
         let value = match tag {
             Tag::Value if self.is_bare => Value::String(self.text.to_string()),
             Tag::Value => return Ok(()),

@@ -427,6 +427,25 @@ fn each_version_of_python_words_its_faults_in_its_own_way() {
     }
 }
 
+/// A small document must not fill the memory. CPython's values share one text.
+#[test]
+fn a_text_that_many_elements_repeat_is_refused() {
+    let repeated = |text: &str, times| {
+        let (open, close) = ("<string>".repeat(times), "</string>".repeat(times));
+        decode_call(
+            format!("<methodCall><methodName>m</methodName>{open}{text}{close}</methodCall>")
+                .as_bytes(),
+        )
+    };
+    assert_eq!(repeated("ab", 3).unwrap().params, vec![text("ab"); 3]);
+    let refused = repeated(&"x".repeat(32 << 10), 1900);
+    assert!(
+        matches!(refused, Err(DecodeError::Unsupported { .. })),
+        "{:?}",
+        refused.map(|call| call.params.len())
+    );
+}
+
 #[test]
 fn a_call_has_the_last_method_name_and_all_values() {
     let call = decode_call(
