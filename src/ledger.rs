@@ -184,8 +184,7 @@ impl Ledger {
 
     pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
         self.lock().update_session(change);
-        self.write();
-        self.work.notify_one();
+        self.save();
     }
 
     /// The number in the present master's [`Token`].
@@ -333,7 +332,7 @@ impl Ledger {
         let label = Label { at, origin };
         inner.append(vec![RecordContent::labelled(call.clone(), label)]);
         drop(inner);
-        self.write();
+        self.save();
     }
 
     /// Wakes the tasks that write and replicate records.
@@ -521,8 +520,7 @@ impl Ledger {
         }
         inner.append(entries);
         drop(inner);
-        self.write();
-        self.work.notify_one();
+        self.save();
         Ok(())
     }
 
@@ -615,7 +613,7 @@ impl Ledger {
         inner.note_equal();
         let token = inner.token();
         drop(inner);
-        self.write();
+        self.save();
         (token, announced)
     }
 
@@ -630,8 +628,7 @@ impl Ledger {
         }
         inner.write_session();
         drop(inner);
-        self.write();
-        self.work.notify_one();
+        self.save();
     }
 
     /// Lets calls pass to the present master. Returns the number in its [`Token`].
@@ -759,7 +756,7 @@ impl Ledger {
             inner.order.master_notifies(now, subject, *nodes);
         }
         drop(inner);
-        self.write();
+        self.save();
         Some(announced)
     }
 

@@ -88,6 +88,12 @@ impl Ledger {
         }
     }
 
+    /// Writes the queued records to the checkpoint, in another thread, and has them synced.
+    pub(super) fn save(&self) {
+        self.write();
+        self.work.notify_one();
+    }
+
     /// Writes the queued records to the checkpoint, in another thread.
     pub(crate) fn write(&self) {
         #[cfg(test)]

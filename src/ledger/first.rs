@@ -157,8 +157,7 @@ impl Ledger {
         }
         inner.write_session();
         drop(inner);
-        self.write();
-        self.work.notify_one();
+        self.save();
     }
 }
 

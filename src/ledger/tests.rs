@@ -57,6 +57,19 @@ fn a_reply_of_a_master_that_was_succeeded_does_not_count() {
     assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
 }
 
+/// With `--sync always`, an injection waits until its announcement is synced.
+#[tokio::test]
+async fn the_announcement_of_an_injection_is_synced_at_once() {
+    let ledger = ledger();
+    ledger.succeed();
+    let limit = Duration::from_secs(20);
+    assert!(
+        tokio::time::timeout(limit, ledger.work.notified())
+            .await
+            .is_ok()
+    );
+}
+
 #[test]
 fn a_different_answer_of_the_master_puts_the_mirror_in_doubt() {
     let ledger = ledger();
