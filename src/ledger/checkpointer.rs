@@ -103,10 +103,7 @@ impl Checkpointer {
 
     async fn save(mut self) {
         loop {
-            tokio::select! {
-                () = self.ledger.work.notified() => {}
-                () = tokio::time::sleep(LOOK) => {}
-            }
+            self.work_or_look().await;
             self.round(true).await;
             if self.sync != SyncPolicy::Always {
                 self.pause().await;
@@ -223,7 +220,7 @@ impl Checkpointer {
         let (seq, finished) = match begun {
             None => return,
             Some((seq, Err(error))) => (seq, Some(Err(error))),
-            Some((seq, Ok(job))) => match crate::task::spawn_blocking(move || job.run()).await {
+            Some((seq, Ok(job))) => match self.sync_meanwhile(move || job.run()).await {
                 Ok(done) => {
                     let finished = self.on_store(|store| {
                         let finished = store.finish_compaction(done);
@@ -248,7 +245,9 @@ impl Checkpointer {
                 self.failed_at = Some(Instant::now());
                 tracing::debug!(%error, "compaction failed");
             }
-            _ => {
+            // The new file has not become the present one. The next round tries again.
+            None => {}
+            Some(Ok(())) => {
                 let now = Instant::now();
                 self.compacted_at = Some(now);
                 let board = &self.voice.board;
@@ -259,6 +258,35 @@ impl Checkpointer {
                 }
                 ledger.set_attempted(Ok(()));
             }
+        }
+    }
+
+    /// Runs `job` in another thread. A slow disk may take seconds for a whole checkpoint, so the present file is synced
+    /// meanwhile.
+    async fn sync_meanwhile<T: Send + 'static>(
+        &self,
+        job: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, tokio::task::JoinError> {
+        let mut job = crate::task::spawn_blocking(job);
+        loop {
+            let due = async {
+                match self.sync {
+                    SyncPolicy::Always => self.work_or_look().await,
+                    _ => tokio::time::sleep(self.sync_interval).await,
+                }
+            };
+            tokio::select! {
+                done = &mut job => return done,
+                () = due => self.sync(self.sync != SyncPolicy::Never).await,
+            }
+        }
+    }
+
+    /// Waits until there is something to write, or until the file must be checked.
+    async fn work_or_look(&self) {
+        tokio::select! {
+            () = self.ledger.work.notified() => {}
+            () = tokio::time::sleep(LOOK) => {}
         }
     }
 

@@ -3,6 +3,7 @@
  *   h  every operation hangs until the letter changes
  *   o  opening a file hangs
  *   y  syncing a file hangs
+ *   n  syncing a new checkpoint hangs, before it has its name
  *   s  each operation takes 0.2 s
  *   f  the disk is full: writes are done in part or not at all
  *   r  the disk is read-only */
@@ -50,7 +51,8 @@ static int meets(const char *path, enum kind kind)
     if (part == NULL || path == NULL || strstr(path, part) == NULL)
         return 0;
     char now = state();
-    while (now == 'h' || (now == 'o' && (kind == OPENS || kind == CREATES)) || (now == 'y' && kind == SYNCS)) {
+    while (now == 'h' || (now == 'o' && (kind == OPENS || kind == CREATES)) || (now == 'y' && kind == SYNCS)
+           || (now == 'n' && kind == SYNCS && strstr(path, ".new-") != NULL)) {
         usleep(1000);
         now = state();
     }

@@ -91,6 +91,8 @@ pub(crate) enum Trouble {
     HangsOnOpen,
     /// No sync finishes until the trouble is over.
     HangsOnSync,
+    /// No sync of a new checkpoint, which does not have its name yet, finishes until the trouble is over.
+    HangsOnNewFile,
     /// Each operation takes 0.2 s.
     Slow,
     Full,
@@ -127,6 +129,7 @@ impl FailingDisk {
             Trouble::Hangs => "h",
             Trouble::HangsOnOpen => "o",
             Trouble::HangsOnSync => "y",
+            Trouble::HangsOnNewFile => "n",
             Trouble::Slow => "s",
             Trouble::Full => "f",
             Trouble::ReadOnly => "r",
