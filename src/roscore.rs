@@ -23,6 +23,7 @@ use crate::{
     ledger::Ledger,
     limit::{AlarmLimit, alarm, all_clear},
     process::{self, Rosout},
+    resolver,
     write_queue::WriteQueue,
 };
 
@@ -138,10 +139,16 @@ async fn supervise_rosout(roscore: &Roscore) {
     let mut pause = RESPAWN;
     loop {
         let start = Instant::now();
-        match living_rosout(roscore)
-            .await
-            .or_else(|| block_in_place(|| rosout.find_orphan()))
-        {
+        let mut living = living_rosout(roscore).await;
+        while living == Some(Living::Elsewhere) {
+            tokio::time::sleep(LONGEST_RESPAWN).await;
+            living = living_rosout(roscore).await;
+        }
+        let here = match living {
+            Some(Living::Here { pid }) => Some(pid),
+            _ => block_in_place(|| rosout.find_orphan()),
+        };
+        match here {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
                 process::wait_until_ended(pid).await;
@@ -176,15 +183,32 @@ async fn supervise_rosout(roscore: &Roscore) {
     }
 }
 
-/// Process id of the registered rosout. `None` if it does not answer.
-async fn living_rosout(roscore: &Roscore) -> Option<u32> {
+/// A registered rosout that answers.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Living {
+    Here {
+        pid: u32,
+    },
+    /// It runs on another computer or in a container, where its process id means something else, or is another program.
+    Elsewhere,
+}
+
+/// The registered rosout. `None` if it does not answer.
+async fn living_rosout(roscore: &Roscore) -> Option<Living> {
     let api = roscore
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
-    match client::call_for_value(&api, &master::get_pid(), roscore.node_timeout).await {
-        (Reaction::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
-        _ => None,
-    }
+    let asked = client::call_for_value(&api, &master::get_pid(), roscore.node_timeout).await;
+    let (Reaction::Alive, Some(Value::Int(pid))) = asked else {
+        return None;
+    };
+    let pid = u32::try_from(pid).ok()?;
+    let is_here = block_in_place(|| process::runs(pid, "rosout"))
+        && !resolver::is_elsewhere(&api, roscore.node_timeout).await;
+    Some(match is_here {
+        true => Living::Here { pid },
+        false => Living::Elsewhere,
+    })
 }
 
 /// Time after which a new process shows its command line.

@@ -8,8 +8,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params, unreadable,
-    within,
+    FakeNode, Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params,
+    unreadable, within,
 };
 use rustix::process::Signal;
 
@@ -167,6 +167,22 @@ fn a_core_keeps_rosout_alive() {
             && now.subscribers == before.subscribers
             && now.nodes != before.nodes
     });
+}
+
+/// The process id that a rosout in a container or of another computer reports means another process here.
+#[test]
+fn a_rosout_that_ran_elsewhere_is_replaced_when_it_has_ended() {
+    let robot = Robot::start(Mode::Core);
+    robot.settled_state();
+    assert!(rosout(&robot).is_some());
+    let elsewhere = FakeNode::start("/rosout");
+    elsewhere.claim_pid(1);
+    elsewhere.subscribe(&robot.client(), "/rosout", "rosgraph_msgs/Log");
+    eventually("rosrescue's rosout has ended", || {
+        rosout(&robot).is_none() && elsewhere.received("getPid").len() > 1
+    });
+    drop(elsewhere);
+    eventually("rosrescue's rosout runs again", || rosout(&robot).is_some());
 }
 
 /// A rosout that ends at once, for example because its libraries are missing, is started again after growing pauses.
