@@ -62,7 +62,7 @@ pub enum NextStart {
 pub struct Restarts {
     /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
     deaths: VecDeque<Instant>,
-    /// Number of failed workers since the last one that answered calls.
+    /// Number of failed workers in a row.
     failures: usize,
     /// Whether any worker has answered calls.
     served: bool,
@@ -101,11 +101,13 @@ impl Restarts {
     ///
     /// Before any worker has answered calls, an exit status is an error of the start, such as a missing rosmaster.
     /// Later the same error may be temporary. A worker that has answered calls is replaced at once, because calls wait.
-    /// Only workers that fail earlier could keep the processor busy without use, so they are delayed.
+    /// Workers that fail earlier, or that end with an error again within a minute, could keep the processor busy without
+    /// use, so they are delayed.
     pub fn worker_ended(&mut self, end: End, served: bool, now: Instant) -> NextStart {
         self.served |= served;
-        self.failures = match served {
-            true => 0,
+        let is_error = matches!(end, End::Code(code) if code != PANIC);
+        self.failures = match served && !(is_error && self.died_recently(now)) {
+            true => usize::from(is_error),
             false => self.failures + 1,
         };
         match end {
@@ -132,6 +134,11 @@ impl Restarts {
             let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
             (PAUSE_LEAST * 2_u32.pow(doublings)).min(PAUSE_MOST)
         })
+    }
+
+    fn died_recently(&self, now: Instant) -> bool {
+        let last = self.deaths.back();
+        last.is_some_and(|last| now.saturating_duration_since(*last) < SPAN)
     }
 
     /// Counts a death, and returns the number of recent deaths.
@@ -189,6 +196,23 @@ mod tests {
             assert_eq!(die(2 * number), (true, number >= 5), "{number}");
         }
         assert_eq!(die(200), (true, false), "much later");
+    }
+
+    /// For example `proxy` in front of itself: the mirror answers before the error is found.
+    #[test]
+    fn an_error_that_comes_back_is_delayed_although_each_worker_has_served() {
+        let mut restarts = Restarts::default();
+        let start = Instant::now();
+        let mut fail = |at| {
+            let now = start + Duration::from_secs(at);
+            match restarts.worker_ended(End::Code(1), true, now) {
+                NextStart::Restart { pause, .. } => pause.as_millis(),
+                NextStart::Exit(status) => panic!("exit {status}"),
+            }
+        };
+        let pauses: Vec<_> = (0..8).map(&mut fail).collect();
+        assert_eq!(pauses, [0, 0, 0, 0, 0, 500, 1000, 2000]);
+        assert_eq!(fail(200), 0, "much later");
     }
 
     #[test]
