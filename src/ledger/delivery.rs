@@ -63,10 +63,7 @@ impl Delivery {
     /// Notes that the answer is ready to be written.
     pub(crate) fn ready(&self) {
         if let Some(ledger) = &self.ledger {
-            ledger
-                .lock()
-                .order
-                .answer_ready(Instant::now(), self.number);
+            ledger.release(|order| order.answer_ready(Instant::now(), self.number));
         }
     }
 

@@ -96,8 +96,8 @@ struct InFlight {
 /// Says that a call or a notification has to wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MustWait {
-    /// When to ask again at the latest. Before that, ask again when [`Order::answer_written`], [`Order::calls_settled`]
-    /// or [`Order::notification_taken`] returns true.
+    /// When to ask again at the latest. Before that, ask again when [`Order::answer_ready`], [`Order::answer_written`],
+    /// [`Order::calls_settled`] or [`Order::notification_taken`] returns true.
     pub until: Option<Instant>,
 }
 
@@ -121,9 +121,10 @@ impl Order {
     }
 
     /// Notes that the answer can be sent to its caller. From now on, calls and notifications wait for it for at most
-    /// [`ANSWER_LIMIT`].
-    pub fn answer_ready(&mut self, now: Instant, answer: u64) {
+    /// [`ANSWER_LIMIT`]. Returns whether one waits already, which does not know of that limit.
+    pub fn answer_ready(&mut self, now: Instant, answer: u64) -> bool {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
+        std::mem::take(&mut self.awaited)
     }
 
     /// Notes that the answer has been written to its caller, or never will be. Returns whether a call or a notification

@@ -104,7 +104,11 @@ fn an_answer_that_its_client_does_not_read_delays_others_only_briefly() {
     let ledger = ledger();
     let mut queue = VecDeque::from([item(subscribe("/a", "/t")), item(publish("/b", "/t"))]);
     let first = next(&ledger, &mut queue);
+    let waits = next(&ledger, &mut queue);
+    assert!(waits.items.is_empty() && waits.until.is_none());
+    let looks_again = ledger.order_changed();
     first.items[0].delivery.as_ref().unwrap().ready();
+    assert!(looks_again.has_changed().unwrap());
     let waits = next(&ledger, &mut queue);
     assert!(waits.items.is_empty());
     let until = waits.until.unwrap();
