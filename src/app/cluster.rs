@@ -154,14 +154,20 @@ impl ClusterDriver {
             self.facts.note_member_entry(change);
         }
         let actions = self.member.on(now, input);
+        // A limit holds from now on. Without one, this computer is cut off, and the actions say first whom it may notify.
         let lease = self.member.machine().lease(now);
-        self.setup.context.ledger.lease.set(lease);
+        if lease.is_some() {
+            self.setup.context.ledger.lease.set(lease);
+        }
         for action in actions {
             match action {
                 Action::End => return Some(Ok(())),
                 Action::EndForNamesake(uri) => return Some(Err(self.namesake_at(uri))),
                 action => self.carry_out(action).await,
             }
+        }
+        if lease.is_none() {
+            self.setup.context.ledger.lease.set(None);
         }
         let position = self.member.position();
         self.position

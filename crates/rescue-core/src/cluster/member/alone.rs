@@ -16,6 +16,8 @@ impl Member {
             self.give_up();
             return self.publish_standing(Standing::Nobody { known: true });
         }
+        // First, because what follows waits for the disk, and another computer may lead already.
+        self.act(Action::NotifyOwnOnly(true));
         let led = self.records();
         self.end_master();
         let base = match led || self.follows() {
@@ -68,7 +70,6 @@ impl Member {
     }
 
     fn serve_alone(&mut self) {
-        self.act(Action::NotifyOwnOnly(true));
         self.act(Action::AnswerFromMirror);
         self.publish_standing(Standing::Alone);
         self.all_ready();

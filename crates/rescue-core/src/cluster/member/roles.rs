@@ -34,11 +34,11 @@ impl Member {
 
     fn lead(&mut self, now: Instant) {
         let term = self.machine.term().unwrap_or_default();
+        self.act(Action::NotifyOwnOnly(false));
         match self.records() {
             false => self.begin_to_lead(now),
             true => {
                 self.report_news(News::LeadsAgain);
-                self.act(Action::NotifyOwnOnly(false));
                 self.begin_master(Cause::WasCutOff);
                 self.cut_off.resumed();
                 let last = self.outgoing.last();

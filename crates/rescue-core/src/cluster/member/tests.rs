@@ -305,6 +305,52 @@ fn who_is_cut_off_from_an_empty_journal_begins_in_its_own_state() {
     assert_eq!(member.partition_writes().unwrap().base, state);
 }
 
+/// The disk may be slow, and the next leader may notify all nodes already.
+#[test]
+fn a_leader_that_is_cut_off_notifies_only_its_own_nodes_before_it_stores_anything() {
+    let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
+    let own = LocalCheckpoint::default();
+    let mut member = Member::new(settings, keys, own, None, "a-1".to_owned());
+    let mut now = Instant::now();
+    let mut inputs = VecDeque::from([Input::Begin]);
+    let mut has_led = false;
+    let order: Vec<_> = loop {
+        let input = inputs.pop_front().unwrap_or_else(|| {
+            now = member.deadline().unwrap();
+            Input::Wake
+        });
+        let actions = member.on(now, input);
+        let steps = actions.iter().filter_map(|action| match action {
+            Action::NotifyOwnOnly(true) => Some("own only"),
+            Action::ReplacePartitionWrites(_) => Some("store"),
+            Action::AnswerFromMirror => Some("answer"),
+            _ => None,
+        });
+        let steps: Vec<_> = steps.collect();
+        for action in actions {
+            match action {
+                Action::Load(_) => inputs.push_back(Input::Loaded(Some(Read::empty()))),
+                Action::Send { number, op, .. } if !has_led => {
+                    let answer = match op {
+                        machine::Op::Read => EtcdAnswer::Is(View::default()),
+                        machine::Op::Claim { seq, .. } | machine::Op::Beat { seq, .. } => {
+                            let revision = 1;
+                            EtcdAnswer::Applied { revision, seq }
+                        }
+                    };
+                    inputs.push_back(Input::Answer { number, answer });
+                }
+                Action::BeginMaster(_) => has_led = true,
+                _ => {}
+            }
+        }
+        if member.machine().role() == Role::Alone {
+            break steps;
+        }
+    };
+    assert_eq!(order, ["own only", "store", "answer"]);
+}
+
 /// etcd takes no parts of a large value, so a handover cannot begin. Its time runs out, and calls do not wait any longer.
 #[test]
 fn a_handover_of_which_etcd_never_hears_ends_in_time() {
