@@ -89,6 +89,10 @@ impl EtcdError {
             _ if says("no leader") || says("request timed out") || says("leader changed") => {
                 Self::NoMajority { endpoint, why }
             }
+            // After a change of users or roles, etcd wants a new token; its own client then logs in again.
+            _ if says("revision of auth store is old") || says("revision in header is old") => {
+                Self::Token { endpoint }
+            }
             UNAVAILABLE => Self::Gateway { endpoint, why },
             UNAUTHENTICATED => Self::Token { endpoint },
             PERMISSION_DENIED => Self::Access { endpoint, why },
@@ -132,6 +136,18 @@ struct ErrorAnswer {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// With `--auth-token jwt`. The messages are those of etcd's `rpctypes`.
+    #[test]
+    fn a_token_that_is_older_than_the_users_is_renewed() {
+        for message in [
+            "etcdserver: revision of auth store is old",
+            "auth: revision in header is old",
+        ] {
+            let error = EtcdError::answered("https://a:2379", 3, message);
+            assert!(matches!(error, EtcdError::Token { .. }), "{error:?}");
+        }
+    }
 
     #[test]
     fn a_gateway_that_refuses_a_name_in_a_certificate_is_explained() {
