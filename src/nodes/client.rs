@@ -31,8 +31,18 @@ pub(crate) async fn call_for_value(
     call: &Call,
     limit: Duration,
 ) -> (Reaction, Option<Value>) {
-    let answer = call_unless(api, call, limit, std::future::pending()).await;
-    answer.unwrap_or((Reaction::Silent, None))
+    let outcome = call_unless(api, call, limit, std::future::pending()).await;
+    outcome.map_or((Reaction::Silent, None), |it| (it.sign, it.value))
+}
+
+/// What came of a call to a node.
+#[derive(Debug, PartialEq)]
+pub(super) struct Outcome {
+    pub sign: Reaction,
+    /// The value that the node answered.
+    pub value: Option<Value>,
+    /// Whether there was a connection, so that the node may have got the call.
+    pub is_connected: bool,
 }
 
 /// Like [`call_for_value`], but gives up once `withdrawn` ends, and returns `None`. The node then does not get what it has
@@ -42,13 +52,14 @@ pub(super) async fn call_unless(
     call: &Call,
     limit: Duration,
     withdrawn: impl Future<Output = ()>,
-) -> Option<(Reaction, Option<Value>)> {
-    let silent = (Reaction::Silent, None);
-    let Ok(address) = MasterUri::parse(api) else {
-        return Some(silent);
-    };
+) -> Option<Outcome> {
+    let mut is_connected = false;
+    let connected = &mut is_connected;
     let mut withdrawn = pin!(withdrawn);
     let exchange = async {
+        let Ok(address) = MasterUri::parse(api) else {
+            return Some((Reaction::Silent, None));
+        };
         let connection = tokio::select! {
             connection = connect(&address, limit) => connection,
             () = &mut withdrawn => return None,
@@ -57,6 +68,7 @@ pub(super) async fn call_unless(
             Ok(connection) => connection,
             Err(sign) => return Some((sign, None)),
         };
+        *connected = true;
         tokio::select! {
             answer = put(&mut connection, call) => return Some(answer),
             () = &mut withdrawn => {}
@@ -64,7 +76,13 @@ pub(super) async fn call_unless(
         connection.reset();
         None
     };
-    timeout(limit, exchange).await.unwrap_or(Some(silent))
+    let answer = timeout(limit, exchange).await;
+    let (sign, value) = answer.unwrap_or(Some((Reaction::Silent, None)))?;
+    Some(Outcome {
+        sign,
+        value,
+        is_connected,
+    })
 }
 
 /// The host of `api`, resolved to its first address. `None` if it has no address within `limit`.
@@ -156,9 +174,33 @@ async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Valu
 
 #[cfg(test)]
 mod tests {
+    use socket2::{Domain, Socket, Type};
     use tokio::{io::AsyncReadExt, net::TcpListener};
 
     use super::*;
+
+    /// The kernel drops connections that a listener with a full queue does not accept, as a network does that is away.
+    #[tokio::test]
+    async fn a_call_without_a_connection_is_told_from_one_without_an_answer() {
+        let listener = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        let any: SocketAddr = "127.0.0.1:0".parse().unwrap();
+        listener.bind(&any.into()).unwrap();
+        listener.listen(0).unwrap();
+        let address = listener.local_addr().unwrap().as_socket().unwrap();
+        let api = format!("http://{address}/");
+        let (call, limit) = (master::get_pid(), Duration::from_millis(300));
+        let ask = || call_unless(&api, &call, limit, std::future::pending());
+        assert!(ask().await.unwrap().is_connected);
+        let mut queued = Vec::new();
+        while let Ok(Ok(stream)) = timeout(limit, TcpStream::connect(address)).await {
+            queued.push(stream);
+        }
+        let outcome = ask().await.unwrap();
+        assert_eq!(
+            (outcome.sign, outcome.is_connected),
+            (Reaction::Silent, false)
+        );
+    }
 
     /// The rest of a call that is only given up would still arrive.
     #[tokio::test]

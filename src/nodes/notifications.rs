@@ -18,7 +18,7 @@ use tokio::sync::Semaphore;
 
 use super::{
     Nodes,
-    client::{self, Reaction},
+    client::{self, Outcome, Reaction},
 };
 use crate::{limit::rarely, wait};
 
@@ -161,7 +161,10 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 asked.await
             }
         };
-        let Some((sign, _)) = answer else {
+        let Some(Outcome {
+            sign, is_connected, ..
+        }) = answer
+        else {
             nodes
                 .ledger
                 .release(|order| order.notification_withdrawn(number));
@@ -170,7 +173,9 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         nodes
             .ledger
             .release(|order| order.notification_taken(number));
-        if is_param && sign == Reaction::Silent && is_answering(&nodes, &port).await {
+        // Without a connection, the network was away: the node has not heard, and is told the state when it answers.
+        let may_be_mute = is_param && sign == Reaction::Silent && is_connected;
+        if may_be_mute && is_answering(&nodes, &port).await {
             nodes.set_mute(&port, true);
             continue;
         }
