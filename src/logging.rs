@@ -1,29 +1,45 @@
 //! Writes the log to standard error. If journald reads it, each line begins with its priority, as
 //! described in `sd-daemon(3)`, so that `journalctl -p warning` and its colours work.
+//!
+//! A thread of its own writes. A terminal that was stopped with Ctrl-S, a pipe that nobody reads or a disk that hangs
+//! must hold up no call.
 
 use std::io::{self, Write};
 
 use rustix::fs::fstat;
 use tracing::{Level, Metadata};
+use tracing_appender::non_blocking::{NonBlocking, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::fmt::MakeWriter;
 
 use crate::printable::plain;
 
+/// Number of lines that wait if standard error cannot be written to. Later ones are lost.
+const WAITING: usize = 10_000;
+
 /// Makes writers to standard error.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Stderr {
+    lines: NonBlocking,
     is_journald: bool,
 }
 
 impl Stderr {
     /// Finds out whether journald reads standard error. `stream` is the value of `JOURNAL_STREAM`: device and inode of
     /// the stream that systemd created. Standard error may have been redirected since.
-    pub fn detect(stream: Option<&str>) -> Self {
+    ///
+    /// When the guard is dropped, the lines that wait are written, for at most a second.
+    pub fn start(stream: Option<&str>) -> (Self, WorkerGuard) {
+        let builder = NonBlockingBuilder::default().buffered_lines_limit(WAITING);
+        let (lines, guard) = builder.thread_name("log").finish(io::stderr());
         let own = fstat(io::stderr()).ok();
         let own = own.map(|file| format!("{}:{}", file.st_dev, file.st_ino));
-        Self {
-            is_journald: own.is_some() && own.as_deref() == stream,
-        }
+        let is_journald = own.is_some() && own.as_deref() == stream;
+        (Self { lines, is_journald }, guard)
+    }
+
+    fn prefixed(&self, prefix: &'static str) -> Prefixed {
+        let lines = self.lines.clone();
+        Prefixed { prefix, lines }
     }
 }
 
@@ -31,11 +47,11 @@ impl<'a> MakeWriter<'a> for Stderr {
     type Writer = Prefixed;
 
     fn make_writer(&'a self) -> Prefixed {
-        Prefixed("")
+        self.prefixed("")
     }
 
     fn make_writer_for(&'a self, metadata: &Metadata<'_>) -> Prefixed {
-        Prefixed(match *metadata.level() {
+        self.prefixed(match *metadata.level() {
             _ if !self.is_journald => "",
             Level::ERROR => "<3>",
             Level::WARN => "<4>",
@@ -47,7 +63,10 @@ impl<'a> MakeWriter<'a> for Stderr {
 
 /// Writes one line after this prefix, without characters that a terminal would take for commands.
 #[derive(Debug)]
-pub struct Prefixed(&'static str);
+pub struct Prefixed {
+    prefix: &'static str,
+    lines: NonBlocking,
+}
 
 impl Write for Prefixed {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
@@ -57,7 +76,8 @@ impl Write for Prefixed {
     /// Writes the whole line at once, because other processes may write to the same stream.
     fn write_all(&mut self, line: &[u8]) -> io::Result<()> {
         let line = safe(&String::from_utf8_lossy(line));
-        io::stderr().write_all(format!("{}{line}", self.0).as_bytes())
+        self.lines
+            .write_all(format!("{}{line}", self.prefix).as_bytes())
     }
 
     fn flush(&mut self) -> io::Result<()> {

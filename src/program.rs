@@ -27,6 +27,7 @@ use crate::{
 use clap::{CommandFactory, error::ErrorKind};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
+use tracing_appender::non_blocking::WorkerGuard;
 use tracing_subscriber::{
     Layer, filter::Targets, fmt, layer::SubscriberExt, util::SubscriberInitExt,
 };
@@ -94,11 +95,12 @@ pub fn main() -> ExitCode {
             .error(ErrorKind::ValueValidation, error)
             .exit(),
     };
-    if let Err(error) = start_log(&common.logging, verbose) {
-        Cli::command()
+    let _log = match start_log(&common.logging, verbose) {
+        Ok(log) => log,
+        Err(error) => Cli::command()
             .error(ErrorKind::ValueValidation, error)
-            .exit();
-    }
+            .exit(),
+    };
     if let Some(sockets) = &sockets
         && matches!(sockets.guard, Guard::Systemd)
     {
@@ -224,7 +226,8 @@ fn colour_is_welcome() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-fn start_log(args: &LoggingArgs, verbose: bool) -> Result<(), String> {
+/// Starts the log. Its last lines are written when the guard is dropped.
+fn start_log(args: &LoggingArgs, verbose: bool) -> Result<WorkerGuard, String> {
     let default = if verbose {
         "warn,rosrescue=debug,etcd_kv=debug"
     } else {
@@ -235,10 +238,9 @@ fn start_log(args: &LoggingArgs, verbose: bool) -> Result<(), String> {
         .parse()
         .map_err(|error| format!("--log: `{filter}`: {error}"))?;
     let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
+    let (stderr, guard) = Stderr::start(std::env::var("JOURNAL_STREAM").ok().as_deref());
     let log = fmt::layer()
-        .with_writer(Stderr::detect(
-            std::env::var("JOURNAL_STREAM").ok().as_deref(),
-        ))
+        .with_writer(stderr)
         .with_target(false)
         // These errors would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)
@@ -251,7 +253,7 @@ fn start_log(args: &LoggingArgs, verbose: bool) -> Result<(), String> {
             .with(log.json().with_filter(filter))
             .init(),
     }
-    Ok(())
+    Ok(guard)
 }
 
 /// Raises the limit on open files as far as allowed, because the usual 1,024 are soon reached.

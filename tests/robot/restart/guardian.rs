@@ -1,9 +1,9 @@
 //! The guardian: whatever happens to the worker, the port stays open and a new worker serves it.
 
 use std::collections::BTreeSet;
-use std::fs;
-use std::io::ErrorKind;
-use std::os::unix::fs::symlink;
+use std::fs::{self, OpenOptions};
+use std::io::{ErrorKind, Write};
+use std::os::unix::fs::{OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, FakeNode, Finish, Rescue, Rosmaster, Scratch, Setup, State, alive, behind, eventually,
-    eventually_some, free_port, holds, params, signal, status,
+    eventually_some, free_port, holds, params, signal, status, within,
 };
+use rustix::fs::OFlags;
 use rustix::process::Signal;
 
 /// Pause between two calls of a client.
@@ -235,6 +236,44 @@ fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
         line.contains("pause=500ms")
     });
     (rescue, program)
+}
+
+/// A terminal that was stopped with Ctrl-S takes no lines, and neither does a pipe whose reader stands still.
+#[test]
+fn a_log_that_takes_no_lines_holds_up_neither_calls_nor_restarts() {
+    let scratch = Scratch::new();
+    let pipe = scratch.path("lines");
+    let setup = Setup::core(&scratch, free_port())
+        .guarded()
+        .env("LOG", &pipe)
+        .wrapped(|own| {
+            let mut shell = Command::new("sh");
+            shell.args(["-c", r#"mkfifo "$LOG" && exec "$0" "$@" 2<>"$LOG""#]);
+            behind(shell, own)
+        });
+    let mut rescue = setup.start();
+    let client = rescue.client();
+    let flags = OFlags::NONBLOCK.bits().cast_signed();
+    let log = OpenOptions::new()
+        .write(true)
+        .custom_flags(flags)
+        .open(pipe);
+    let mut log = log.unwrap();
+    // The kernel takes short lines when it has no room for long ones.
+    for length in [4096, 1] {
+        while log.write(&vec![b'\n'; length]).is_ok() {}
+    }
+    let limit = Duration::from_secs(20);
+    let dead = client.master_pid().unwrap();
+    signal(dead, Signal::KILL);
+    within(limit, "a write", || client.set_param("/a", 1));
+    eventually("another master runs", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    signal(worker(&scratch), Signal::KILL);
+    within(limit, "a write", || client.set_param("/a", 2));
+    let end = within(limit, "the end", || rescue.terminate());
+    assert_eq!(end.code(), Some(0));
 }
 
 #[test]
