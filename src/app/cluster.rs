@@ -212,15 +212,26 @@ impl ClusterDriver {
                 self.watch = Some(Watching::new(watch, self.trouble.clone()));
                 self.watched = view;
             }
-            Action::Prepare { term, parts } => {
+            Action::Prepare {
+                number,
+                term,
+                parts,
+            } => {
                 let replica = self.replica.clone();
-                self.spawn(Input::Prepared(None), async move {
+                let unknown = Input::Prepared {
+                    number,
+                    leads: None,
+                };
+                self.spawn(unknown, async move {
                     let prepared = replica.prepare(term, &parts).await;
                     if let Err(error) = &prepared {
                         rarely!(warn, %error, "a large write is not in etcd yet; retrying");
                         tokio::time::sleep(AGAIN).await;
                     }
-                    Input::Prepared(prepared.ok())
+                    Input::Prepared {
+                        number,
+                        leads: prepared.ok(),
+                    }
                 });
             }
             Action::Decide { seq, state, closed } => {

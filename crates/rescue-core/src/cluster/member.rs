@@ -215,7 +215,7 @@ impl Member {
             Input::Recorded(changes) => self.recorded(changes),
             Input::AsState(state) => self.recorded_as_state(state),
             Input::Forwarded { base, writes } => self.serve_from(base, writes),
-            Input::Prepared(leads) => self.prepared(leads),
+            Input::Prepared { number, leads } => self.prepared(number, leads),
             Input::Decided { seq, goes_on } => {
                 self.reading.deciding = false;
                 self.queue_input(machine::Input::Decided { seq, goes_on });

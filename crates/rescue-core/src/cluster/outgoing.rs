@@ -30,8 +30,10 @@ pub struct Outgoing {
     written: u64,
     /// The last change whose call was answered.
     pub acknowledged: u64,
-    /// Whether the parts of the next change are being written.
-    pub preparing: bool,
+    /// The number of the job that is writing the parts of the next change.
+    preparing: Option<u64>,
+    /// How many such jobs there have been. The result of an earlier one may still come.
+    prepares: u64,
 }
 
 impl Outgoing {
@@ -41,6 +43,7 @@ impl Outgoing {
             ready: seq,
             written: seq,
             acknowledged: seq,
+            prepares: self.prepares,
             ..Self::default()
         };
     }
@@ -118,16 +121,28 @@ impl Outgoing {
         self.ready
     }
 
+    /// Notes that the parts of the next change are being written. Returns the number of that job.
+    pub fn begin_prepare(&mut self) -> u64 {
+        self.prepares += 1;
+        self.preparing = Some(self.prepares);
+        self.prepares
+    }
+
+    /// Notes that the job `number` has ended. False if what it wrote is no longer the next change.
+    pub fn end_prepare(&mut self, number: u64) -> bool {
+        self.preparing.take_if(|it| *it == number).is_some()
+    }
+
     /// Raises [`Self::ready()`] to the last change without writing parts, because this computer is cut off.
     pub fn all_ready(&mut self) {
-        self.preparing = false;
+        self.preparing = None;
         self.ready = self.changes.back().map_or(self.ready, Change::seq);
     }
 
     /// Raises [`Self::ready()`] to the last change before a large one, and returns the parts of the large one, which
     /// must be written first.
     pub fn prepare(&mut self, keys: &Keys) -> Result<Option<Vec<Put>>, JournalError> {
-        if self.preparing {
+        if self.preparing.is_some() {
             return Ok(None);
         }
         for change in &self.changes {
@@ -184,7 +199,7 @@ impl Outgoing {
 
     /// Removes and returns all changes.
     pub fn take_all(&mut self) -> Vec<Change> {
-        self.preparing = false;
+        self.preparing = None;
         self.changes.drain(..).collect()
     }
 
@@ -292,11 +307,11 @@ mod tests {
         let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
         let parts = outgoing.prepare(&keys).unwrap().unwrap();
         assert_eq!((outgoing.ready(), parts.len()), (5, 1));
-        outgoing.preparing = true;
+        let job = outgoing.begin_prepare();
         // Only one change is prepared at a time.
         assert!(outgoing.prepare(&keys).unwrap().is_none());
         assert_eq!(outgoing.ready(), 5);
-        outgoing.preparing = false;
+        assert!(outgoing.end_prepare(job));
         // The parts were not written, so they are returned again.
         assert_eq!(outgoing.prepare(&keys).unwrap(), Some(parts));
         outgoing.prepared();
@@ -313,9 +328,9 @@ mod tests {
     #[test]
     fn what_became_ready_alone_has_its_parts_written_with_the_beat() {
         let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
-        outgoing.preparing = true;
+        let job = outgoing.begin_prepare();
         outgoing.all_ready();
-        assert!(!outgoing.preparing);
+        assert!(!outgoing.end_prepare(job));
         assert_eq!(outgoing.ready(), 7);
         assert_eq!(outgoing.missing_parts(&keys), []);
         outgoing.committed(5);

@@ -92,8 +92,12 @@ impl Member {
         loop {
             match self.outgoing.prepare(&self.keys) {
                 Ok(Some(parts)) => {
-                    self.outgoing.preparing = true;
-                    self.act(Action::Prepare { term, parts });
+                    let number = self.outgoing.begin_prepare();
+                    self.act(Action::Prepare {
+                        number,
+                        term,
+                        parts,
+                    });
                     break;
                 }
                 Ok(None) => break,
@@ -106,8 +110,8 @@ impl Member {
         self.queue_input(machine::Input::Recorded(self.outgoing.ready()));
     }
 
-    pub(super) fn prepared(&mut self, leads: Option<bool>) {
-        if !std::mem::take(&mut self.outgoing.preparing) {
+    pub(super) fn prepared(&mut self, number: u64, leads: Option<bool>) {
+        if !self.outgoing.end_prepare(number) {
             return;
         }
         if leads == Some(true) {

@@ -305,6 +305,61 @@ fn who_is_cut_off_from_an_empty_journal_begins_in_its_own_state() {
     assert_eq!(member.partition_writes().unwrap().base, state);
 }
 
+/// A computer that was cut off and leads again starts again, while its last job may still be at work in a slow etcd.
+#[test]
+fn the_parts_of_an_earlier_write_are_not_taken_for_those_of_the_present_one() {
+    let (keys, settings) = (Keys::new("robot"), Merges::new().member.settings().clone());
+    let own = LocalCheckpoint::default();
+    let mut member = Member::new(settings, keys, own, None, "a-1".to_owned());
+    let mut now = Instant::now();
+    let mut inputs = VecDeque::from([Input::Begin]);
+    let (mut revision, mut jobs, mut starts) = (0, Vec::new(), 0);
+    let large = |seq| {
+        let value = format!("{seq}").repeat(1 << 20);
+        let params = [Value::from("/n"), "/k".into(), (&*value).into()];
+        let entry = RecordContent::call(Request::new(Method::SetParam, params));
+        Input::Recorded(vec![Change::Call(Record { seq, entry }, Source::Here)])
+    };
+    while jobs.len() < 2 {
+        let input = inputs.pop_front().unwrap_or_else(|| {
+            now = member.deadline().unwrap();
+            Input::Wake
+        });
+        for action in member.on(now, input) {
+            match action {
+                Action::Load(_) => inputs.push_back(Input::Loaded(Some(Read::empty()))),
+                Action::Send { number, op, .. } => {
+                    revision += 1;
+                    let answer = match op {
+                        machine::Op::Read => EtcdAnswer::Is(View::default()),
+                        machine::Op::Claim { seq, .. } | machine::Op::Beat { seq, .. } => {
+                            EtcdAnswer::Applied { revision, seq }
+                        }
+                    };
+                    inputs.push_back(Input::Answer { number, answer });
+                }
+                Action::StartRecording { seq, .. } => {
+                    starts = seq;
+                    inputs.push_back(large(seq + 1));
+                }
+                Action::Prepare { number, .. } => {
+                    jobs.push(number);
+                    if jobs.len() < 2 {
+                        member.outgoing.start(starts);
+                        inputs.push_back(large(starts + 1));
+                    }
+                }
+                _ => {}
+            }
+        }
+    }
+    for (number, ready) in jobs.into_iter().zip([starts, starts + 1]) {
+        let leads = Some(true);
+        member.on(now, Input::Prepared { number, leads });
+        assert_eq!(member.outgoing.ready(), ready);
+    }
+}
+
 /// The disk may be slow, and the next leader may notify all nodes already.
 #[test]
 fn a_leader_that_is_cut_off_notifies_only_its_own_nodes_before_it_stores_anything() {

@@ -199,7 +199,7 @@ pub enum Input {
         writes: ForwardedWrites,
     },
     /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
-    Prepared(Option<bool>),
+    Prepared { number: u64, leads: Option<bool> },
     /// The result of [`Action::Decide`].
     Decided { seq: u64, goes_on: bool },
     /// The result of [`Action::Probe`] `number`: whether the leader's rosrescue answered that it leads.
@@ -300,6 +300,7 @@ pub enum Action {
     Watch(View),
     /// Write the parts of a large change to etcd.
     Prepare {
+        number: u64,
         term: u64,
         parts: Vec<Put>,
     },

@@ -65,7 +65,7 @@ enum Event {
     Late(usize, u64, usize),
     Merge(usize, u64, Option<usize>, u64, (u64, Ask)),
     Probe(usize, u64, usize, u64, u64),
-    Put(usize, u64, u64, Vec<crate::cluster::journal::Put>),
+    Put(usize, u64, (u64, u64), Vec<crate::cluster::journal::Put>),
     /// A node is notified of a parameter's value, by a computer or by its master.
     Notify {
         from: usize,
@@ -304,14 +304,15 @@ impl World {
                 let input = Input::Probed { number, leads };
                 self.after(delay, Event::Input(from, life, input));
             }
-            Event::Put(at, life, term, parts) => {
+            Event::Put(at, life, (number, term), parts) => {
                 let reaches = self.network.reaches_etcd(at);
                 let leads = self.etcd.view().guard().leader == term;
                 if reaches && leads {
                     self.etcd.put(parts);
                 }
                 let delay = self.delay();
-                let prepared = Input::Prepared(reaches.then_some(leads));
+                let leads = reaches.then_some(leads);
+                let prepared = Input::Prepared { number, leads };
                 self.after(delay, Event::Input(at, life, prepared));
             }
             Event::Notify {
@@ -598,9 +599,13 @@ impl World {
                     self.show_watch(at);
                 }
             }
-            Action::Prepare { term, parts } => {
+            Action::Prepare {
+                number,
+                term,
+                parts,
+            } => {
                 let delay = self.delay();
-                self.after(delay, Event::Put(at, life, term, parts));
+                self.after(delay, Event::Put(at, life, (number, term), parts));
             }
             Action::Decide { seq, .. } => {
                 let delay = self.delay();
