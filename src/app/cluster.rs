@@ -169,6 +169,12 @@ impl ClusterDriver {
         if lease.is_none() {
             self.setup.context.ledger.lease.set(None);
         }
+        if self.partition_writes.must_be_replaced()
+            && let Some(writes) = self.member.partition_writes()
+        {
+            let path = &self.setup.context.checkpoint;
+            self.partition_writes.replace(path, writes).await;
+        }
         let position = self.member.position();
         self.position
             .send_if_modified(|before| std::mem::replace(before, position) != position);
@@ -303,15 +309,7 @@ impl ClusterDriver {
                     .replace(&context.checkpoint, writes)
                     .await;
             }
-            Action::AddPartitionWrites(calls) => {
-                self.partition_writes.add(calls).await;
-                if self.partition_writes.has_outgrown()
-                    && let Some(writes) = self.member.partition_writes()
-                {
-                    let path = &self.setup.context.checkpoint;
-                    self.partition_writes.replace(path, writes).await;
-                }
-            }
+            Action::AddPartitionWrites(calls) => self.partition_writes.add(calls).await,
             Action::DeletePartitionWrites => {
                 self.partition_writes.remove(&context.checkpoint).await
             }

@@ -6,7 +6,7 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use checkpoint_store::{Store, StoreError, SyncJob, Synced, regular_file};
@@ -29,6 +29,8 @@ use crate::{
 const FILE_BYTES: u64 = 64 << 10;
 /// How long after a write the file is synced.
 const SYNC_PAUSE: Duration = Duration::from_millis(100);
+/// How long after a failure the file is written again. A disk that is silent takes [`DISK_PATIENCE`] of it.
+const AGAIN: Duration = Duration::from_secs(20);
 
 /// The file `CHECKPOINT.alone`, which holds the partition writes.
 #[derive(Default)]
@@ -39,6 +41,10 @@ pub(super) struct PartitionWritesFile {
     written: u64,
     /// Whether a sync of the file begins soon.
     sync_is_due: Arc<AtomicBool>,
+    /// Whether the file may lack writes, because the disk failed or was silent.
+    lacks_writes: Arc<AtomicBool>,
+    /// When the whole file was last written, or could not be.
+    tried_at: Option<Instant>,
 }
 
 fn file_path(checkpoint: &Path) -> PathBuf {
@@ -111,11 +117,13 @@ impl PartitionWritesFile {
                 wait::within(DISK_PATIENCE, open).await
             }
         };
+        self.lacks_writes.store(false, Ordering::Relaxed);
         match store {
             Some(Ok(store)) => self.write(store, writes).await,
-            Some(Err(error)) => log_unsaved(&error),
-            None => log_unsaved(&SILENT),
+            Some(Err(error)) => note_unsaved(&self.lacks_writes, &error),
+            None => note_unsaved(&self.lacks_writes, &SILENT),
         }
+        self.tried_at = Some(Instant::now());
     }
 
     async fn write(&mut self, mut store: Store, writes: PartitionWrites) {
@@ -161,20 +169,23 @@ impl PartitionWritesFile {
         if self.sync_is_due.swap(true, Ordering::Relaxed) {
             return;
         }
-        let is_due = self.sync_is_due.clone();
+        let (is_due, lacks_writes) = (self.sync_is_due.clone(), self.lacks_writes.clone());
         crate::task::spawn(async move {
             tokio::time::sleep(SYNC_PAUSE).await;
             // What is added from now on gets a sync of its own.
             is_due.store(false, Ordering::Relaxed);
             let synced = crate::task::spawn_blocking(move || job.run()).await;
             if let Some(error) = synced.as_ref().ok().and_then(Synced::error) {
-                log_unsaved(error);
+                note_unsaved(&lacks_writes, error);
             }
         });
     }
 
-    /// Whether the file is twice as large as necessary.
-    pub(super) fn has_outgrown(&self) -> bool {
+    /// Whether the whole file must be written again: it is twice as large as necessary, or a failure is long enough ago.
+    pub(super) fn must_be_replaced(&self) -> bool {
+        if self.lacks_writes.load(Ordering::Relaxed) {
+            return self.tried_at.is_none_or(|at| at.elapsed() >= AGAIN);
+        }
         let Some(store) = &self.store else {
             return false;
         };
@@ -188,17 +199,17 @@ impl PartitionWritesFile {
         work: impl FnOnce() -> (Result<(), StoreError>, Store) + Send + 'static,
     ) {
         let Some((done, store)) = wait::within(DISK_PATIENCE, work).await else {
-            return log_unsaved(&SILENT);
+            return note_unsaved(&self.lacks_writes, &SILENT);
         };
         if let Err(error) = done {
-            log_unsaved(&error);
+            note_unsaved(&self.lacks_writes, &error);
         }
         self.store = Some(store);
     }
 
     /// Removes the file, because all writes have been sent.
     pub(super) async fn remove(&mut self, checkpoint: &Path) {
-        self.store = None;
+        *self = Self::default();
         let path = file_path(checkpoint);
         // A hanging disk may remove the file later: it must only be gone before the next start.
         wait::within(DISK_PATIENCE, move || remove_files(path)).await;
@@ -254,7 +265,9 @@ fn set_aside(store: &mut Store) {
     }
 }
 
-fn log_unsaved(error: &dyn std::fmt::Display) {
+/// Logs that the file may lack writes, and has it written again.
+fn note_unsaved(lacks_writes: &AtomicBool, error: &dyn std::fmt::Display) {
+    lacks_writes.store(true, Ordering::Relaxed);
     rarely!(
         error,
         %error,
@@ -343,6 +356,34 @@ mod tests {
         assert!(loaded(&checkpoint, true).await.is_none());
     }
 
+    /// A disk may be full for a moment while the computer is cut off for hours.
+    #[tokio::test]
+    async fn the_file_is_written_again_after_a_failure() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        std::fs::create_dir(file_path(&checkpoint)).unwrap();
+        let mut kept = begun(&checkpoint).await;
+        std::fs::remove_dir(file_path(&checkpoint)).unwrap();
+        kept.add(vec![set("/a", 1)]).await;
+        assert!(!kept.must_be_replaced(), "not at once");
+        kept.tried_at = None;
+        assert!(kept.must_be_replaced());
+        kept.replace(&checkpoint, writes(vec![set("/a", 1)])).await;
+        kept.tried_at = None;
+        assert!(!kept.must_be_replaced());
+        // The disk loses what it has.
+        std::fs::write(file_path(&checkpoint), "").unwrap();
+        let all = vec![set("/a", 1), set("/b", 2)];
+        kept.add(vec![set("/b", 2)]).await;
+        kept.tried_at = None;
+        assert!(kept.must_be_replaced());
+        kept.replace(&checkpoint, writes(all.clone())).await;
+        kept.add(vec![set("/c", 3)]).await;
+        drop(kept);
+        let left = loaded(&checkpoint, true).await.unwrap();
+        assert_eq!(left.calls, [all, vec![set("/c", 3)]].concat());
+    }
+
     #[tokio::test]
     async fn parameters_that_are_set_again_and_again_take_no_larger_file() {
         let folder = tempfile::tempdir().unwrap();
@@ -355,7 +396,7 @@ mod tests {
         };
         for round in 0..300 {
             kept.add(values(round)).await;
-            if kept.has_outgrown() {
+            if kept.must_be_replaced() {
                 kept.replace(&checkpoint, writes(values(round))).await;
             }
             let bytes = std::fs::metadata(file_path(&checkpoint)).unwrap().len();
