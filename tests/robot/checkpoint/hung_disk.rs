@@ -222,22 +222,30 @@ fn a_master_that_was_started_on_a_hung_disk_is_used_after_a_death_of_rosrescue()
     assert_survives(&mut rescue, &wanted);
 }
 
+/// A `core` whose answers wait until the disk has them, with the parameter and the node of [`assert_survives`].
+fn core_that_syncs(scratch: &Scratch, disk: &FailingDisk) -> (Rescue, FakeNode) {
+    let setup = Setup::core(scratch, free_port()).args(["--no-rosout", "--sync", "always"]);
+    let rescue = disk.under(setup).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    (rescue, node)
+}
+
 /// A memory card may take seconds for a whole checkpoint. Meanwhile the present file has all writes.
 #[test]
 fn no_write_waits_for_a_whole_checkpoint() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
-    let setup = Setup::core(&scratch, free_port()).args(["--no-rosout", "--sync", "always"]);
-    let mut rescue = disk.under(setup).start();
+    let (mut rescue, _node) = core_that_syncs(&scratch, &disk);
     let client = rescue.client();
-    client.set_param("/before", 1);
-    let node = FakeNode::start("/node");
-    node.publish(&client, "/topic", "std_msgs/String");
     disk.begin(Trouble::HangsOnNewFile);
     let folder = rescue.checkpoint().parent().unwrap().to_owned();
     eventually("a new checkpoint is being written", || {
-        let mut files = std::fs::read_dir(&folder).unwrap();
-        files.any(|file| is_new_checkpoint(&file.unwrap().file_name().to_string_lossy()))
+        let files = std::fs::read_dir(&folder).unwrap();
+        let mut names = files.map(|file| file.unwrap().file_name());
+        names.any(|name| name.to_string_lossy().contains(".new-"))
     });
     within(SOON, "a write", || client.set_param("/during", 1));
     assert_eq!(unprotected(&client), None);
@@ -246,21 +254,12 @@ fn no_write_waits_for_a_whole_checkpoint() {
     assert_survives(&mut rescue, &wanted);
 }
 
-/// Whether a checkpoint that does not have its name yet has this one.
-fn is_new_checkpoint(name: &str) -> bool {
-    name.contains(".new-")
-}
-
 #[test]
 fn answers_wait_for_the_disk_again_as_soon_as_it_syncs() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
-    let setup = Setup::core(&scratch, free_port()).args(["--no-rosout", "--sync", "always"]);
-    let mut rescue = disk.under(setup).start();
+    let (mut rescue, _node) = core_that_syncs(&scratch, &disk);
     let client = rescue.client();
-    client.set_param("/before", 1);
-    let node = FakeNode::start("/node");
-    node.publish(&client, "/topic", "std_msgs/String");
     disk.begin(Trouble::Hangs);
     assert_reads_go_on(&client, {
         let client = client.clone();

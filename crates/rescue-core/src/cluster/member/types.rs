@@ -198,7 +198,7 @@ pub enum Input {
         base: Master,
         writes: ForwardedWrites,
     },
-    /// The result of [`Action::Prepare`]: whether this process still leads. `None` if that is unknown.
+    /// The result of [`Action::Prepare`] `number`: whether this process still leads. `None` if that is unknown.
     Prepared { number: u64, leads: Option<bool> },
     /// The result of [`Action::Decide`].
     Decided { seq: u64, goes_on: bool },
