@@ -1009,38 +1009,38 @@ fn every_promise_holds_in_every_schedule() {
     let number = |name| std::env::var(name).ok().and_then(|text| text.parse().ok());
     // The same schedules in each run, so that a failure comes from a change.
     let seed = number("ROSRESCUE_SEED").unwrap_or(0);
-    let schedules = number("ROSRESCUE_SCHEDULES").unwrap_or(500);
+    let schedules = number("ROSRESCUE_SCHEDULES").unwrap_or(250);
     println!("seeds from {seed} on, {schedules} schedules");
     assert_kept(seed, schedules);
 }
 
 #[test]
 fn every_promise_holds_while_injections_take_long() {
-    assert_kept(LONG_INJECTIONS, 500);
+    assert_kept(LONG_INJECTIONS, 150);
 }
 
 #[test]
 fn every_promise_holds_when_a_parameter_is_also_set_directly() {
-    assert_kept(SET_BEFORE, 500);
+    assert_kept(SET_BEFORE, 150);
 }
 
 #[test]
 fn every_promise_holds_when_the_disk_is_read_only_at_a_start() {
-    assert_kept(READ_ONLY, 500);
+    assert_kept(READ_ONLY, 150);
 }
 
 /// * 7206070: a node starts again twice behind a stopped master. The one in between has registered and ended, and its call
 ///   is pending; the port at which the master has the node is another node's by then.
 #[test]
 fn every_promise_holds_when_ports_are_taken() {
-    assert_kept(TAKEN_PORTS, 500);
+    assert_kept(TAKEN_PORTS, 150);
     assert_kept(7_206_070, 1);
 }
 
 #[test]
 fn late_masters_are_given_what_they_missed() {
     let stats: &'static Stats = Box::leak(Box::default());
-    let worlds = (0..100).map(|seed| World::new(seed, stats));
+    let worlds = (0..60).map(|seed| World::new(seed, stats));
     let caught_up: u64 = worlds.map(|world| world.play().1).sum();
     println!("{caught_up} times");
     assert!(caught_up > 3);
