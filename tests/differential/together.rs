@@ -329,8 +329,19 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
 #[test]
 fn simultaneous_callers_get_the_bytes_of_a_bare_rosmaster() {
     let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
-    for reads in ["mirror", "master"] {
-        play(seed, false, reads);
-        play(seed, true, reads);
+    let unreturnable = std::process::id().is_multiple_of(2);
+    let plays = [
+        (unreturnable, "mirror"),
+        (!unreturnable, "master"),
+        (unreturnable, "master"),
+        (!unreturnable, "mirror"),
+    ];
+    // Each run plays two of the four, which is half the time; one with a given seed plays all.
+    let played = match std::env::var_os("ROSRESCUE_SEED") {
+        Some(_) => plays.len(),
+        None => 2,
+    };
+    for (unreturnable, reads) in &plays[..played] {
+        play(seed, *unreturnable, reads);
     }
 }
