@@ -132,19 +132,6 @@ impl Drivers {
     }
 }
 
-in_both_modes!(no_driver_stalls_when_its_master_is_killed);
-
-fn no_driver_stalls_when_its_master_is_killed(mode: Mode) {
-    let _turn = crate::turn();
-    let mut robot = Robot::start(mode);
-    let mut drivers = Drivers::start(&robot);
-    for kill in 1..=3 {
-        drivers.assert_no_stall(&format!("{mode:?}, kill {kill}"), PASS, || {
-            robot.crash_master();
-        });
-    }
-}
-
 #[test]
 fn no_driver_stalls_while_there_is_no_master() {
     let _turn = crate::turn();
@@ -194,7 +181,7 @@ in_both_modes!(no_driver_stalls_behind_a_master_that_hangs);
 fn no_driver_stalls_behind_a_master_that_hangs(mode: Mode) {
     let _turn = crate::turn();
     let hangs = std::env::var("ROSRESCUE_HANGS");
-    let hangs = hangs.map_or(2, |text| text.parse().unwrap());
+    let hangs = hangs.map_or(1, |text| text.parse().unwrap());
     let robot = Robot::start_with(mode, &["--stand-in-after", "100"]);
     let mut drivers = Drivers::start_with(&robot, &["writes"]);
     let mut ends = Vec::<Instant>::new();
