@@ -169,7 +169,17 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
     fleet.computers[leader].set_param("/steady", 7);
     for cut in [leader, (leader + 1) % 3] {
         await_param(&fleet, "/steady", 7);
-        // A computer that lacks a record of which the leader's answer to it has told does not answer reads.
+        // A computer that lacks a record of which the leader's answer to it has told does not answer reads. The last such
+        // records are of the leader's own rosout, which starts after a takeover.
+        let leads = &fleet.computers[fleet.await_whole()];
+        eventually("the leader's rosout is registered", || {
+            let client = leads.client();
+            let rosout = leads.within(|| client.ask("lookupNode", params!["/test", "/rosout"]));
+            rosout.is_some_and(|api| {
+                api.as_str()
+                    .is_some_and(|api| api.contains(&leads.address()))
+            })
+        });
         fleet.await_same_state();
         let key = format!("/written_{cut}");
         fleet.network.cut_cable(cut);
