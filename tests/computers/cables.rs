@@ -31,7 +31,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_keeps_its_writes() {
     let mut chance = Chance::new();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let traffic = Traffic::start(&fleet);
-    for round in 0..rounds() {
+    for round in 0..rounds(1) {
         let leader = fleet.await_whole();
         let cut = victim(round, leader);
         let rest = fleet.others(cut);
@@ -220,7 +220,7 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
 fn a_computer_that_was_cut_off_does_not_notify_nodes_of_others() {
     let _turn = turn();
     let mut fleet = Fleet::start(&[]);
-    for round in 0..rounds() {
+    for round in 0..rounds(2) {
         let leader = fleet.await_whole();
         let cut = victim(round, leader);
         let rest = fleet.others(cut);

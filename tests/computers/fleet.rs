@@ -135,7 +135,10 @@ impl Fleet {
         let start = Instant::now();
         loop {
             let seen: Vec<_> = self.computers.iter().map(Computer::seen).collect();
-            let leader = self.leader();
+            let leading =
+                |index: &usize| seen[*index].as_ref().is_some_and(|it| it.role == "leading");
+            let mut leaders = (0..COUNT).filter(leading);
+            let leader = leaders.next().filter(|_| leaders.next().is_none());
             let agrees = |index: usize| {
                 let (Some(leader), Some(seen)) = (leader, &seen[index]) else {
                     return false;
@@ -157,7 +160,7 @@ impl Fleet {
                 start.elapsed() < PATIENCE,
                 "not all follow one leader: {seen:#?}"
             );
-            sleep(Duration::from_millis(50));
+            sleep(Duration::from_millis(100));
         }
     }
 

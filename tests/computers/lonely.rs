@@ -1,16 +1,16 @@
-use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
-use std::thread::scope;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{scope, sleep};
+use std::time::Duration;
 
 use ros1_master::xmlrpc::Value;
 
-use crate::computer::{Computer, PORT};
+use crate::computer::Computer;
 use crate::fleet::Fleet;
-use crate::network::enter;
-use crate::support::{Client, Finish, eventually, params};
+use crate::support::{Finish, eventually, params};
 use crate::turn;
 
 /// Number of parameters that are written while the computer is cut off.
-const KEYS: usize = 1500;
+const KEYS: usize = 600;
 /// Others also write each 50th of these parameters during the merge.
 const SHARED: usize = 50;
 
@@ -20,7 +20,7 @@ fn key(number: usize) -> String {
 
 /// Waits until the computer has sent the leader the writes that it acknowledged while it was cut off.
 #[track_caller]
-fn await_merged(computer: &Computer) {
+pub(crate) fn await_merged(computer: &Computer) {
     eventually("the writes made while cut off have been sent", || {
         !computer
             .logged("sent the writes made while cut off")
@@ -28,7 +28,7 @@ fn await_merged(computer: &Computer) {
     });
 }
 
-fn lost_writes(computer: &Computer) -> Option<u64> {
+pub(crate) fn lost_writes(computer: &Computer) -> Option<u64> {
     computer.status()?["cluster"]["lost_writes"].as_u64()
 }
 
@@ -128,6 +128,7 @@ fn a_write_made_while_cut_off_does_not_replace_one_made_during_the_merge() {
                     if finish.load(Ordering::Relaxed) {
                         break;
                     }
+                    sleep(Duration::from_millis(5));
                 }
                 written
             })
@@ -163,72 +164,5 @@ fn a_write_made_while_cut_off_does_not_replace_one_made_during_the_merge() {
         lost_writes(&fleet.computers[cut]),
         written[0]
     );
-    fleet.assert_nodes_live();
-}
-
-/// The former leader acknowledges the calls of its own nodes while it is alone. The followers make their forwarded
-/// calls again at the new leader.
-#[test]
-fn a_leader_without_etcd_drops_forwarded_calls_that_the_others_repeat() {
-    let _turn = turn();
-    let mut fleet = Fleet::start(&["--alone", "serve"]);
-    let leader = fleet.await_whole();
-    let rest = fleet.others(leader);
-    let key = |index: usize| format!("/counted_by_{index}");
-    let finish = AtomicBool::new(false);
-    let counts = [0, 1, 2].map(AtomicI32::new);
-    scope(|scope| {
-        let finish = Finish(&finish);
-        for &index in &rest {
-            let (count, finish) = (&counts[index], finish.0);
-            let namespace = fleet.computers[index].namespace.clone();
-            scope.spawn(move || {
-                enter(&namespace);
-                let client = Client::new(PORT);
-                for value in 1.. {
-                    client.ok("setParam", params!["/writer", key(index), value]);
-                    count.store(value, Ordering::Relaxed);
-                    if finish.load(Ordering::Relaxed) {
-                        return;
-                    }
-                }
-            });
-        }
-        let await_more = || {
-            for &index in &rest {
-                let before = counts[index].load(Ordering::Relaxed);
-                eventually("the writers go on", || {
-                    counts[index].load(Ordering::Relaxed) > before + 20
-                });
-            }
-        };
-        await_more();
-        for &other in &rest {
-            fleet.network.cut_port(leader, other, 2379);
-        }
-        fleet.computers[leader].kill_etcd();
-        fleet.await_leader_of(&rest);
-        let lonely = &fleet.computers[leader];
-        eventually("the computer is alone", || lonely.role_is("alone"));
-        lonely.set_param("/alone", 1);
-        await_more();
-        for &other in &rest {
-            fleet.network.mend_port(leader, other, 2379);
-        }
-        fleet.computers[leader].start_etcd();
-        fleet.await_whole();
-        await_merged(&fleet.computers[leader]);
-        await_more();
-        drop(finish);
-    });
-    fleet.await_same_state();
-    for computer in &fleet.computers {
-        assert_eq!(computer.param("/alone"), Some(Value::Int(1)));
-        for &index in &rest {
-            let last = counts[index].load(Ordering::Relaxed);
-            assert_eq!(computer.param(&key(index)), Some(Value::Int(last)));
-        }
-    }
-    assert_eq!(lost_writes(&fleet.computers[leader]), Some(0));
     fleet.assert_nodes_live();
 }

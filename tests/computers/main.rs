@@ -51,10 +51,10 @@ fn turn() -> support::Turn {
     support::turn(2)
 }
 
-/// Number of rounds in which computers are killed, cut off or told to hand over. `ROSRESCUE_ROUNDS` changes it.
-fn rounds() -> usize {
+/// Number of rounds in which computers are killed, cut off or told to hand over: `usual`, or `ROSRESCUE_ROUNDS`.
+fn rounds(usual: usize) -> usize {
     let rounds = std::env::var("ROSRESCUE_ROUNDS");
-    rounds.map_or(2, |rounds| {
+    rounds.map_or(usual, |rounds| {
         rounds.parse().expect("ROSRESCUE_ROUNDS is a number")
     })
 }

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::scope;
+use std::thread::{scope, sleep};
 use std::time::Duration;
 
 use ros1_master::xmlrpc::Value;
@@ -16,6 +16,8 @@ use crate::{rounds, turn};
 
 /// Number of parameters, each with its own writer.
 const KEYS: usize = 8;
+/// Pause between two calls of a writer.
+const PAUSE: Duration = Duration::from_millis(20);
 
 fn key(index: usize) -> String {
     format!("/of_writer_{index}")
@@ -31,6 +33,7 @@ fn count(key: &str, mut number: i32, stop: &AtomicBool) -> i32 {
             return number;
         }
         number += 1;
+        sleep(PAUSE);
     }
 }
 
@@ -69,7 +72,7 @@ fn a_leader_that_was_paused_sends_no_old_notifications() {
     let _turn = turn();
     let mut fleet = Fleet::start(&[]);
     let (mut first, mut watcher) = (0, None);
-    for round in 0..rounds() {
+    for round in 0..rounds(1) {
         let leader = fleet.await_whole();
         let rest = fleet.others(leader);
         let [healthy, late] = [0, 1].map(|nth| &fleet.computers[rest[nth]]);

@@ -13,7 +13,7 @@ use crate::network::{enter, within};
 use crate::support::{Client, FakeNode, Finish, State, eventually, params};
 
 /// Pause between two calls of a client.
-const PAUSE: Duration = Duration::from_millis(20);
+const PAUSE: Duration = Duration::from_millis(50);
 
 /// A parameter that always has the same value. Each reader must get it, never a default.
 const STEADY: &str = "/steady";

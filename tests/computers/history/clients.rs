@@ -18,9 +18,9 @@ use crate::support::{Client, Finish, ReceivedCall, State, eventually, params, re
 use crate::traffic::{Named, TYPE};
 
 /// Pause between two calls of a client.
-const PAUSE: Duration = Duration::from_millis(25);
+const PAUSE: Duration = Duration::from_millis(50);
 /// Pause between two requests for a computer's role.
-const SAMPLE: Duration = Duration::from_millis(40);
+const SAMPLE: Duration = Duration::from_millis(80);
 /// Time limit of such a request.
 const ANSWER: Duration = Duration::from_millis(300);
 /// How many parameters all computers write. Each computer also has a parameter of its own.
