@@ -134,7 +134,7 @@ fn python_reads_random_values_alike() {
     use proptest::strategy::ValueTree;
     use proptest::test_runner::TestRunner;
     let mut runner = TestRunner::default();
-    let values: Vec<Value> = (0..400)
+    let values: Vec<Value> = (0..150)
         .map(|_| values().new_tree(&mut runner).unwrap().current())
         .collect();
     // `shown` can convert integers of 128 bits.
