@@ -12,8 +12,8 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 const STEP: Duration = Duration::from_millis(10);
 
-/// Longest pause between two looks at a condition that comes true at some time. Looks are calls to rosrescue and its
-/// master, which other tests need the cores for.
+/// Longest pause between two looks at a condition. Looks are calls to rosrescue and its master, which other tests need
+/// the cores for.
 const LONGEST_STEP: Duration = Duration::from_millis(50);
 
 /// Waits until `condition` holds. Returns false after [`PATIENCE`].
@@ -43,9 +43,14 @@ fn look_until<T>(span: Duration, mut look: impl FnMut() -> Option<T>) -> Option<
         if let found @ Some(_) = look() {
             return found;
         }
-        sleep((start.elapsed() / 20).clamp(STEP, LONGEST_STEP));
+        pause(start);
     }
     None
+}
+
+/// Pauses between two looks, longer the longer the wait since `start` already takes.
+fn pause(start: Instant) {
+    sleep((start.elapsed() / 20).clamp(STEP, LONGEST_STEP));
 }
 
 /// Whether `condition` holds during all of `span`. Used for events that must *not* happen.
@@ -55,7 +60,7 @@ pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool
         if !condition() {
             return false;
         }
-        sleep(STEP);
+        pause(start);
     }
     true
 }
