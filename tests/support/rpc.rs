@@ -99,12 +99,7 @@ impl Client {
 
     /// Makes a call and decodes the answer.
     pub(crate) fn call(&self, method: &str, params: Vec<Value>) -> io::Result<Reply> {
-        let response = self.exchange(&http_request(&encode_call(method, params)))?;
-        if response.code != 200 {
-            let text = format!("{method}: the HTTP status is `{}`", response.status);
-            return Err(io::Error::other(text));
-        }
-        xmlrpc::decode_reply(&response.body).map_err(io::Error::other)
+        self.connect()?.call(method, params)
     }
 
     /// Code, message and value of the answer to a method of the Master API.
@@ -113,15 +108,7 @@ impl Client {
         method: &str,
         params: Vec<Value>,
     ) -> io::Result<(i32, String, Value)> {
-        match self.call(method, params)? {
-            Reply::Value(Value::Array(fields)) => match fields.as_slice() {
-                [Value::Int(code), Value::String(text), value] => {
-                    Ok((*code, text.clone(), value.clone()))
-                }
-                other => Err(io::Error::other(format!("{method}: {other:?}"))),
-            },
-            other => Err(io::Error::other(format!("{method}: {other:?}"))),
-        }
+        self.connect()?.status(method, params)
     }
 
     /// The value of a call that must succeed.
@@ -168,7 +155,7 @@ impl Client {
     }
 }
 
-/// One connection. After an HTTP/1.0 answer it connects again.
+/// One connection. After an HTTP/1.0 answer, or one with `Connection: close`, it connects again.
 #[derive(Debug)]
 pub(crate) struct Wire {
     stream: BufReader<TcpStream>,
@@ -207,6 +194,34 @@ impl Wire {
             *self = Self::to(self.address)?;
         }
         self.stream.get_mut().write_all(bytes)
+    }
+
+    /// Makes a call and decodes the answer.
+    pub(crate) fn call(&mut self, method: &str, params: Vec<Value>) -> io::Result<Reply> {
+        self.send(&http_request(&encode_call(method, params)))?;
+        let response = self.response()?;
+        if response.code != 200 {
+            let text = format!("{method}: the HTTP status is `{}`", response.status);
+            return Err(io::Error::other(text));
+        }
+        xmlrpc::decode_reply(&response.body).map_err(io::Error::other)
+    }
+
+    /// Code, message and value of the answer to a method of the Master API.
+    pub(crate) fn status(
+        &mut self,
+        method: &str,
+        params: Vec<Value>,
+    ) -> io::Result<(i32, String, Value)> {
+        match self.call(method, params)? {
+            Reply::Value(Value::Array(fields)) => match fields.as_slice() {
+                [Value::Int(code), Value::String(text), value] => {
+                    Ok((*code, text.clone(), value.clone()))
+                }
+                other => Err(io::Error::other(format!("{method}: {other:?}"))),
+            },
+            other => Err(io::Error::other(format!("{method}: {other:?}"))),
+        }
     }
 
     /// Closes this half of the connection, after the last request.
@@ -270,7 +285,8 @@ impl Wire {
                 self.stream.read_to_end(&mut response.body)?;
             }
         }
-        self.spent = response.status.starts_with("HTTP/1.0");
+        self.spent = response.status.starts_with("HTTP/1.0")
+            || response.header("connection") == Some("close");
         Ok(response)
     }
 

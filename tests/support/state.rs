@@ -33,12 +33,14 @@ impl State {
     }
 
     pub(crate) fn try_read(client: &Client) -> io::Result<Self> {
-        let ask = |method: &str, argument: Option<&str>| {
+        // One connection for all calls, because rosmaster starts a thread for each connection.
+        let mut wire = client.connect()?;
+        let mut ask = |method: &str, argument: Option<&str>| {
             let params = std::iter::once("/test")
                 .chain(argument)
                 .map(Value::from)
                 .collect();
-            let (code, text, value) = client.status(method, params)?;
+            let (code, text, value) = wire.status(method, params)?;
             match code {
                 1 => Ok(value),
                 _ => Err(io::Error::other(format!(
