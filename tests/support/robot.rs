@@ -115,9 +115,9 @@ impl Robot {
         }
         if mode == Mode::Core && !options.contains(&"--no-rosout") {
             // The subscription is the last thing that rosout registers.
-            let is_ready = |state: State| !state.subscribers_of("/rosout").is_empty();
+            let is_running = |nodes: Vec<_>| !nodes.is_empty();
             eventually("rosout is running", || {
-                State::try_read(&robot.bare()).is_ok_and(is_ready)
+                State::read_subscribers(&robot.bare(), "/rosout").is_some_and(is_running)
             });
         }
         robot
@@ -159,7 +159,8 @@ impl Robot {
         })
     }
 
-    /// Waits until the real master's state is `wanted`; panics with the difference.
+    /// Waits until the real master's state is `wanted`; panics with the difference. What changes the state meanwhile, such
+    /// as a health check, takes seconds.
     #[track_caller]
     pub(crate) fn await_state(&self, wanted: &State, when: &str) {
         let start = Instant::now();
@@ -171,7 +172,7 @@ impl Robot {
             if start.elapsed() > PATIENCE {
                 wanted.assert_same(&now.expect("the state of the master"), when);
             }
-            sleep(Duration::from_millis(50));
+            sleep(Duration::from_millis(200));
         }
     }
 

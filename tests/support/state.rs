@@ -156,6 +156,14 @@ impl State {
         self.nodes.iter().any(|(name, _)| name == node)
     }
 
+    /// The names of the subscribers of a topic, without the rest of the state.
+    pub(crate) fn read_subscribers(client: &Client, topic: &str) -> Option<Vec<String>> {
+        let system = client.ask("getSystemState", vec!["/test".into()])?;
+        let subscribers = registrations(list(&system).get(1)?);
+        let found = subscribers.into_iter().find(|(name, _)| name == topic);
+        Some(found.map(|(_, nodes)| nodes).unwrap_or_default())
+    }
+
     pub(crate) fn publishers_of(&self, topic: &str) -> Vec<String> {
         let found = self.publishers.iter().find(|(name, _)| name == topic);
         found.map(|(_, nodes)| nodes.clone()).unwrap_or_default()
