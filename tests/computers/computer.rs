@@ -11,7 +11,7 @@ use rustix::process::Signal;
 use crate::network::{COUNT, Network, address, within};
 use crate::support::{
     Client, Library, Node, Process, Scratch, State, alive, behind, command, eventually,
-    eventually_some, request, signal,
+    eventually_some, path_with_quick_rosversion, request, signal,
 };
 
 pub(crate) const NAMES: [&str; COUNT] = ["a", "b", "c"];
@@ -330,6 +330,7 @@ impl Computer {
             None => format!("{}/robot", endpoints().join(",")),
         };
         let mut command = command(&self.scratch, PORT, &["core", "--cluster", &cluster]);
+        command.env("PATH", path_with_quick_rosversion());
         command.args([
             "--advertise",
             &self.address(),

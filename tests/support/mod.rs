@@ -65,7 +65,10 @@ pub(crate) use relay::Relay;
 pub(crate) use report::report;
 pub(crate) use rescue::{PROGRAM, Rescue, Setup};
 pub(crate) use robot::{Mode, Robot};
-pub(crate) use ros::{NODES, Rosmaster, Tool, command, cpp_nodes, find_program, ros_command};
+pub(crate) use ros::{
+    NODES, Rosmaster, Tool, command, cpp_nodes, find_program, path_with_quick_rosversion,
+    ros_command,
+};
 pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request, unreadable};
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use servers::{LIMIT, Servers};
