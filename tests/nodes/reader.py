@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Reads a parameter again and again, with a default value that it should never get. Usage: reader.py KEY
+"""Reads a parameter again and again, with a default value that it should never get. Usage: reader.py KEY [HZ]
 
 It starts reading before it registers as a node, because a held registration blocks all other calls of a rospy process.
 """
@@ -24,12 +24,14 @@ def read(key, count):
 
 
 def main():
-    key = rospy.myargv()[1]
+    arguments = rospy.myargv()
+    key = arguments[1]
+    hz = float(arguments[2]) if len(arguments) > 2 else 50.0
     for count in range(1, 21):
         read(key, count)
     rospy.init_node("reader")
     say("ready", rospy.get_name())
-    for count, _ in enumerate(ticks(50), count + 1):
+    for count, _ in enumerate(ticks(hz), count + 1):
         read(key, count)
 
 

@@ -78,6 +78,15 @@ impl Node {
         node
     }
 
+    /// Waits until all of `nodes` are ready. Nodes that start at the same time make the computer wait less.
+    #[track_caller]
+    pub(crate) fn all_ready<const COUNT: usize>(mut nodes: [Self; COUNT]) -> [Self; COUNT] {
+        for node in &mut nodes {
+            node.wait_ready();
+        }
+        nodes
+    }
+
     #[track_caller]
     fn wait_ready(&mut self) {
         self.wait_line("`ready`", |line| line.starts_with("ready "));

@@ -35,11 +35,12 @@ impl Streams {
     #[track_caller]
     pub(crate) fn start(robot: &Robot, topic: &str, hz: &str, every: &str) -> Self {
         let remap = format!("chatter:=/{topic}");
+        // Talkers and listeners do not start together: rospy may then make a link twice.
         let start = |node: &str, arguments: &[&str]| {
-            LIBRARIES.map(|(library, suffix)| {
+            Node::all_ready(LIBRARIES.map(|(library, suffix)| {
                 let name = format!("__name:={node}_{suffix}_{topic}");
-                robot.node(library, node, &[arguments, &[&name, &remap]].concat())
-            })
+                robot.spawn_node(library, node, &[arguments, &[&name, &remap]].concat())
+            }))
         };
         let mut streams = Self {
             talkers: start("talker", &[hz, "quiet"]),
