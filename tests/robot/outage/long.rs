@@ -6,14 +6,14 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 
 use crate::support::{
-    FakeNode, LIBRARIES, Library, Mode, Node, Robot, State, Streams, Tool, eventually, holds,
+    FakeNode, LIBRARIES, Library, Mode, Node, Robot, State, Streams, eventually, holds,
     in_both_modes,
 };
 
 /// Rate of every talker, in Hz.
-const HZ: &str = "50";
-/// Listeners print every twenty-fifth message, and every gap.
-const EVERY: &str = "25";
+const HZ: &str = "20";
+/// Listeners print every tenth message, and every gap.
+const EVERY: &str = "10";
 /// Number of values that the cached parameter takes.
 const VALUES: i32 = 5;
 
@@ -42,16 +42,16 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     // Services: the server of each client is of the other library.
     let [py, cpp] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
     let pairs = [(py, cpp), (cpp, py)];
-    let servers = pairs.map(|((library, suffix), _)| {
+    let servers = Node::all_ready(pairs.map(|((library, suffix), _)| {
         let service = format!("who:=/who_{suffix}");
         let name = format!("__name:=server_{suffix}");
-        robot.node(library, "server", &[&service, &name])
-    });
-    let clients = pairs.map(|((_, server), (library, suffix))| {
+        robot.spawn_node(library, "server", &[&service, &name])
+    }));
+    let clients = Node::all_ready(pairs.map(|((_, server), (library, suffix))| {
         let service = format!("who:=/who_{server}");
         let name = format!("__name:=client_{suffix}");
-        robot.node(library, "client", &["20", &service, &name])
-    });
+        robot.spawn_node(library, "client", &["5", &service, &name])
+    }));
     for (client, ((_, server), _)) in clients.iter().zip(pairs) {
         let server = format!("/server_{server}");
         eventually("services answer", || {
@@ -59,26 +59,21 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
             replies.len() >= 5 && replies.iter().all(|name| *name == server)
         });
     }
-    // A tool sets a parameter, which nodes have cached.
-    let users = LIBRARIES.map(|(library, suffix)| {
+    // A parameter changes that nodes have cached.
+    let users = Node::all_ready(LIBRARIES.map(|(library, suffix)| {
         let name = format!("__name:=user_{suffix}");
-        robot.node(library, "param_user", &["/speed", &name])
-    });
+        robot.spawn_node(library, "param_user", &["/speed", &name])
+    }));
     for value in 1..=VALUES {
-        let value = value.to_string();
-        let set = ["set", "/speed", &value];
-        let tool = Tool::run(&robot.scratch, robot.port(), "rosparam", &set);
-        assert!(tool.status.success(), "{}", tool.stderr);
+        robot.client().set_param("/speed", value);
         for user in &users {
             eventually("the cached parameter has the new value", || {
-                user.said("value").last() == Some(&value)
+                user.said("value").last() == Some(&value.to_string())
             });
         }
     }
     // Nodes of the same name displace each other, within a library and across.
     displace(&robot);
-    // Other nodes end by themselves and unregister.
-    end(&robot);
     let seconds = std::env::var("ROSRESCUE_AWAY_SECONDS").map_or(0, |text| text.parse().unwrap());
     let rest = Duration::from_secs(seconds).saturating_sub(away.elapsed());
     assert!(holds(rest, || !robot.is_open()));
@@ -90,6 +85,13 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     for user in &users {
         assert_eq!(user.said("value"), heard);
     }
+    // Nodes that are asked to end do so, and unregister. The other client and its server see the next master.
+    let [user_py, user_cpp] = users;
+    let ([client_cpp, client_py], [server_py, server_cpp]) = (clients, servers);
+    for mut node in [user_py, user_cpp, client_cpp, server_py] {
+        end(&robot, &mut node);
+    }
+    let stay = [server_cpp, client_py];
     before.assert_whole(&robot);
     during.assert_whole(&robot);
     let mirror = State::read(&robot.client());
@@ -107,10 +109,8 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     mirror.assert_same(&robot.state(), "some seconds later");
     before.assert_whole(&robot);
     during.assert_whole(&robot);
-    assert_no_failure(&servers);
-    assert_no_failure(&clients);
-    assert_no_failure(&users);
-    for mut node in servers.into_iter().chain(clients).chain(users) {
+    assert_no_failure(&stay);
+    for mut node in stay {
         assert_eq!(node.exited(), None, "{}", node.log());
     }
     for topic in ["/before", "/during"] {
@@ -120,51 +120,49 @@ fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
 
 /// Checks that the second of two nodes of the same name stays, and the first one ends.
 fn displace(robot: &Robot) {
-    for ((first, _), (second, name)) in [
-        (LIBRARIES[0], LIBRARIES[0]),
-        (LIBRARIES[1], LIBRARIES[1]),
-        (LIBRARIES[0], LIBRARIES[1]),
-    ] {
-        let name = format!("twin_{first:?}_{name}").to_lowercase();
-        let remaps = [&*format!("__name:={name}"), "chatter:=/twins"];
-        let arguments = [HZ, "quiet", "logged", remaps[0], remaps[1]];
-        let mut displaced = robot.node(first, "talker", &arguments);
-        let mut stays = robot.node(second, "talker", &arguments);
-        displaced.wait();
-        assert!(
-            holds(Duration::from_millis(500), || stays.exited().is_none()),
-            "{}",
-            stays.log()
-        );
-        let state = State::read(&robot.client());
-        assert!(state.publishers_of("/twins").contains(&format!("/{name}")));
-        stays.signal(Signal::INT);
-        stays.wait();
+    let [py, cpp] = LIBRARIES;
+    let pairs = [(py, py), (cpp, cpp), (py, cpp)];
+    let names = pairs.map(|((_, first), (_, second))| format!("twin_{first}_{second}"));
+    let start = |libraries: [Library; 3]| {
+        let mut nodes = libraries.into_iter().zip(&names).map(|(library, name)| {
+            let name = format!("__name:={name}");
+            let arguments = [HZ, "quiet", "logged", &name, "chatter:=/twins"];
+            robot.spawn_node(library, "talker", &arguments)
+        });
+        Node::all_ready([(); 3].map(|()| nodes.next().unwrap()))
+    };
+    let displaced = start(pairs.map(|((library, _), _)| library));
+    let mut stay = start(pairs.map(|(_, (library, _))| library));
+    for mut node in displaced {
+        node.wait();
+    }
+    assert!(holds(Duration::from_millis(500), || {
+        stay.iter_mut().all(|node| node.exited().is_none())
+    }));
+    let state = State::read(&robot.client());
+    let publishers = state.publishers_of("/twins");
+    assert!(
+        names
+            .iter()
+            .all(|name| publishers.contains(&format!("/{name}"))),
+        "{state}"
+    );
+    for node in &stay {
+        node.signal(Signal::INT);
+    }
+    for node in &mut stay {
+        node.wait();
     }
     let state = State::read(&robot.client());
     assert_eq!(state.publishers_of("/twins"), Vec::<String>::new());
 }
 
-/// Checks that nodes which are asked to end do so, and are unregistered.
-fn end(robot: &Robot) {
-    // A rospy node that is told to end during a call to the master waits forever for its own lock, and it
-    // makes such calls all the time for a parameter that is not set.
-    robot.client().set_param("/leaving", 1);
-    for (library, suffix) in LIBRARIES {
-        for node in ["listener", "server", "param_user"] {
-            let name = format!("leaving_{node}_{suffix}");
-            let remap = format!("__name:={name}");
-            // The nodes that end must have no topic or service in common with a node that stays.
-            let arguments = ["/leaving", &remap, "chatter:=/leaving", "who:=/leaving"];
-            let arguments = match node {
-                "param_user" => &arguments[..],
-                _ => &arguments[1..],
-            };
-            let mut leaving = robot.node(library, node, arguments);
-            leaving.signal(Signal::INT);
-            leaving.wait();
-            let state = State::read(&robot.client());
-            assert!(!state.knows(&format!("/{name}")), "{state}");
-        }
-    }
+/// Checks that a node which is asked to end does so, and is unregistered.
+fn end(robot: &Robot, node: &mut Node) {
+    let name = node.said("ready").remove(0);
+    assert!(State::read(&robot.client()).knows(&name), "{name}");
+    node.signal(Signal::INT);
+    node.wait();
+    let state = State::read(&robot.client());
+    assert!(!state.knows(&name), "{state}");
 }
