@@ -4,12 +4,14 @@ use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, Permissions};
 use std::iter;
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::OnceLock;
 
 use ros1_master::xmlrpc::Value;
 
+use super::node::Library;
 use super::patience::eventually;
 use super::process::Process;
 use super::rpc::Client;
@@ -187,6 +189,22 @@ impl Tool {
             &mut ros_command(scratch, find_program(name), port),
             arguments,
         )
+    }
+
+    /// Makes each of `runs`, a tool's name and its arguments, one after another. The tools are imported only once
+    /// (`tests/nodes/tools.py`), which is most of what a run costs.
+    #[track_caller]
+    pub(crate) fn run_all(scratch: &Scratch, port: u16, runs: &[&[&str]]) -> Vec<Self> {
+        let mut command = Library::Rospy.command(scratch, port, "tools");
+        let runs = serde_json::to_string(runs).unwrap();
+        let printed = Self::wait(&mut command, &[&runs]).ended(0);
+        let results: Vec<(i32, String, String)> = serde_json::from_str(&printed).unwrap();
+        let tool = |(status, stdout, stderr): (i32, String, String)| Self {
+            status: ExitStatus::from_raw(status),
+            stdout: stdout.lines().collect::<Vec<_>>().join("\n"),
+            stderr: stderr.lines().collect::<Vec<_>>().join("\n"),
+        };
+        results.into_iter().map(tool).collect()
     }
 
     /// Runs a command of rosrescue with the master at `port` until it ends by itself.

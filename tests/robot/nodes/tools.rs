@@ -78,8 +78,7 @@ fn session(scratch: &Scratch, port: u16) -> Vec<String> {
         &["rosparam", "dump", &dump_text, "/"],
     ];
     let mut said = Vec::new();
-    for run in runs {
-        let tool = Tool::run(scratch, port, run[0], &run[1..]);
+    for (run, tool) in runs.iter().zip(Tool::run_all(scratch, port, runs)) {
         let text = format!("{run:?}: {}\n{}\n{}", tool.status, tool.stdout, tool.stderr);
         said.push(normalised(&text, scratch));
     }
@@ -120,7 +119,7 @@ fn without_ports(line: &str) -> String {
 }
 
 #[test]
-fn tools_print_the_same_as_with_a_bare_master() {
+fn tools_print_and_do_the_same_as_with_a_bare_master() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let _bare_cast = Cast::start(&scratch, master.port);
@@ -132,7 +131,7 @@ fn tools_print_the_same_as_with_a_bare_master() {
     );
 
     let mut robot = Robot::start(Mode::Proxy);
-    let _cast = Cast::start(&robot.scratch, robot.port());
+    let cast = Cast::start(&robot.scratch, robot.port());
     robot.crash_master();
     let through = session(&robot.scratch, robot.port());
     assert_eq!(bare.len(), through.len());
@@ -142,13 +141,11 @@ fn tools_print_the_same_as_with_a_bare_master() {
             "==== at a bare master\n{bare}\n==== through rosrescue\n{through}"
         );
     }
+    rosnode_cleanup_removes_a_dead_node_permanently(robot, cast);
 }
 
 /// `rosnode cleanup` asks before it removes nodes, so it gets an answer on its standard input.
-#[test]
-fn rosnode_cleanup_removes_a_dead_node_permanently() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let mut cast = Cast::start(&robot.scratch, robot.port());
+fn rosnode_cleanup_removes_a_dead_node_permanently(mut robot: Robot, mut cast: Cast) {
     let before = robot.settled_state();
     let after = before.without_node("/dead");
     cast.dead.kill();
