@@ -1,4 +1,4 @@
-//! The nodes of the example robot (`examples/robot`) do not notice six deaths of the master and two of rosrescue's
+//! The nodes of the example robot (`examples/robot`) do not notice three deaths of the master and one of rosrescue's
 //! worker.
 
 use std::collections::BTreeMap;
@@ -16,9 +16,8 @@ use crate::support::{
 };
 
 const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/robot");
-/// Number of deaths of the master between two deaths of the worker. A sixth death within a minute would be a
-/// crash loop.
-const DEATHS: [usize; 3] = [2, 2, 2];
+/// Number of deaths of the master before and after the death of the worker.
+const DEATHS: [usize; 2] = [2, 1];
 /// Sets a parameter as rqt_reconfigure does.
 const RECONFIGURE: &str = "
 import sys, rospy, dynamic_reconfigure.client
