@@ -142,6 +142,24 @@ impl Node {
         );
     }
 
+    /// Waits until each of `listeners` has received `more` further messages of each of `publishers`.
+    #[track_caller]
+    pub(crate) fn all_wait_messages(listeners: &[Self], publishers: &[String], more: usize) {
+        let counts = || {
+            let of = |listener: &Self| -> Vec<_> {
+                let counts = publishers.iter().map(|name| listener.messages(name).len());
+                counts.collect()
+            };
+            listeners.iter().flat_map(of).collect::<Vec<_>>()
+        };
+        let before = counts();
+        let what = format!("{more} more messages of each of {publishers:?} (after {before:?})");
+        eventually(&what, || {
+            let pairs = counts().into_iter().zip(&before);
+            pairs.into_iter().all(|(now, before)| now >= before + more)
+        });
+    }
+
     /// Panics unless all messages of `publisher` were received once and in order.
     #[track_caller]
     pub(crate) fn assert_no_message_lost(&self, publisher: &str) {

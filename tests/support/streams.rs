@@ -63,11 +63,7 @@ impl Streams {
     /// Waits until every listener has received messages from every talker.
     #[track_caller]
     fn flow(&self) {
-        for listener in &self.listeners {
-            for talker in self.names("talker") {
-                listener.wait_messages(&talker, 2);
-            }
-        }
+        Node::all_wait_messages(&self.listeners, &self.names("talker"), 2);
     }
 
     /// The links that each node reports for the topic, including their numbers and ports.
