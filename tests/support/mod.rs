@@ -124,34 +124,3 @@ macro_rules! in_both_modes {
     )*};
 }
 pub(crate) use in_both_modes;
-
-/// Like [`in_both_modes`], also for each client library: each test is called with a library and a mode.
-#[allow(unused_macros)]
-macro_rules! everywhere {
-    ($($test:ident),* $(,)?) => {$(
-        mod $test {
-            use crate::support::{Library, Mode};
-
-            #[test]
-            fn rospy_core() {
-                super::$test(Library::Rospy, Mode::Core);
-            }
-
-            #[test]
-            fn rospy_proxy() {
-                super::$test(Library::Rospy, Mode::Proxy);
-            }
-
-            #[test]
-            fn roscpp_core() {
-                super::$test(Library::Roscpp, Mode::Core);
-            }
-
-            #[test]
-            fn roscpp_proxy() {
-                super::$test(Library::Roscpp, Mode::Proxy);
-            }
-        }
-    )*};
-}
-pub(crate) use everywhere;
