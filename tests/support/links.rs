@@ -26,7 +26,7 @@ pub(crate) use traces::Traces;
 const SUBSCRIBERS: usize = 3;
 const SPACE: &str = "/links/";
 /// Pause between two checks of the nodes' connections. Each check takes some milliseconds of every node.
-const LOOK: Duration = Duration::from_millis(250);
+const LOOK: Duration = Duration::from_millis(500);
 
 /// The order in which a node registers its publishers and subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -352,8 +352,13 @@ pub(crate) fn start(place: Place, plan: &Plan, seed: u64) -> Start {
     let client = stage.client();
     let (state, has) = loop {
         sleep(LOOK);
-        let (state, has) = (State::read(&client), made(&nodes));
-        if wanted(&state) == has && has.len() == plan.links || begin.elapsed() > plan.bound() {
+        let has = made(&nodes);
+        let is_over = begin.elapsed() > plan.bound();
+        if has.len() != plan.links && !is_over {
+            continue;
+        }
+        let state = State::read(&client);
+        if wanted(&state) == has || is_over {
             break (state, has);
         }
     };

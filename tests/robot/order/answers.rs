@@ -21,7 +21,7 @@ use crate::support::{
 /// Possible times between the two calls, in microseconds.
 const APART: [u64; 4] = [50, 200, 500, 2_000];
 /// How long each kind of pair is tried. Each pair takes some 5 to 20 ms.
-const TIME: Duration = Duration::from_millis(1_200);
+const TIME: Duration = Duration::from_millis(600);
 /// Number of pairs at the same time, after each kind was tried alone.
 const PAIRS: usize = 6;
 const TYPE: &str = "std_msgs/String";

@@ -12,7 +12,8 @@ fn every_link_is_made(place: Place, library: Library) {
     let plan = Plan {
         library,
         nodes: 8,
-        links: 480,
+        // The kills must come while the nodes register.
+        links: if place == Place::Kills { 480 } else { 240 },
         // On a busy computer some links take 13 s.
         wait: PATIENCE,
         ..Plan::default()
@@ -23,11 +24,6 @@ fn every_link_is_made(place: Place, library: Library) {
 #[test]
 fn every_link_is_made_through_core() {
     every_link_is_made(Place::Core, Library::Rospy);
-}
-
-#[test]
-fn every_link_is_made_through_proxy() {
-    every_link_is_made(Place::Proxy, Library::Rospy);
 }
 
 #[test]
@@ -46,6 +42,6 @@ fn every_link_is_made_by_the_nodes_of_a_follower() {
 }
 
 #[test]
-fn every_link_is_made_by_roscpp() {
-    every_link_is_made(Place::Core, Library::Roscpp);
+fn every_link_is_made_by_roscpp_through_proxy() {
+    every_link_is_made(Place::Proxy, Library::Roscpp);
 }
