@@ -1,8 +1,9 @@
 //! Another computer at the end of a cable: a network namespace, with a way to make packets to it or from it
 //! vanish. Needs root and iproute2.
 
+use std::io::Write;
 use std::net::Ipv6Addr;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use super::namespace::isolate;
@@ -26,6 +27,24 @@ pub(crate) fn ip(words: &str) {
         "ip {words}: {}(network namespaces need root)",
         String::from_utf8_lossy(&output.stderr)
     );
+}
+
+/// Runs one `ip` with many commands, one per line, in the namespace `name`. Panics with its output if it fails.
+#[track_caller]
+fn ip_batch(name: &str, commands: &str) {
+    let mut ip = Command::new("ip")
+        .args(["-n", name, "-batch", "-"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut input = ip.stdin.take().unwrap();
+    input.write_all(commands.as_bytes()).unwrap();
+    drop(input);
+    let output = ip.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "ip -batch: {errors}\n{commands}");
 }
 
 impl Netns {
@@ -53,10 +72,10 @@ impl Netns {
         ip(&format!("addr add {net}.1/24 dev {near}"));
         ip(&format!("link set {near} up"));
         ip(&format!("-n {name} link set lo up"));
-        for host in 2..40 {
-            ip(&format!("-n {name} addr add {net}.{host}/24 dev {far}"));
-        }
-        ip(&format!("-n {name} link set {far} up"));
+        let addresses = (2..40).map(|host| format!("addr add {net}.{host}/24 dev {far}\n"));
+        let up = format!("link set {far} up\n");
+        let commands: String = addresses.chain([up]).collect();
+        ip_batch(&name, &commands);
         this
     }
 
