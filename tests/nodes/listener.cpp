@@ -81,7 +81,7 @@ int main(int argc, char** argv)
   uint32_t links = 0;
   while (ros::ok())
   {
-    ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.002));
+    ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.01));
     const uint32_t now = subscriber.getNumPublishers();
     if (now != links)
       say("links " + std::to_string(links = now));
