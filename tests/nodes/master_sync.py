@@ -3,7 +3,7 @@
 
     master_sync.py OWN REMOTE NAMESPACE IGNORED...
 
-Five times a second it reads the state of the master at REMOTE, as master_discovery does, and registers the nodes below
+Twice a second it reads the state of the master at REMOTE, as master_discovery does, and registers the nodes below
 NAMESPACE with the master at OWN, under their own names and addresses, as master_sync does. It unregisters whatever the
 remote master no longer has. Topics in IGNORED are left out, as by `_ignore_topics`. A subscriber that it has registered
 is told of the publishers at both masters. After each pass that changed something it prints `synced JSON` with all
@@ -94,7 +94,7 @@ def main():
         except (OSError, xmlrpc.client.Error) as error:
             # One of the masters is away for a moment.
             print("again", error, flush=True)
-        time.sleep(0.2)
+        time.sleep(0.5)
 
 
 if __name__ == "__main__":
