@@ -70,31 +70,6 @@ fn a_service_unregistered_during_a_hang_stays_unregistered_if_rosrescue_is_kille
     }
 }
 
-/// A topic is registered with another type while the master is stopped.
-#[test]
-fn a_topic_type_changed_during_a_hang_is_given_to_the_master_afterwards() {
-    let robot = Robot::start_with(Mode::Proxy, &PROBES);
-    let client = robot.client();
-    let [node, other] = ["/node", "/other"].map(FakeNode::start);
-    for topic in ["/published", "/subscribed"] {
-        node.publish(&client, topic, "a/B");
-    }
-    other.subscribe(&client, "/subscribed", "a/B");
-    let pid = robot.master_pid();
-    stop(pid);
-    eventually("the gate is shut", || !robot.is_open());
-    for topic in ["/published", "/subscribed"] {
-        node.publish(&client, topic, "a/C");
-    }
-    node.unpublish(&client, "/subscribed");
-    let after = State::read(&client);
-    assert!(after.topic_types.iter().all(|(_, kind)| kind != "a/B"));
-    signal(pid, Signal::CONT);
-    settles(&robot.bare(), &robot.rescue, |state| {
-        state.topic_types == after.topic_types
-    });
-}
-
 /// A call of the killed rosrescue still runs in the master when the next rosrescue gets a newer value.
 #[test]
 fn a_newer_value_wins_over_a_long_call_of_a_killed_rosrescue() {
@@ -102,7 +77,7 @@ fn a_newer_value_wins_over_a_long_call_of_a_killed_rosrescue() {
     let long: Struct = (0..KEYS)
         .map(|key| (format!("k{key}"), Value::Int(1)))
         .collect();
-    for delay in [60, 120, 180, 240] {
+    for delay in [60, 180] {
         let mut robot = Robot::start(Mode::Proxy);
         let client = robot.client();
         let body = crate::support::encode_call(
@@ -224,7 +199,7 @@ fn writes_that_bypassed_rosrescue_are_found_and_kept() {
 /// Number of rounds of the random test. `ROSRESCUE_RETURNS` changes it.
 fn rounds() -> u64 {
     let given = std::env::var("ROSRESCUE_RETURNS").ok();
-    given.map_or(12, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
+    given.map_or(3, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
 }
 
 /// The same incarnation comes back after 1, 10 or 100 writes, one of which was under way when it went away.
@@ -255,16 +230,12 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
         let key = format!("/p{}", roll(6));
         let service = format!("/s{}", roll(3));
         let uri = format!("rosrpc://{name}");
+        // A topic may get another type.
+        let kind = ["a/B", "a/C"][roll(2)];
         match roll(10) {
-            0 | 1 => (
-                "registerPublisher",
-                params![name, topic, "std_msgs/String", api],
-            ),
+            0 | 1 => ("registerPublisher", params![name, topic, kind, api]),
             2 => ("unregisterPublisher", params![name, topic, api]),
-            3 => (
-                "registerSubscriber",
-                params![name, topic, "std_msgs/String", api],
-            ),
+            3 => ("registerSubscriber", params![name, topic, kind, api]),
             4 => ("unregisterSubscriber", params![name, topic, api]),
             5 => ("registerService", params![name, service, uri, api]),
             6 => ("unregisterService", params![name, service, uri]),
