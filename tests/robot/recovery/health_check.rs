@@ -3,9 +3,7 @@
 
 use std::time::Duration;
 
-use crate::support::{
-    FakeNode, Library, Mode, Robot, State, eventually, holds, in_both_modes, names, status,
-};
+use crate::support::{FakeNode, Library, Mode, Robot, State, eventually, holds, names, status};
 
 /// Waits for the report of a recovery whose health check has finished, and checks the fields of every report.
 #[track_caller]
@@ -32,14 +30,12 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
     }
 }
 
-in_both_modes!(a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told);
-
-fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mode: Mode) {
-    let mut robot = Robot::start(mode);
+/// Nodes of many kinds, which one health check judges.
+#[test]
+fn only_dead_nodes_and_those_whose_port_another_node_has_are_unregistered() {
+    let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
-    let dead = FakeNode::start("/dead");
-    let living = FakeNode::start("/living");
-    let subscriber = FakeNode::start("/subscriber");
+    let [dead, living, subscriber] = ["/dead", "/living", "/subscriber"].map(FakeNode::start);
     for node in [&dead, &living] {
         node.publish(&client, "/topic", "std_msgs/String");
         node.subscribe(&client, "/other", "std_msgs/String");
@@ -47,26 +43,6 @@ fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mod
         node.watch_param(&client, "/gains");
     }
     subscriber.subscribe(&client, "/topic", "std_msgs/String");
-    let after = robot.settled_state().without_node("/dead");
-    drop(dead);
-    robot.crash_master();
-    robot.await_state(&after, "after the dead node was unregistered");
-    eventually("the subscriber is notified", || {
-        subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
-    });
-    report(&robot, "the removed node", |report| {
-        names(&report["removed"]) == ["/dead"]
-    });
-    for node in [&living, &subscriber] {
-        assert_eq!(node.received("shutdown"), Vec::<Vec<_>>::new());
-    }
-}
-
-/// rosrescue asked both nodes for their process ids soon after they had registered.
-#[test]
-fn another_process_at_the_port_counts_as_another_node() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
     let [old, same] = [("/old", 4001), ("/same", 4002)].map(|(name, pid)| {
         let node = FakeNode::start(name);
         node.claim_pid(pid);
@@ -75,39 +51,59 @@ fn another_process_at_the_port_counts_as_another_node() {
         node.offer(&client, &format!("{name}/service"));
         node
     });
-    for node in [&old, &same] {
+    // Some client libraries report invented process ids. Matching topics count for more.
+    let restless = FakeNode::start("/restless");
+    restless.claim_restless_pid();
+    restless.publish(&client, "/restless/topic", "std_msgs/String");
+    restless.offer(&client, "/restless/service");
+    // This node answers `getPublications` and `getSubscriptions` with empty lists.
+    let stub = FakeNode::start("/stub");
+    stub.publish(&client, "/stub/published", "std_msgs/String");
+    stub.subscribe(&client, "/stub/subscribed", "std_msgs/String");
+    stub.claim_publication("/stub/published", None);
+    stub.claim_subscription("/stub/subscribed", None);
+    for node in [&old, &same, &restless] {
         eventually("the node is asked for its process id", || {
             !node.received("getPid").is_empty()
         });
     }
-    let after = robot.settled_state().without_node("/old");
+    // rosrescue has not asked this node for its process id yet. The node that gets its port has other topics.
+    let different = FakeNode::start("/different");
+    different.publish(&client, "/rosout", "rosgraph_msgs/Log");
+    different.publish(&client, "/different/topic", "std_msgs/String");
+    different.offer(&client, "/different/service");
+    let other = take_port(different, "/other");
+    other.publish(&client, "/rosout", "rosgraph_msgs/Log");
+    other.publish(&client, "/other/topic", "std_msgs/String");
+    drop(dead);
+    // Another process has the port of this node.
     let taker = take_port(old, "/taker");
     taker.claim_pid(4003);
     taker.claim_publication("/rosout", Some("rosgraph_msgs/Log"));
-    robot.crash_master();
-    robot.await_state(&after, "after the old node was unregistered");
-    report(&robot, "the removed node", |report| {
-        names(&report["removed"]) == ["/old"]
-    });
-    assert_eq!(taker.received("shutdown"), Vec::<Vec<_>>::new());
-    assert_eq!(same.received("shutdown"), Vec::<Vec<_>>::new());
-}
-
-/// Some client libraries report invented process ids.
-#[test]
-fn matching_topics_count_for_more_than_a_changed_process_id() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let node = FakeNode::start("/restless");
-    node.claim_restless_pid();
-    node.publish(&client, "/topic", "std_msgs/String");
-    node.offer(&client, "/service");
-    eventually("the node is asked for its process id", || {
-        !node.received("getPid").is_empty()
-    });
+    let removed = ["/dead", "/different", "/old"];
     let before = robot.settled_state();
-    for _ in 0..2 {
-        assert_kept(&mut robot, &before);
+    let after = removed
+        .iter()
+        .fold(before, |state, node| state.without_node(node));
+    robot.crash_master();
+    robot.await_state(&after, "after three nodes were unregistered");
+    eventually("the subscriber is notified", || {
+        subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
+    });
+    report(&robot, "the removed nodes", |report| {
+        names(&report["removed"]) == removed
+    });
+    assert_kept(&mut robot, &after);
+    for node in [
+        &living,
+        &subscriber,
+        &same,
+        &restless,
+        &stub,
+        &other,
+        &taker,
+    ] {
+        assert_eq!(node.received("shutdown"), Vec::<Vec<_>>::new());
     }
 }
 
@@ -122,42 +118,6 @@ fn assert_kept(robot: &mut Robot, before: &State) {
     before.assert_same(&robot.state(), "after the health check");
 }
 
-/// The node answers `getPublications` and `getSubscriptions` with empty lists.
-#[test]
-fn a_node_that_cannot_list_its_topics_keeps_its_registrations() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let stub = FakeNode::start("/stub");
-    stub.publish(&client, "/published", "std_msgs/String");
-    stub.subscribe(&client, "/subscribed", "std_msgs/String");
-    stub.claim_publication("/published", None);
-    stub.claim_subscription("/subscribed", None);
-    let before = robot.settled_state();
-    assert_kept(&mut robot, &before);
-}
-
-/// rosrescue has never asked the old node for its process id.
-#[test]
-fn different_topics_at_the_port_count_as_another_node() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let old = FakeNode::start("/old");
-    old.publish(&client, "/rosout", "rosgraph_msgs/Log");
-    old.publish(&client, "/old/topic", "std_msgs/String");
-    old.offer(&client, "/old/service");
-    let same = FakeNode::start("/same");
-    same.publish(&client, "/rosout", "rosgraph_msgs/Log");
-    same.publish(&client, "/same/topic", "std_msgs/String");
-    let taker = take_port(old, "/taker");
-    taker.publish(&client, "/rosout", "rosgraph_msgs/Log");
-    taker.publish(&client, "/taker/topic", "std_msgs/String");
-    let after = robot.settled_state().without_node("/old");
-    robot.crash_master();
-    robot.await_state(&after, "after the old node was unregistered");
-    assert_eq!(taker.received("shutdown"), Vec::<Vec<_>>::new());
-    assert_eq!(same.received("shutdown"), Vec::<Vec<_>>::new());
-}
-
 /// Ends `node` and starts another node at its port.
 fn take_port(node: FakeNode, name: &str) -> FakeNode {
     let port = node.port();
@@ -166,22 +126,31 @@ fn take_port(node: FakeNode, name: &str) -> FakeNode {
 }
 
 #[test]
-fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again() {
+fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again_or_dies() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
-    let silent = FakeNode::start("/silent");
+    let [silent, dying] = ["/silent", "/dying"].map(FakeNode::start);
     silent.subscribe(&client, "/topic", "std_msgs/String");
     client.set_param("/gain", 1);
     silent.watch_param(&client, "/gain");
+    dying.publish(&client, "/last_words", "std_msgs/String");
     let before = robot.settled_state();
     silent.hold();
+    dying.hold();
     robot.crash_master();
     let unreachable = || names(&status(&client)["unreachable"]);
-    eventually("the node is unreachable", || unreachable() == ["/silent"]);
-    report(&robot, "the unreachable node", |report| {
-        names(&report["unreachable"]) == ["/silent"]
+    let both = ["/dying", "/silent"];
+    eventually("the nodes are unreachable", || unreachable() == both);
+    report(&robot, "the unreachable nodes", |report| {
+        names(&report["unreachable"]) == both
     });
-    before.assert_same(&robot.state(), "while the node is unreachable");
+    before.assert_same(&robot.state(), "while the nodes are unreachable");
+    drop(dying);
+    let after = before.without_node("/dying");
+    robot.await_state(&after, "after an unreachable node has died");
+    eventually("the other node is unreachable", || {
+        unreachable() == ["/silent"]
+    });
     // The master has tried to notify the node of this, or is still trying.
     let late = FakeNode::start("/late");
     late.publish(&client, "/topic", "std_msgs/String");
@@ -197,30 +166,10 @@ fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again() {
     });
 }
 
+/// No outage is needed for this. `liveness.rs` shows that dead nodes stay registered by default.
 #[test]
-fn an_unreachable_node_that_dies_is_unregistered() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
-    let client = robot.client();
-    let silent = FakeNode::start("/silent");
-    silent.publish(&client, "/topic", "std_msgs/String");
-    let after = robot.settled_state().without_node("/silent");
-    silent.hold();
-    robot.crash_master();
-    eventually("the node is unreachable", || {
-        names(&status(&client)["unreachable"]) == ["/silent"]
-    });
-    drop(silent);
-    robot.await_state(&after, "after the unreachable node has died");
-    eventually("no node is unreachable", || {
-        names(&status(&client)["unreachable"]).is_empty()
-    });
-}
-
-/// No outage is needed for this.
-#[test]
-fn reap_all_unregisters_dead_nodes_and_is_off_by_default() {
+fn reap_all_unregisters_dead_nodes() {
     let robot = Robot::start_with(Mode::Core, &["--reap", "all"]);
-    let client = robot.client();
     let mut talker = robot.node(Library::Rospy, "talker", &[]);
     let listener = robot.node(Library::Roscpp, "listener", &[]);
     listener.wait_messages("/talker", 5);
@@ -235,17 +184,6 @@ fn reap_all_unregisters_dead_nodes_and_is_off_by_default() {
     eventually("the listener is notified", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });
-
-    let robot = Robot::start(Mode::Proxy);
-    let dead = FakeNode::start("/dead");
-    dead.publish(&robot.client(), "/topic", "std_msgs/String");
-    let before = robot.settled_state();
-    drop(dead);
-    assert!(holds(Duration::from_secs(3), || {
-        let now = State::try_read(&robot.bare());
-        now.is_ok_and(|now| now == before)
-    }));
-    drop((client, after));
 }
 
 /// A node that does not answer, for example because it is busy, does not have to wait when it registers.
