@@ -175,13 +175,11 @@ def main():
         for _ in range(rounds):
             crowd.round()
             # A pace at which some nodes live long enough to be watched.
-            until = time.monotonic() + 0.1
-            while time.monotonic() < until:
-                crowd.check()
-                time.sleep(0.02)
-        while any(node.watched for node in crowd.dead.values()):
+            time.sleep(0.1)
             crowd.check()
-            time.sleep(0.02)
+        while any(node.watched for node in crowd.dead.values()):
+            time.sleep(0.1)
+            crowd.check()
     finally:
         for node in crowd.alive.values():
             os.kill(node.pid, signal.SIGKILL)

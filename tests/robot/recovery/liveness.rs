@@ -1,13 +1,13 @@
 //! The status reports dead nodes, long before a rescue or `--reap` unregisters them.
 
+use super::reap::{await_watched, has_logged, shown};
 use crate::support::{
-    FakeNode, Library, Mode, Robot, Tool, eventually, free_port, in_both_modes, names, page, params,
+    FakeNode, Library, Mode, Robot, Tool, eventually, free_port, names, page, params,
 };
 
-in_both_modes!(killed_nodes_are_reported_as_dead_and_stay_registered);
-
-fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
-    let robot = Robot::start_with(mode, &["--node-timeout", "300"]);
+#[test]
+fn killed_nodes_are_reported_as_dead_and_stay_registered() {
+    let robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let mut talker = robot.node(Library::Roscpp, "talker", &[]);
     let mut listener = robot.node(Library::Rospy, "listener", &[]);
@@ -25,41 +25,40 @@ fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
         unchecked() == ["/lost"] && status()["alive_nodes"].as_u64().map(|alive| alive + 1) == all
     });
     assert_eq!(names(&status()["dead_nodes"]), Vec::<String>::new());
-    let nodes = status()["state"]["nodes"].clone();
+    await_watched(&robot, &[("/talker", talker.pid())]);
+    let before = robot.settled_state();
+    let process = format!("its process {} ended at", talker.pid());
 
     talker.kill();
     listener.kill();
     eventually("the killed nodes are reported as dead", || {
         names(&status()["dead_nodes"]) == ["/listener", "/talker"]
     });
-    assert_eq!(
-        status()["state"]["nodes"],
-        nodes,
-        "the dead nodes must stay registered"
-    );
+    eventually("the log reports the dead node", || {
+        let report = "would have unregistered /talker: ";
+        has_logged(&robot, &[report, &process, "nobody listens at its port"])
+    });
+    assert_eq!(status()["node_health"]["/talker"]["health"], "dead");
+    before.assert_same(&robot.settled_state(), "dead nodes stay registered");
     assert_eq!(status()["unreachable"], serde_json::json!([]));
-    let shown = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(1);
+    let printed = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(1);
     for part in [
         "NODES DIED, since 2",
         "2 dead but registered: /listener since 2",
         ", /talker since 2",
         "; 1 not checked: /lost since 2",
     ] {
-        assert!(shown.contains(part), "{part}: {shown}");
+        assert!(printed.contains(part), "{part}: {printed}");
     }
     let metrics = page(&client, "/metrics");
-    assert!(metrics.contains("\nrosrescue_dead_nodes 2\n"), "{metrics}");
-    assert!(
-        metrics.contains("\nrosrescue_unchecked_nodes 1\n"),
-        "{metrics}"
-    );
-    let state = page(&client, "/state.json");
-    let state: serde_json::Value =
-        serde_json::from_str(state.rsplit("\r\n").next().unwrap_or(&state)).unwrap();
-    let node = |name: &str| {
-        let mut nodes = state["nodes"].as_array().unwrap().iter();
-        nodes.find(|node| node["name"] == name).unwrap().clone()
-    };
+    for line in [
+        "\nrosrescue_dead_nodes 2\n",
+        "\nrosrescue_unchecked_nodes 1\n",
+        "\nrosrescue_node_since_seconds{node=\"/talker\",health=\"dead\"} ",
+    ] {
+        assert!(metrics.contains(line), "{line}: {metrics}");
+    }
+    let node = |name: &str| shown(&robot, name).unwrap();
     assert_eq!(node("/talker")["health"], "dead");
     assert!(node("/talker")["removed_at"].is_null() && !node("/talker")["checked_at"].is_null());
     assert_eq!(

@@ -6,15 +6,15 @@ use rustix::process::Signal;
 use serde_json::Value as Json;
 
 use crate::support::{
-    FakeNode, Library, Mode, NODES, Node, Process, Robot, State, eventually, free_port, holds,
-    in_both_modes, names, page, params, ros_command, signal,
+    FakeNode, Library, Mode, NODES, Process, Robot, eventually, free_port, holds, page, params,
+    ros_command, signal,
 };
 
 /// Longer than a master needs to tell a node to shut down.
 const A_WHILE: Duration = Duration::from_secs(2);
 
 /// The node as the page shows it. `None` if it is unknown.
-fn shown(robot: &Robot, node: &str) -> Option<Json> {
+pub(super) fn shown(robot: &Robot, node: &str) -> Option<Json> {
     let state = page(&robot.client(), "/state.json");
     let state: Json = serde_json::from_str(state.rsplit("\r\n").next()?).ok()?;
     let mut nodes = state["nodes"].as_array()?.iter();
@@ -22,7 +22,7 @@ fn shown(robot: &Robot, node: &str) -> Option<Json> {
 }
 
 /// Waits until rosrescue watches these nodes' processes through the kernel.
-fn await_watched(robot: &Robot, nodes: &[(&str, u32)]) {
+pub(super) fn await_watched(robot: &Robot, nodes: &[(&str, u32)]) {
     for (node, pid) in nodes {
         eventually("the kernel watches the node's process", || {
             shown(robot, node).is_some_and(|of| of["process"] == *pid)
@@ -30,52 +30,32 @@ fn await_watched(robot: &Robot, nodes: &[(&str, u32)]) {
     }
 }
 
-fn has_logged(robot: &Robot, words: &[&str]) -> bool {
+/// Whether the master knows the node.
+#[track_caller]
+fn is_known(robot: &Robot, node: &str) -> bool {
+    let answer = robot.bare().status("lookupNode", params!["/test", node]);
+    answer.unwrap().0 == 1
+}
+
+/// Whether rosrescue has printed a line with all of these words.
+pub(super) fn has_logged(robot: &Robot, words: &[&str]) -> bool {
     let mut lines = robot.rescue.output().into_iter();
     lines.any(|line| words.iter().all(|word| line.contains(word)))
 }
 
-/// A node of each library, whose processes the kernel watches.
-fn two_nodes(robot: &Robot) -> [Node; 2] {
-    let talker = robot.node(Library::Rospy, "talker", &[]);
+#[test]
+fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one() {
+    let robot = Robot::start_with(Mode::Proxy, &["--reap", "local"]);
+    let mut talker = robot.node(Library::Rospy, "talker", &[]);
     let listener = robot.node(Library::Roscpp, "listener", &[]);
     let pids = [("/talker", talker.pid()), ("/listener", listener.pid())];
-    await_watched(robot, &pids);
-    [talker, listener]
-}
-
-in_both_modes!(by_default_dead_nodes_are_reported_and_stay_registered);
-
-fn by_default_dead_nodes_are_reported_and_stay_registered(mode: Mode) {
-    let robot = Robot::start_with(mode, &[]);
-    let [mut talker, _listener] = two_nodes(&robot);
-    let before = robot.settled_state();
-    let process = format!("its process {} ended at", talker.pid());
-    talker.kill();
-    eventually("the log reports the dead node", || {
-        let report = "would have unregistered /talker: ";
-        has_logged(&robot, &[report, &process, "nobody listens at its port"])
-    });
-    let status = robot.status().unwrap_or_default();
-    assert_eq!(names(&status["dead_nodes"]), ["/talker"]);
-    assert_eq!(status["node_health"]["/talker"]["health"], "dead");
-    let metrics = page(&robot.client(), "/metrics");
-    let line = "\nrosrescue_node_since_seconds{node=\"/talker\",health=\"dead\"} ";
-    assert!(metrics.contains(line), "{metrics}");
-    before.assert_same(&robot.settled_state(), "a dead node stays registered");
-}
-
-in_both_modes!(reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one);
-
-fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one(mode: Mode) {
-    let robot = Robot::start_with(mode, &["--reap", "local"]);
-    let [mut talker, listener] = two_nodes(&robot);
+    await_watched(&robot, &pids);
     let after = robot.settled_state().without_node("/talker");
     listener.signal(Signal::STOP);
     let killed = Instant::now();
     talker.kill();
     eventually("the dead node is unregistered", || {
-        State::try_read(&robot.bare()).is_ok_and(|now| !now.knows("/talker"))
+        !is_known(&robot, "/talker")
     });
     println!("unregistered after {:?}", killed.elapsed());
     robot.await_state(&after, "after the node's death");
@@ -84,7 +64,7 @@ fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one(mode: Mode) {
         has_logged(&robot, &line) && robot.counter("dead_nodes_reaped") == 1
     });
     // A node that is stopped does not answer, but lives.
-    assert!(holds(A_WHILE, || robot.state().knows("/listener")));
+    assert!(holds(A_WHILE, || is_known(&robot, "/listener")));
     listener.signal(Signal::CONT);
     let state = robot.settled_state();
     after.assert_same(&state, "the stopped node stays registered");
@@ -109,10 +89,9 @@ fn start_again(robot: &Robot) -> FakeNode {
     again
 }
 
-in_both_modes!(reap_local_never_lets_the_master_shut_down_an_innocent_node);
-
-fn reap_local_never_lets_the_master_shut_down_an_innocent_node(mode: Mode) {
-    let robot = Robot::start_with(mode, &["--reap", "local"]);
+#[test]
+fn reap_local_never_lets_the_master_shut_down_an_innocent_node() {
+    let robot = Robot::start_with(Mode::Proxy, &["--reap", "local"]);
     let innocent = with_taken_port(&robot);
     let _again = start_again(&robot);
     assert!(holds(A_WHILE, || innocent.received("shutdown").is_empty()));
@@ -208,7 +187,7 @@ fn two_programs_that_take_a_name_from_each_other_are_reported() {
 fn a_node_that_restarts_repeatedly_is_not_reported_as_two_programs() {
     let robot = Robot::start_with(Mode::Core, &[]);
     for _ in 0..4 {
-        let node = robot.node(Library::Rospy, "talker", &[]);
+        let node = robot.node(Library::Roscpp, "talker", &[]);
         await_watched(&robot, &[("/talker", node.pid())]);
         signal(node.pid(), Signal::KILL);
         drop(node);
