@@ -12,18 +12,20 @@ use crate::support::{
     params, signal, status,
 };
 
-/// Registers a publisher from the other computer. Its arguments are the master's address, the node and the node's
-/// address.
+/// Registers publishers from the other computer. Its arguments are the master's address, the node and the node's
+/// address of each.
 const REGISTER: &str = "
 import sys, xmlrpc.client
-uri, node, api = sys.argv[1:]
-assert xmlrpc.client.ServerProxy(uri).registerPublisher(node, node + '/t', 'std_msgs/String', api)[0] == 1
+for uri, node, api in zip(sys.argv[1::3], sys.argv[2::3], sys.argv[3::3]):
+    assert xmlrpc.client.ServerProxy(uri).registerPublisher(node, node + '/t', 'std_msgs/String', api)[0] == 1
 ";
 
-fn register(scratch: &Scratch, net: &Netns, uri: &str, node: &str, api: &str) {
+fn register(scratch: &Scratch, net: &Netns, publishers: &[[String; 3]]) {
     let mut command = Command::new("/usr/bin/python3");
     scratch.prepare(&mut command);
-    command.args(["-c", REGISTER, uri, node, api]);
+    command
+        .args(["-c", REGISTER])
+        .args(publishers.as_flattened());
     let output = net.inside(&command).output().unwrap();
     assert!(output.status.success(), "{output:?}");
 }
@@ -154,16 +156,12 @@ fn an_address_proves_something_only_if_it_leads_to_where_the_node_has_registered
         // Another computer may have this address here and there.
         ("/never_seen", &uri, net.far(9)),
     ];
-    for (node, uri, host) in &kept {
-        register(&scratch, &net, uri, node, &format!("http://{host}:9/"));
-    }
-    register(
-        &scratch,
-        &net,
-        &uri,
-        "/dead_far",
-        &format!("http://{}:9/", net.far(2)),
-    );
+    let dead_far = ("/dead_far", &uri, net.far(2));
+    let publishers = kept.iter().chain([&dead_far]).map(|(node, uri, host)| {
+        let api = format!("http://{host}:9/");
+        [uri.to_string(), node.to_string(), api]
+    });
+    register(&scratch, &net, &publishers.collect::<Vec<_>>());
     // Registrations from this computer, under each of its addresses.
     for (node, host, at) in [
         ("/dead_here", net.near(), "localhost"),

@@ -102,15 +102,13 @@ fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
     assert_eq!(robot.counter("divergences"), 0);
 }
 
-in_both_modes!(a_node_that_took_the_port_is_not_shut_down_during_an_outage_either);
-
-fn a_node_that_took_the_port_is_not_shut_down_during_an_outage_either(mode: Mode) {
-    let mut robot = Robot::start_under_with(mode, "waiting_rosmaster.py", &[], &["--reap", "all"]);
+#[test]
+fn a_node_that_took_the_port_is_not_shut_down_during_an_outage_either() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--reap", "all"]);
     let client = robot.client();
     let heir = FakeNode::start("/heir");
     let port = dead_node(&client, &heir);
     robot.settled_state();
-    robot.stay_away();
     robot.take_master_away();
     let mut innocent = innocent(&robot.scratch, robot.port(), port);
     let again = started_again(&client);
@@ -128,23 +126,21 @@ fn a_node_that_took_the_port_is_not_shut_down_during_an_outage_either(mode: Mode
 /// Anybody can register any address. A client registers another name at a living node's address and then moves it.
 #[test]
 fn a_living_node_stays_when_another_name_at_its_address_moves() {
-    for reap in ["local", "all"] {
-        let robot = Robot::start_with(Mode::Core, &["--reap", reap]);
-        let client = robot.client();
-        let victim = FakeNode::start("/victim");
-        victim.publish(&client, "/topic", "std_msgs/String");
-        for turn in 0..4 {
-            let name = format!("/thief{turn}");
-            let elsewhere = format!("http://127.0.0.1:{}/", free_port());
-            for api in [&victim.api, &elsewhere] {
-                let params = params![name.as_str(), "/other", "std_msgs/String", api.as_str()];
-                client.ok("registerPublisher", params);
-            }
+    let robot = Robot::start_with(Mode::Core, &["--reap", "all"]);
+    let client = robot.client();
+    let victim = FakeNode::start("/victim");
+    victim.publish(&client, "/topic", "std_msgs/String");
+    for turn in 0..4 {
+        let name = format!("/thief{turn}");
+        let elsewhere = format!("http://127.0.0.1:{}/", free_port());
+        for api in [&victim.api, &elsewhere] {
+            let params = params![name.as_str(), "/other", "std_msgs/String", api.as_str()];
+            client.ok("registerPublisher", params);
         }
-        assert!(holds(A_WHILE, || victim.received("shutdown").is_empty()));
-        let state = robot.settled_state();
-        assert_eq!(state.publishers_of("/topic"), ["/victim"], "{reap}");
-        assert_eq!(robot.counter("shutdowns_misdirected"), 0);
-        assert_eq!(robot.counter("shutdowns_prevented"), 4);
     }
+    assert!(holds(A_WHILE, || victim.received("shutdown").is_empty()));
+    let state = robot.settled_state();
+    assert_eq!(state.publishers_of("/topic"), ["/victim"]);
+    assert_eq!(robot.counter("shutdowns_misdirected"), 0);
+    assert_eq!(robot.counter("shutdowns_prevented"), 4);
 }
