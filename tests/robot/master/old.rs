@@ -1,17 +1,18 @@
 //! A master that behaves like rosmaster 1.14.3 and earlier: it also notifies the node that has set a parameter itself.
 //! While there is no master, rosrescue does the same.
 
-use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
+use crate::support::{FakeNode, Mode, Robot, eventually, holds, params};
 use std::time::Duration;
 
 use ros1_master::xmlrpc::Value;
 
-in_both_modes!(a_node_that_sets_a_parameter_is_notified_as_by_the_old_master);
-
-fn a_node_that_sets_a_parameter_is_notified_as_by_the_old_master(mode: Mode) {
-    for (program, is_old) in [("old_rosmaster.py", true), ("waiting_rosmaster.py", false)] {
-        let mut robot = Robot::start_under(mode, program, &[]);
-        robot.stay_away();
+#[test]
+fn a_node_that_sets_a_parameter_is_notified_as_by_the_old_master() {
+    for is_old in [true, false] {
+        let mut robot = match is_old {
+            true => Robot::start_under(Mode::Proxy, "old_rosmaster.py", &[]),
+            false => Robot::start(Mode::Proxy),
+        };
         let client = robot.client();
         let node = FakeNode::start("/node");
         node.watch_param(&client, "/gain");
