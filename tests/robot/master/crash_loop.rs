@@ -142,17 +142,23 @@ fn is_question(call: &ReceivedCall) -> bool {
 
 #[test]
 fn calls_are_answered_while_every_master_dies_at_once() {
-    let mut robot = Robot::new(&[]);
+    let mut robot = Robot::new(&["--hold", "1"]);
     let before = robot.failures.starts().len();
     robot.fail_with("at once");
     robot.await_crash_loop(true);
     // Reads are answered all the time.
     assert_eq!(robot.client().param("/robot/name"), Some("r2".into()));
     // Writes are answered too.
-    for i in 0..60 {
+    for i in 0..50 {
         within(SOON, "a write", || robot.client().set_param("/last", i));
         thread::sleep(Duration::from_millis(100));
     }
+    // Only calls that the mirror does not understand are affected: they are held until their time limit, and never
+    // answered wrongly.
+    within(Duration::from_secs(20), "a held call", || {
+        let answer = robot.client().exchange(&unreadable("/late", 0));
+        assert!(answer.is_err(), "{answer:?}");
+    });
     // Five restarts at once, then after pauses of 0.5, 1, 2, 4 and 8 s.
     let starts = || robot.failures.starts().split_off(before);
     eventually("the first pauses are over", || starts().len() > 6);
@@ -160,7 +166,7 @@ fn calls_are_answered_while_every_master_dies_at_once() {
     let first_ten = starts.iter().filter(|at| **at - starts[0] < 10.0).count();
     assert!(first_ten <= 10, "{starts:?}");
     robot.failures.clear();
-    assert_eq!(robot.client().param("/last"), Some(59.into()));
+    assert_eq!(robot.client().param("/last"), Some(49.into()));
     robot.client().ok("deleteParam", params!["/test", "/last"]);
     robot.await_state(&robot.before, "after the crash loop");
     assert_eq!(
@@ -180,41 +186,6 @@ fn calls_are_answered_while_every_master_dies_at_once() {
 }
 
 #[test]
-fn calls_are_answered_while_every_master_dies_after_two_seconds() {
-    let robot = Robot::new(&["--hold", "1"]);
-    let client = robot.client();
-    robot.fail_with("after 2");
-    robot.await_crash_loop(true);
-    // Each master serves calls between two deaths, but it is a crash loop nevertheless.
-    eventually("a master serves in between", || {
-        let status = status(&client);
-        status["open"] == true && status["crash_loop"] == true
-    });
-    // Clients notice nothing, while a master lives or after its death.
-    let (start, mut number) = (Instant::now(), 0);
-    while start.elapsed() < Duration::from_secs(6) {
-        number += 1;
-        within(SOON, "a write and a read", || {
-            client.set_param("/late", number);
-            assert_eq!(client.param("/late"), Some(number.into()));
-        });
-        thread::sleep(Duration::from_millis(20));
-    }
-    // Only calls that the mirror does not understand are affected: during the longer pauses they are held until their
-    // time limit, and never answered wrongly.
-    eventually("a held call ends after its time limit", || {
-        within(Duration::from_secs(20), "a held call", || {
-            client.exchange(&unreadable("/late", 0)).is_err()
-        })
-    });
-    robot.failures.clear();
-    robot.await_crash_loop(false);
-    client.set_param("/late", 1);
-    client.ok("deleteParam", params!["/test", "/late"]);
-    robot.await_state(&robot.before, "after the crash loop");
-}
-
-#[test]
 fn a_master_that_hangs_during_the_injection_is_replaced() {
     let probes = ["--probe-interval", "100", "--probe-timeout", "500"];
     let robot = Robot::new(&probes);
@@ -229,40 +200,29 @@ fn a_master_that_hangs_during_the_injection_is_replaced() {
     robot.await_state(&robot.before, "after a hang");
 }
 
-/// One record kills every master that gets it. No node notices this, and it ends when a client removes the record.
+/// Records that kill every master that gets them. No node notices this, and it ends when a client removes the last one.
 #[test]
-fn a_record_that_kills_masters_causes_no_outage() {
-    for name in ["/robot/arm/gain", "/topic0"] {
-        let robot = Robot::new(&[]);
-        let client = robot.client();
-        let questions = robot.questions();
-        robot.fail_with(&format!("name {name}"));
-        robot.await_crash_loop(true);
-        let away = |state: &State| state.assert_same(&State::read(&client), "in the mirror");
-        away(&robot.before);
-        client.set_param("/while/it/dies", 1);
-        client.ok("deleteParam", params!["/test", "/while"]);
-        robot.assert_no_node_disturbed(&questions);
-        let after = match name {
-            "/topic0" => {
-                robot.nodes[0].unpublish(&client, name);
-                robot.before.without_publisher(name, "/node0")
-            }
-            _ => {
-                client.ok("deleteParam", params!["/test", name]);
-                let after = State::read(&client);
-                robot.before.with_params_of(&after)
-            }
-        };
-        away(&after);
-        robot.failures.clear();
-        robot.await_state(&after, "after the record was removed");
-        robot.rescue.assert_no_panic();
-        assert!(
-            robot
-                .nodes
-                .iter()
-                .all(|node| node.received("shutdown").is_empty())
-        );
-    }
+fn records_that_kill_masters_cause_no_outage() {
+    let robot = Robot::new(&[]);
+    let client = robot.client();
+    let questions = robot.questions();
+    robot.fail_with("name /robot/arm/gain\nname /topic0");
+    robot.await_crash_loop(true);
+    let away = |state: &State| state.assert_same(&State::read(&client), "in the mirror");
+    away(&robot.before);
+    client.set_param("/while/it/dies", 1);
+    client.ok("deleteParam", params!["/test", "/while"]);
+    robot.assert_no_node_disturbed(&questions);
+    robot.nodes[0].unpublish(&client, "/topic0");
+    let after = robot.before.without_publisher("/topic0", "/node0");
+    away(&after);
+    // The topic keeps its type, which is also a record.
+    robot.failures.set("name /robot/arm/gain");
+    client.ok("deleteParam", params!["/test", "/robot/arm/gain"]);
+    let after = after.with_params_of(&State::read(&client));
+    away(&after);
+    robot.await_state(&after, "after the records were removed");
+    robot.rescue.assert_no_panic();
+    let mut nodes = robot.nodes.iter();
+    assert!(nodes.all(|node| node.received("shutdown").is_empty()));
 }
