@@ -2,12 +2,11 @@
 
 use serde_json::Value;
 
-use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes};
+use crate::support::{FakeNode, Mode, Robot, Tool, eventually};
 
-in_both_modes!(rescues_before_a_death_of_rosrescue_are_still_reported);
-
-fn rescues_before_a_death_of_rosrescue_are_still_reported(mode: Mode) {
-    let mut robot = Robot::start_with(mode, &["--node-timeout", "300"]);
+#[test]
+fn rescues_before_a_death_of_rosrescue_are_still_reported() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let reports = |robot: &Robot| {
         let folder = robot.rescue.checkpoint().parent().unwrap().to_owned();
         let entries = std::fs::read_dir(folder).unwrap().flatten();

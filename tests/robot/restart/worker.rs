@@ -10,15 +10,14 @@ use std::time::Duration;
 
 use crate::support::{
     Client, FakeNode, Library, Mode, NODES, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State,
-    alive, eventually, eventually_some, free_port, in_both_modes, signal, status,
+    alive, eventually, eventually_some, free_port, signal, status,
 };
 use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
-in_both_modes!(a_killed_rosrescue_adopts_the_living_master_when_restarted);
-
-fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
-    let mut robot = Robot::start(mode);
+#[test]
+fn a_killed_rosrescue_adopts_the_living_master_when_restarted() {
+    let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let talker = robot.node(Library::Roscpp, "talker", &[]);
     let listener = robot.node(Library::Rospy, "listener", &[]);
@@ -113,10 +112,9 @@ fn an_ended_node_does_not_displace_the_one_that_has_taken_its_name() {
     assert!(living.received("shutdown").is_empty());
 }
 
-in_both_modes!(nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master);
-
-fn nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master(mode: Mode) {
-    let mut robot = Robot::start_for_outages(mode);
+#[test]
+fn nodes_hear_what_a_dead_rosrescue_owed_them_although_there_is_no_master() {
+    let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let listener = FakeNode::start("/listener");
     listener.subscribe(&client, "/topic", "std_msgs/String");
@@ -400,7 +398,7 @@ fn a_hung_master_that_was_left_behind_is_replaced() {
 /// rosrescue is killed right after it has started its rosmaster, before any call was made to it.
 #[test]
 fn an_empty_master_that_was_left_behind_is_used_or_ended() {
-    for millis in [0, 60, 120, 180, 240] {
+    for millis in [0, 120, 240] {
         let scratch = Scratch::new();
         let port = free_port();
         let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
@@ -500,12 +498,14 @@ fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_mean
     assert_eq!(client.param("/kept"), Some(2.into()));
 }
 
-/// The master and rosrescue die within 200 ms of each other. The next master is used, however far it has got.
+/// The master and rosrescue die within 200 ms of each other, at moments that differ between runs. The next master is
+/// used, however far it has got.
 #[test]
 fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
     let scratch = Scratch::new();
     let mut rescue = core(&scratch);
-    for millis in (0..200).step_by(10) {
+    let first = u64::from(std::process::id() % 25);
+    for millis in (first..200).step_by(25) {
         let dead = kill_master_and_rescue(&mut rescue, Duration::from_millis(millis));
         let next = eventually_some("the next master runs alone", || {
             only_master(&scratch).filter(|pid| *pid != dead)
