@@ -178,12 +178,7 @@ fn a_master_keeps_its_state_although_an_older_checkpoint_was_restored() {
 /// some nodes are on another computer and live on.
 #[test]
 fn a_master_keeps_its_state_after_a_power_cut_of_rosrescues_computer() {
-    let cases = [
-        ("never", "auto"),
-        ("never", "always"),
-        ("interval", "always"),
-        ("always", "always"),
-    ];
+    let cases = [("never", "auto"), ("never", "always"), ("always", "always")];
     for (sync, restore) in cases {
         let scratch = Scratch::new();
         let master = Rosmaster::start(&scratch);
