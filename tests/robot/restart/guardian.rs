@@ -113,6 +113,7 @@ fn a_worker_restarts_although_the_configuration_file_is_broken_meanwhile() {
     assert!(words.contains("--hold=3\0--no-rosout"), "{words}");
 }
 
+/// A worker that had served calls is restarted at once, however often it dies.
 #[test]
 fn a_killed_worker_costs_no_connection_and_no_state() {
     let scratch = Scratch::new();
@@ -133,7 +134,7 @@ fn a_killed_worker_costs_no_connection_and_no_state() {
             .map(|_| scope.spawn(|| call_until(&done, &client)))
             .collect();
         let mut dead = 0;
-        for _ in 0..5 {
+        for _ in 0..8 {
             let alive = worker_after(&scratch, dead);
             signal(alive, Signal::KILL);
             dead = alive;
@@ -151,10 +152,12 @@ fn a_killed_worker_costs_no_connection_and_no_state() {
         "the master must be adopted"
     );
     assert_eq!(process_of(&scratch, "rosout/rosout"), rosout);
-    before.assert_same(&State::read(&client), "after five deaths");
+    before.assert_same(&State::read(&client), "after eight deaths");
     assert_eq!(node.received("publisherUpdate").len(), 0);
     let said = rescue.stderr().join("\n");
-    assert_eq!(said.matches("the worker has ended").count(), 5, "{said}");
+    assert_eq!(said.matches("restarting it at once").count(), 5, "{said}");
+    assert_eq!(said.matches("the worker keeps dying").count(), 3, "{said}");
+    assert_eq!(said.matches("pause=0ns").count(), 3, "{said}");
 }
 
 /// rosout takes some time to register. Until then the next worker recognises it by its process.
@@ -179,10 +182,18 @@ fn a_rosout_that_was_just_started_is_adopted() {
 }
 
 #[test]
-fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
+fn the_guardian_and_its_children_get_the_sockets_memory_and_priorities_that_they_need() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);
-    let guardian = rescue.pid();
+    assert_only_the_worker_has_the_sockets(&scratch, rescue.pid());
+    assert_little_memory(rescue.pid());
+    assert_ended_last(rescue.pid());
+    assert_run_before_the_nodes(&scratch, &rescue);
+}
+
+/// The guardian passes its sockets to the worker only.
+#[track_caller]
+fn assert_only_the_worker_has_the_sockets(scratch: &Scratch, guardian: u32) {
     let shared = |pid| {
         let common: BTreeSet<_> = sockets(pid)
             .intersection(&sockets(guardian))
@@ -191,13 +202,13 @@ fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
         common.len()
     };
     // The sockets of IPv4 and, if there is one, IPv6.
-    assert!(shared(worker(&scratch)) >= 1);
+    assert!(shared(worker(scratch)) >= 1);
     assert_eq!(
-        process_with(&scratch, "GLIBC_TUNABLES="),
-        Some(worker(&scratch))
+        process_with(scratch, "GLIBC_TUNABLES="),
+        Some(worker(scratch))
     );
     for program in ["rosmaster --core", "rosout/rosout"] {
-        let pid = process_of(&scratch, program);
+        let pid = process_of(scratch, program);
         assert_eq!(shared(pid), 0, "{program} has inherited a socket");
         let environment = fs::read(format!("/proc/{pid}/environ")).unwrap();
         let environment = String::from_utf8_lossy(&environment);
@@ -205,6 +216,10 @@ fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
         assert!(!environment.contains("ROSRESCUE_GUARDIAN"), "{program}");
         assert!(!environment.contains("GLIBC_TUNABLES"), "{program}");
     }
+}
+
+#[track_caller]
+fn assert_little_memory(guardian: u32) {
     let memory = fs::read_to_string(format!("/proc/{guardian}/smaps_rollup")).unwrap();
     let line = memory
         .lines()
@@ -219,6 +234,45 @@ fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
         .unwrap();
     // Most of this memory is relocations by the linker, which are larger in a debug build.
     assert!(kib < 3072, "the guardian uses {kib} KiB");
+}
+
+/// If the system permits it, the kernel ends nodes before the guardian when memory runs out.
+#[track_caller]
+fn assert_ended_last(guardian: u32) {
+    const SCORE: &str = "oom_score_adj";
+    let own = fs::read_to_string(format!("/proc/self/{SCORE}")).unwrap();
+    let script = format!(
+        "[ $(cat /proc/$$/{SCORE}) != 0 ] || echo -500 2>&- >/proc/$$/{SCORE}; cat /proc/$$/{SCORE}"
+    );
+    let permitted = Command::new("sh").args(["-c", &script]).output().unwrap();
+    let expected = String::from_utf8(permitted.stdout).unwrap();
+    let score = fs::read_to_string(format!("/proc/{guardian}/{SCORE}")).unwrap();
+    assert_eq!(score, expected, "the test's own value was {own}");
+}
+
+/// On a busy computer rosrescue runs first, then the master, then the nodes, to which rosout belongs.
+#[track_caller]
+fn assert_run_before_the_nodes(scratch: &Scratch, rescue: &Rescue) {
+    let allowed = match own_nice_value() {
+        0 if may_take_priority() => [-20, -20, -10, 0],
+        // The user has chosen a value.
+        own => [own; 4],
+    };
+    let values = || {
+        let [master, rosout] = ["rosmaster", "rosout"].map(|name| process_of(scratch, name));
+        [rescue.pid(), worker(scratch), master, rosout].map(nice_value)
+    };
+    assert_eq!(values(), allowed);
+    let dead = worker(scratch);
+    let master = rescue.client().master_pid().unwrap();
+    signal(master, Signal::KILL);
+    signal(dead, Signal::KILL);
+    worker_after(scratch, dead);
+    let client = rescue.client();
+    eventually("another master answers", || {
+        client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
+    });
+    assert_eq!(values(), allowed, "after the death of worker and master");
 }
 
 /// A `rosrescue core` that has lost its rosmaster program and its worker, so that new workers end before they serve
@@ -287,28 +341,6 @@ fn workers_that_fail_before_serving_are_restarted_after_a_pause() {
 }
 
 #[test]
-fn workers_that_have_served_are_always_restarted_at_once() {
-    let scratch = Scratch::new();
-    let rescue = core(&scratch);
-    let client = rescue.client();
-    let mut dead = 0;
-    for _ in 0..8 {
-        let next = worker_after(&scratch, dead);
-        eventually("rosrescue answers", || {
-            status(&client)["pid"].as_u64() == Some(next.into())
-        });
-        signal(next, Signal::KILL);
-        dead = next;
-    }
-    worker_after(&scratch, dead);
-    assert!(client.master_pid().is_some());
-    let said = rescue.stderr().join("\n");
-    assert_eq!(said.matches("restarting it at once").count(), 5, "{said}");
-    assert_eq!(said.matches("the worker keeps dying").count(), 3, "{said}");
-    assert_eq!(said.matches("pause=0ns").count(), 3, "{said}");
-}
-
-#[test]
 fn stopping_during_a_pause_ends_everything() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
@@ -317,9 +349,10 @@ fn stopping_during_a_pause_ends_everything() {
     assert_eq!(scratch.survivors(), vec![]);
 }
 
-/// A guardian that was stopped with Ctrl-Z exists but does not start a worker.
+/// A guardian that was stopped with Ctrl-Z exists but does not start a worker. A guardian that has ended leaves a worker
+/// that goes on.
 #[test]
-fn a_guardian_stopped_by_ctrl_z_does_not_count_as_one() {
+fn a_worker_reports_a_guardian_that_is_stopped_and_survives_one_that_ends() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.client().port());
@@ -338,47 +371,56 @@ fn a_guardian_stopped_by_ctrl_z_does_not_count_as_one() {
         line.contains("runs again")
     });
     assert_eq!(status(&client)["guarded"], true);
-}
 
-/// If the system permits it, the kernel ends nodes before the guardian when memory runs out.
-#[test]
-fn the_kernel_ends_the_guardian_last_when_memory_runs_out() {
-    const SCORE: &str = "oom_score_adj";
-    let scratch = Scratch::new();
-    let master = Rosmaster::start(&scratch);
-    let setup = Setup::proxy(&scratch, master.client().port());
-    let rescue = setup.guarded().start();
-    let own = fs::read_to_string(format!("/proc/self/{SCORE}")).unwrap();
-    let script = format!(
-        "[ $(cat /proc/$$/{SCORE}) != 0 ] || echo -500 2>&- >/proc/$$/{SCORE}; cat /proc/$$/{SCORE}"
-    );
-    let permitted = Command::new("sh").args(["-c", &script]).output().unwrap();
-    let expected = String::from_utf8(permitted.stdout).unwrap();
-    let score = fs::read_to_string(format!("/proc/{}/{SCORE}", rescue.pid())).unwrap();
-    assert_eq!(score, expected, "the test's own value was {own}");
+    let worker = worker(&scratch);
+    rescue.kill();
+    eventually("the log reports the missing guardian", || {
+        let lines = rescue.stderr().into_iter();
+        let warned = lines.filter(|line| line.contains("unguarded")).count();
+        warned == 2
+    });
+    client.set_param("/x", 1);
+    assert_eq!(status(&client)["guarded"], false);
+    assert!(by().contains("has ended"), "{}", by());
+    signal(worker, Signal::TERM);
+    eventually("the worker ends", || !alive(worker));
+    eventually("rosrescue was stopped cleanly", || {
+        rescue.stderr().join("\n").contains("stopped cleanly")
+    });
 }
 
 #[test]
 fn a_clean_stop_ends_everything() {
-    for signals in [
-        &[Signal::TERM][..],
-        &[Signal::INT],
-        &[Signal::HUP],
-        // killall signals both processes.
-        &[Signal::TERM, Signal::TERM],
-    ] {
+    // killall signals both processes.
+    for both in [false, true] {
         let scratch = Scratch::new();
         let mut rescue = core(&scratch);
-        if signals.len() > 1 {
-            signal(worker(&scratch), signals[1]);
+        if both {
+            signal(worker(&scratch), Signal::TERM);
         }
-        rescue.signal(signals[0]);
-        assert_eq!(rescue.wait_output().code(), Some(0), "{signals:?}");
-        assert_eq!(scratch.survivors(), vec![], "{signals:?}");
-        let said = rescue.stderr().join("\n");
-        assert!(said.contains("stopped cleanly"), "{said}");
-        assert!(!said.contains("unguarded"), "{said}");
+        rescue.signal(Signal::TERM);
+        assert_clean_stop(&mut rescue, Signal::TERM);
+        assert_eq!(scratch.survivors(), vec![], "both: {both}");
     }
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    for signal in [Signal::INT, Signal::HUP] {
+        let setup = Setup::proxy(&scratch, master.client().port());
+        let mut rescue = setup.guarded().start();
+        rescue.signal(signal);
+        assert_clean_stop(&mut rescue, signal);
+        let left = scratch.survivors().into_iter().map(|(pid, _)| pid);
+        assert_eq!(left.collect::<Vec<_>>(), [master.pid()], "{signal:?}");
+    }
+}
+
+/// Waits until rosrescue has ended, and checks that it was stopped cleanly.
+#[track_caller]
+fn assert_clean_stop(rescue: &mut Rescue, signal: Signal) {
+    assert_eq!(rescue.wait_output().code(), Some(0), "{signal:?}");
+    let said = rescue.stderr().join("\n");
+    assert!(said.contains("stopped cleanly"), "{said}");
+    assert!(!said.contains("unguarded"), "{said}");
 }
 
 /// The next worker may have got to any point. It ends the processes that the dead one left behind.
@@ -468,31 +510,6 @@ fn an_error_at_the_start_is_reported_once_and_ends_rosrescue() {
         assert_eq!(said.matches(sentence).count(), 1, "{said}");
         assert!(!said.contains("worker"), "{said}");
     }
-}
-
-#[test]
-fn a_worker_survives_its_guardian_and_reports_it() {
-    let scratch = Scratch::new();
-    let master = Rosmaster::start(&scratch);
-    let setup = Setup::proxy(&scratch, master.client().port());
-    let mut rescue = setup.guarded().start();
-    let client = rescue.client();
-    let worker = worker(&scratch);
-    rescue.kill();
-    eventually("the log reports the missing guardian", || {
-        let lines = rescue.stderr().into_iter();
-        let warned = lines.filter(|line| line.contains("unguarded")).count();
-        warned == 1
-    });
-    client.set_param("/x", 1);
-    let page = status(&client);
-    assert_eq!(page["guarded"], false);
-    assert!(page["guarded_by"].as_str().unwrap().contains("has ended"));
-    signal(worker, Signal::TERM);
-    eventually("the worker ends", || !alive(worker));
-    eventually("rosrescue was stopped cleanly", || {
-        rescue.stderr().join("\n").contains("stopped cleanly")
-    });
 }
 
 #[test]
@@ -609,33 +626,6 @@ fn nice_value(pid: u32) -> i32 {
 /// The nice value of this process, and of its children.
 fn own_nice_value() -> i32 {
     nice_value(std::process::id())
-}
-
-/// On a busy computer rosrescue runs first, then the master, then the nodes, to which rosout belongs.
-#[test]
-fn rosrescue_and_the_master_run_before_the_nodes() {
-    let scratch = Scratch::new();
-    let rescue = core(&scratch);
-    let allowed = match own_nice_value() {
-        0 if may_take_priority() => [-20, -20, -10, 0],
-        // The user has chosen a value.
-        own => [own; 4],
-    };
-    let values = || {
-        let [master, rosout] = ["rosmaster", "rosout"].map(|name| process_of(&scratch, name));
-        [rescue.pid(), worker(&scratch), master, rosout].map(nice_value)
-    };
-    assert_eq!(values(), allowed);
-    let dead = worker(&scratch);
-    let master = rescue.client().master_pid().unwrap();
-    signal(master, Signal::KILL);
-    signal(dead, Signal::KILL);
-    worker_after(&scratch, dead);
-    let client = rescue.client();
-    eventually("another master answers", || {
-        client.master_pid().is_some_and(|pid| pid != master) && status(&client)["open"] == true
-    });
-    assert_eq!(values(), allowed, "after the death of worker and master");
 }
 
 #[test]
