@@ -2,39 +2,27 @@
 # packaging/build-deb.sh [--debug] [--version VERSION]: makes a Debian package and prints its name.
 #
 # --debug takes the program that `cargo build` has made, for tests. --target TRIPLE takes the one that build-all.sh has
-# made, and --output FOLDER says where the package goes. Needs cargo-deb, which it installs into target/tools if it is
-# missing there.
+# made, and --output FOLDER says where the package goes. Needs dpkg-dev.
 set -eu
 cd "$(dirname "$0")/.."
 target=${CARGO_TARGET_DIR:-target}
-cargo_deb=3.8.0
 
 profile=dist
 version=
-fast=
 triple=
-output=$target/deb/
+output=$target/deb
 while [ $# -gt 0 ]; do
     case $1 in
-    --debug) profile=dev fast=--fast ;;
+    --debug) profile=dev ;;
     --version) version=$2 && shift ;;
     --target) triple=$2 && shift ;;
-    --output) output=$2/ && shift ;;
+    --output) output=$2 && shift ;;
     *) echo "build-deb.sh: unknown argument $1; use --debug, --version, --target or --output" >&2 && exit 2 ;;
     esac
     shift
 done
 
-deb=$target/tools/bin/cargo-deb
-if ! "$deb" --version 2>/dev/null | grep -qxF "cargo-deb $cargo_deb"; then
-    echo "build-deb.sh: installing cargo-deb $cargo_deb into $target/tools: some two minutes on two cores" >&2
-    # For tests it is built quickly. They make two packages.
-    quick=
-    [ "$profile" = dist ] || quick=--debug
-    env -u RUSTFLAGS -u CFLAGS -u CARGO_UNSTABLE_BUILD_STD cargo install $quick --quiet --locked --version "$cargo_deb" --root "$target/tools" cargo-deb
-fi
-
-# The program that makes the assets runs here, whichever processor the package is for.
+# The program that makes manual pages and completions runs here, whichever processor the package is for.
 if [ -n "$triple" ]; then
     program=$target/x86_64-unknown-linux-gnu/dist/rosrescue
 elif [ "$profile" = dev ]; then
@@ -43,33 +31,82 @@ else
     cargo build --profile dist --locked
     program=$target/dist/rosrescue
 fi
+packaged=$program
+[ -z "$triple" ] || packaged=$target/$triple/dist/rosrescue
+
+stage=$target/package
+root=$stage/debian/rosrescue
+share=$root/usr/share
+doc=$share/doc/rosrescue
+control=$root/DEBIAN
+rm -rf "$stage"
+install -D -m 755 "$packaged" "$root/usr/bin/rosrescue"
+install -D -m 755 -t "$control" packaging/deb/postinst packaging/deb/postrm packaging/deb/prerm
+install -D -m 644 packaging/deb/default "$root/etc/default/rosrescue"
+install -D -m 644 -t "$root/usr/lib/systemd/system" packaging/systemd/*
+if [ -z "$triple" ]; then
+    processor=$(dpkg --print-architecture)
+    # The other profile strips it.
+    [ "$profile" = dist ] || strip "$root/usr/bin/rosrescue"
+    # dpkg-shlibdeps runs only where the sources of a package are.
+    : >"$stage/debian/control"
+    depends=$(cd "$stage" && dpkg-shlibdeps -O debian/rosrescue/usr/bin/rosrescue | sed 's/^shlibs:Depends=//')
+else
+    case $triple in
+    x86_64-*) processor=amd64 ;;
+    aarch64-*) processor=arm64 ;;
+    armv7-*) processor=armhf ;;
+    *) echo "build-deb.sh: unknown processor of $triple; there are x86_64, aarch64 and armv7" >&2 && exit 2 ;;
+    esac
+    # build-all.sh has checked that the program needs no later one, and no other library.
+    depends="libc6 (>= 2.17)"
+fi
 
 # Completions and manual pages, made from the definition of the command line.
-assets=target/package
-rm -rf "$assets"
-mkdir -p "$assets/completions"
-"$program" man --folder "$assets/man"
-gzip -9n "$assets"/man/*.1
-for shell in bash zsh fish; do
-    "$program" completions "$shell" >"$assets/completions/$shell"
-done
+completions() { # SHELL FILE
+    mkdir -p "$(dirname "$share/$2")"
+    "$program" completions "$1" >"$share/$2"
+}
+completions bash bash-completion/completions/rosrescue
+completions zsh zsh/vendor-completions/_rosrescue
+completions fish fish/vendor_completions.d/rosrescue.fish
+mkdir -p "$share/man"
+"$program" man --folder "$share/man/man1"
+gzip -9n "$share"/man/man1/*.1
+
+# The documents, and a book of them if there is an mdBook.
+packaging/build-book.sh >/dev/null || [ $? = 3 ]
+mkdir -p "$share/doc"
+mv target/book-source "$doc"
+[ ! -d target/book ] || mv target/book "$doc/html"
+cp -r examples/systemd examples/grafana examples/prometheus "$doc/examples/"
+cp LICENSE "$doc/copyright"
 # What Debian asks for in place of CHANGELOG.md, which is there too.
-number=${version:-$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)-1}
-cat >"$assets/changelog" <<END
-rosrescue ($number) unstable; urgency=medium
+version=${version:-$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)-1}
+gzip -9n >"$doc/changelog.Debian.gz" <<END
+rosrescue ($version) unstable; urgency=medium
 
   * See /usr/share/doc/rosrescue/CHANGELOG.md.
 
  -- The maintainers of rosrescue <maintainers@rosrescue.invalid>  $(LC_ALL=C date -u -R -d "@${SOURCE_DATE_EPOCH:-0}")
 END
-# The documents, and a book of them if there is an mdBook.
-packaging/build-book.sh >/dev/null || [ $? = 3 ]
-mv target/book-source "$assets/doc"
-[ ! -d target/book ] || mv target/book "$assets/doc/html"
-cp -r examples/systemd examples/grafana examples/prometheus "$assets/doc/examples/"
-# This computer's strip knows only its own processor. The profile has stripped the program already.
-strip=--strip
-[ -z "$triple" ] || strip=--no-strip
-# shellcheck disable=SC2086 # no version, no words
-CARGO_TARGET_DIR=$target "$deb" --quiet --locked --no-build --profile "$profile" $strip $fast \
-    ${version:+--deb-version "$version"} ${triple:+--target "$triple" --variant old-glibc} --output "$output"
+chmod -R u=rwX,go=rX "$root"
+
+echo /etc/default/rosrescue >"$control/conffiles"
+(cd "$root" && find etc usr -type f -print0 | LC_ALL=C sort -z | xargs -0 md5sum >DEBIAN/md5sums)
+{
+    cat packaging/deb/control
+    echo "Version: $version"
+    echo "Architecture: $processor"
+    echo "Depends: $depends"
+    echo "Installed-Size: $(du -sk --apparent-size "$root" | cut -f 1)"
+} >"$control/control"
+
+mkdir -p "$output"
+package=$output/rosrescue_${version}_$processor.deb
+# Packages for tests are made quickly.
+quick=
+[ "$profile" = dist ] || quick="-Zgzip -z1"
+# shellcheck disable=SC2086 # several words or none
+dpkg-deb $quick --root-owner-group --build "$root" "$package" >/dev/null
+echo "$package"
