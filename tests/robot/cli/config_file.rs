@@ -4,7 +4,7 @@ use std::{fs, path::PathBuf, process::Command};
 
 use serde_json::Value;
 
-use crate::support::{Scratch, free_port};
+use crate::support::{Scratch, find_program, free_port};
 
 fn file(scratch: &Scratch, text: &str) -> PathBuf {
     let file = scratch.path("rosrescue.toml");
@@ -24,10 +24,13 @@ fn command(scratch: &Scratch, text: &str, words: &[&str]) -> Command {
 fn the_command_line_wins_over_the_environment_and_that_over_the_file() {
     let scratch = Scratch::new();
     let port = free_port().to_string();
+    // `check` does not import a rosmaster that is named, which would take most of its time.
+    let rosmaster = find_program("rosmaster");
     let text = "port = 1\nhold = 2\nhistory = 3\nno-rosout = true\nverbose = true\nallow = [\"10.0.0.0/24\", \"fd00::/64\"]\n";
     let output = command(&scratch, text, &["check", "--json", "--port", &port])
         .env("ROSRESCUE_HOLD", "4.5")
         .env("ROSRESCUE_VERBOSE", "0")
+        .env("ROSRESCUE_ROSMASTER", &rosmaster)
         .output()
         .unwrap();
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
@@ -53,6 +56,7 @@ fn the_command_line_wins_over_the_environment_and_that_over_the_file() {
         );
     }
     let output = command(&scratch, text, &["check", "--port", &port])
+        .env("ROSRESCUE_ROSMASTER", &rosmaster)
         .output()
         .unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
