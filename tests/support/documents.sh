@@ -44,7 +44,7 @@ within() { # SECONDS COMMAND...
             tail -n 20 "$scratch"/terminal-*.log >&2
             return 1
         fi
-        sleep 0.05
+        sleep 0.2
     done
 }
 
@@ -72,7 +72,8 @@ rosrescue() {
             within 60 calls_are_answered
             ;;
         top) command rosrescue "$@" --count 2 ;;
-        drill) command rosrescue "$@" --yes ;; # the user's answer
+        # The user's answer; and one kill instead of three, without a search for topics.
+        drill) command rosrescue "$@" --yes --times 1 --topic some_topic ;;
         *) command rosrescue "$@" ;;
     esac
 }
