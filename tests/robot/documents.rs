@@ -7,32 +7,51 @@ use super::support::{Scratch, blocks, documents};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Run before a section that needs a running rosrescue but starts none itself.
-const A_ROBOT: &str = "rosrescue core\nroslaunch --wait my_robot.launch\n";
+/// Begins the line that prints where a block stands.
+const WHERE: &str = "echo '--- ";
 
-/// Runs the blocks of `document`. Panics with the output of a section that fails.
-fn run(document: &str) {
+/// The sections of `document` with commands for a simulated computer: the heading and the commands. A line before each block
+/// prints where it stands.
+fn sections(document: &str) -> Vec<(String, String)> {
     let text = fs::read_to_string(Path::new(ROOT).join(document)).unwrap();
     let mut blocks = blocks(&text);
     blocks.retain(|block| block.reason().is_none() && !block.is_transcript());
-    for section in blocks.chunk_by(|one, next| one.section == next.section) {
-        let starts = |name: &str| section.iter().any(|block| block.text.contains(name));
-        let mut script = ". tests/support/documents.sh\n".to_owned();
-        if !["rosrescue core", "rosrescue proxy", "examples/"]
-            .iter()
-            .any(|name| starts(name))
-        {
-            script += A_ROBOT;
-        }
+    let sections = blocks.chunk_by(|one, next| one.section == next.section);
+    let sections = sections.map(|section| {
+        let mut script = String::new();
         for block in section {
-            write!(
-                script,
-                "echo '--- {document} line {}'\n{}",
-                block.line, block.text
-            )
-            .unwrap();
+            let (line, text) = (block.line, &block.text);
+            write!(script, "{WHERE}{document} line {line}'\n{text}").unwrap();
         }
-        run_on_a_computer(&script);
+        (section[0].section.clone(), script)
+    });
+    sections.collect()
+}
+
+/// What the reader of a section has started before, unless the section starts it itself.
+fn before(section: &str) -> &'static str {
+    let has = |word: &&str| section.contains(word);
+    let uses_ros = [
+        "rosrescue ",
+        "rosnode ",
+        "rostopic ",
+        "rosparam ",
+        "roslaunch ",
+        "curl ",
+    ];
+    let starts_master = ["rosrescue core", "rosrescue proxy", "examples/"];
+    match uses_ros.iter().any(has) && !starts_master.iter().any(has) {
+        false => "",
+        true if has(&"roslaunch ") => "rosrescue core\n",
+        true => "rosrescue core\nroslaunch --wait my_robot.launch\n",
+    }
+}
+
+/// Runs the commands of `document`. Panics with the output of a section that fails.
+fn run(document: &str) {
+    for (_, section) in sections(document) {
+        let before = before(&section);
+        run_on_a_computer(&format!(". tests/support/documents.sh\n{before}{section}"));
     }
 }
 
@@ -68,9 +87,25 @@ pub(super) fn run_on_a_computer(script: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
+/// The quickstart is in the recording below. The other commands are in the straight path of the guide, in this order.
 #[test]
-fn the_commands_of_the_readme_work() {
-    run("README.md");
+fn other_tests_run_the_commands_of_the_readme() {
+    let mut guide = sections("ROS_MASTER_URI.md");
+    guide.retain(|(heading, _)| heading == "The straight path");
+    let readme = sections("README.md");
+    let commands = |(_, section): &(String, String)| -> Vec<_> {
+        let lines = section.lines().filter(|line| !line.starts_with(WHERE));
+        let commands = lines.map(|line| line.split(" #").next().unwrap().trim().to_owned());
+        commands.collect()
+    };
+    let mut path = guide.iter().flat_map(commands);
+    let mut others: Vec<_> = readme.iter().flat_map(commands).collect();
+    others.retain(|command| command != "examples/quickstart.sh");
+    assert!(others.len() > 1, "{readme:?}");
+    for command in others {
+        let is_there = path.any(|found| found == command);
+        assert!(is_there, "{command} is not in this order in {guide:?}");
+    }
 }
 
 #[test]
@@ -107,6 +142,8 @@ fn lines(picture: &str) -> Vec<String> {
 
 #[test]
 fn the_recording_matches_the_output_of_its_script() {
+    let script = fs::read_to_string(Path::new(ROOT).join("examples/record.sh")).unwrap();
+    assert!(script.contains("examples/quickstart.sh"), "{script}");
     let ours = fs::read_to_string(Path::new(ROOT).join("docs/rescue.svg")).unwrap();
     let made = run_on_a_computer(". tests/support/documents.sh\nexamples/record.sh");
     assert!(lines(&made).len() > 10, "{made}");
