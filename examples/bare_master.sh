@@ -9,13 +9,20 @@ need_scratch
 
 master_port=$(free_port)
 export ROS_MASTER_URI=http://127.0.0.1:$master_port/
-master_pid() {
-    /usr/bin/python3 -c 'import sys, xmlrpc.client; print(xmlrpc.client.ServerProxy(sys.argv[1]).getPid("/example")[2])' \
-        "$ROS_MASTER_URI" 2>/dev/null
+# Prints the master's answer.
+ask() { # METHOD ARGUMENT...
+    local method=$1 params='' argument
+    shift
+    for argument in /example "$@"; do
+        params+="<param><value>$argument</value></param>"
+    done
+    curl -s -m 5 -H 'Content-Type: text/xml' "$ROS_MASTER_URI" \
+        -d "<methodCall><methodName>$method</methodName><params>$params</params></methodCall>"
 }
+master_pid() { ask getPid | sed -n 's/.*<int>\([0-9]*\)<.*/\1/p' | tail -n 1; }
 heard() { grep -cE '^[0-9.]+ [0-9]+$' "$scratch/$1.log" || true; }
 has_heard() { [ "$(heard "$1")" -ge "$2" ]; }
-late_is_up() { rosnode list | grep -qx /late; }
+late_is_up() { ask lookupNode /late | grep http: >/dev/null; }
 count() { "$@" 2>/dev/null | grep -c . || true; }
 
 step "Start a rosmaster that is restarted 0.1 s after its end"
@@ -39,7 +46,10 @@ master=$(master_pid)
 step "kill -9 $master: the rosmaster is dead"
 killed=$EPOCHREALTIME
 kill -KILL "$master"
-is_back() { [ "$(master_pid)" != "$master" ] && [ -n "$(master_pid)" ]; }
+is_back() {
+    local now
+    now=$(master_pid) && [ "$now" != "$master" ]
+}
 within 60 is_back || give_up "the rosmaster did not come back"
 say "after $(seconds "$killed" "$EPOCHREALTIME") s a new rosmaster answers, process $(master_pid)"
 
