@@ -38,7 +38,7 @@ impl Host {
                         seen.lock().unwrap().push(Instant::now());
                     }
                 }
-                thread::sleep(Duration::from_millis(1));
+                thread::sleep(Duration::from_millis(20));
             }
         };
         Self {
