@@ -47,6 +47,24 @@ fn calls_are_answered_with_the_same_bytes_as_by_a_bare_master() {
         "system.multicall",
         vec![Value::Array(vec![tree! { "x" => 1 }])],
     );
+    // Only getUri has another answer: the address of rosrescue.
+    assert_eq!(
+        twins.through.ok("getUri", params!["/c"]),
+        Value::from(twins.through.uri())
+    );
+    assert_eq!(twins.through.master_pid(), twins.behind.master_pid());
+    let several = Call::multicall([Call::new("getUri", params!["/c"])]);
+    let response = twins
+        .through
+        .call("system.multicall", several.params)
+        .unwrap();
+    assert!(
+        !format!("{response:?}").contains(&twins.behind.uri()),
+        "{response:?}"
+    );
+    // The master reports errors in the parameters of a call.
+    twins.same_call("getUri", params![]);
+    twins.same_call("getUri", params!["/c", 1]);
 }
 
 #[test]
@@ -164,26 +182,4 @@ fn http_paths_methods_and_versions_are_treated_as_by_a_bare_master() {
         }
     }
     assert!(differences.is_empty(), "{}", differences.join("\n\n"));
-}
-
-#[test]
-fn get_uri_returns_the_address_of_rosrescue() {
-    let twins = Twins::start();
-    assert_eq!(
-        twins.through.ok("getUri", params!["/c"]),
-        Value::from(twins.through.uri())
-    );
-    assert_eq!(twins.through.master_pid(), twins.behind.master_pid());
-    let several = Call::multicall([Call::new("getUri", params!["/c"])]);
-    let response = twins
-        .through
-        .call("system.multicall", several.params)
-        .unwrap();
-    assert!(
-        !format!("{response:?}").contains(&twins.behind.uri()),
-        "{response:?}"
-    );
-    // The master reports errors in the parameters of a call.
-    twins.same_call("getUri", params![]);
-    twins.same_call("getUri", params!["/c", 1]);
 }
