@@ -8,7 +8,7 @@ const SECRET: &str = "hunter2";
 const CONDITION: &str = "document.querySelector('#condition-name').textContent";
 
 /// The condition that the page shows.
-fn condition_is(name: &str) -> String {
+pub(super) fn condition_is(name: &str) -> String {
     format!("{CONDITION} === '{name}'")
 }
 
@@ -34,71 +34,6 @@ pub(super) fn assert_clean(browser: &Browser, robot: &Robot) {
     for url in requests {
         assert!(url.starts_with(&own) || url.starts_with("data:"), "{url}");
     }
-}
-
-/// After the end of rosrescue, nodes have no master. A page that still says that they keep working is dangerous.
-#[test]
-fn the_page_says_that_its_data_is_old_after_the_end_of_rosrescue() {
-    let mut robot = Robot::start_with(Mode::Proxy, &[]);
-    let node = FakeNode::start("/node");
-    node.publish(&robot.client(), "/topic", "std_msgs/String");
-    let mut browser = Browser::start(&robot.scratch);
-    browser.screen(1280, 900, false);
-    open(&mut browser, &robot);
-    browser.shows("the robot is protected", &condition_is("Protected"));
-    browser.shows(
-        "the node is alive",
-        "document.querySelector('#sick').textContent === 'all alive'",
-    );
-    robot.rescue.terminate();
-    browser.shows(
-        "the page says that its data is old",
-        &condition_is("No answer from rosrescue"),
-    );
-    let page = browser.text();
-    for words in [
-        "Nothing on this page is live",
-        "rosrescue status",
-        "no data since",
-    ] {
-        assert!(page.contains(words), "{words}: {page}");
-    }
-    for words in [
-        "Nodes work",
-        "Nodes keep",
-        "all alive",
-        "Every change is recorded",
-    ] {
-        assert!(!page.contains(words), "{words}: {page}");
-    }
-    let opacity = "getComputedStyle(document.querySelector('#facts')).opacity";
-    assert_eq!(browser.js(opacity), "0.5");
-    robot.rescue.start_again();
-    browser.shows("the page is live again", &condition_is("Protected"));
-    browser.shows(
-        "so is the rest",
-        "document.querySelector('#sick').textContent === 'all alive'",
-    );
-}
-
-/// A dead node comes before everything else, with its name.
-#[test]
-fn the_page_names_a_node_that_has_died_where_the_condition_stands() {
-    let robot = Robot::start_with(Mode::Proxy, &[]);
-    let mut talker = robot.node(Library::Roscpp, "talker", &[]);
-    let mut browser = Browser::start(&robot.scratch);
-    browser.screen(1280, 900, false);
-    open(&mut browser, &robot);
-    browser.shows("the robot is protected", &condition_is("Protected"));
-    talker.kill();
-    browser.shows("the condition is another one", &condition_is("Nodes died"));
-    let banner = browser.js("document.querySelector('#condition').innerText");
-    let banner = banner.as_str().unwrap().to_owned();
-    assert!(banner.contains("/talker since"), "{banner}");
-    assert_eq!(
-        browser.js("document.querySelector('#condition').dataset.is"),
-        "warn"
-    );
 }
 
 #[test]
@@ -201,12 +136,38 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
     }
     assert!(row.contains(" ms") || row.contains(" s"), "{row}");
 
-    // rosrescue itself dies.
+    // rosrescue itself dies. Nodes have no master then. A page that still says that they keep working is dangerous.
+    browser.shows(
+        "the nodes are alive",
+        "document.querySelector('#sick').textContent === 'all alive'",
+    );
     robot.rescue.kill();
     browser.shows(
         "the page says so",
         "document.querySelector('#link').dataset.is === 'lost'",
     );
+    browser.shows(
+        "the page says that its data is old",
+        &condition_is("No answer from rosrescue"),
+    );
+    let page = browser.text();
+    for words in [
+        "Nothing on this page is live",
+        "rosrescue status",
+        "no data since",
+    ] {
+        assert!(page.contains(words), "{words}: {page}");
+    }
+    for words in [
+        "Nodes work",
+        "Nodes keep",
+        "all alive",
+        "Every change is recorded",
+    ] {
+        assert!(!page.contains(words), "{words}: {page}");
+    }
+    let opacity = "getComputedStyle(document.querySelector('#facts')).opacity";
+    assert_eq!(browser.js(opacity), "0.5");
     robot.rescue.start_again();
     robot.rescue.wait_serving();
     browser.shows(
@@ -219,6 +180,11 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
         &format!("document.querySelector('#version').textContent.endsWith('process {pid}')"),
     );
     browser.shows("with the same robot", &draws("node", "/talker"));
+    browser.shows("it is protected", &condition_is("Protected"));
+    browser.shows(
+        "its nodes are alive",
+        "document.querySelector('#sick').textContent === 'all alive'",
+    );
     assert_clean(&browser, &robot);
 }
 

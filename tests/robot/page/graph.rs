@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::browser::{assert_clean, draws, open, paper_robot};
+use super::browser::{assert_clean, condition_is, draws, open, paper_robot};
 use crate::support::{Browser, FakeNode, Mode, Robot};
 
 /// The size of the smallest letters in the graph, in pixels of the screen.
@@ -34,8 +34,9 @@ fn assert_readable(browser: &mut Browser, when: &str) {
 #[test]
 fn labels_of_45_nodes_can_be_read_on_any_screen() {
     let robot = paper(45);
+    let mut browser = Browser::start(&robot.scratch);
     for (width, height) in [(1280, 900), (390, 844)] {
-        let mut browser = Browser::start(&robot.scratch);
+        browser.open("about:blank");
         browser.screen(width, height, false);
         open(&mut browser, &robot);
         browser.shows("all nodes", &format!("{NODES} === 45"));
@@ -50,14 +51,15 @@ fn labels_of_45_nodes_can_be_read_on_any_screen() {
 }
 
 #[test]
-fn of_200_nodes_an_overview_comes_first_and_then_one_nodes_neighbours() {
-    let robot = paper(200);
+fn of_many_nodes_an_overview_comes_first_and_then_one_nodes_neighbours() {
+    // More than `LARGE` in `layout.js`.
+    let robot = paper(130);
     let mut browser = Browser::start(&robot.scratch);
     browser.screen(1280, 900, false);
     open(&mut browser, &robot);
     browser.shows(
         "a tile for each node",
-        &format!("document.querySelector('#picture .overview') && {NODES} === 200"),
+        &format!("document.querySelector('#picture .overview') && {NODES} === 130"),
     );
     assert_readable(&mut browser, "in the overview");
     browser.js(&click(&draws("node", "/arm/n2")));
@@ -68,7 +70,7 @@ fn of_200_nodes_an_overview_comes_first_and_then_one_nodes_neighbours() {
     assert!(browser.js(&draws("node", "/arm/n2")) != Value::Null);
     assert_readable(&mut browser, "in a neighbourhood");
     browser.js("document.querySelector('#graph-back').click()");
-    browser.shows("all nodes again", &format!("{NODES} === 200"));
+    browser.shows("all nodes again", &format!("{NODES} === 130"));
 
     // The whole graph, with all namespaces open.
     browser.js("document.querySelector('#graph-overview').click()");
@@ -78,58 +80,14 @@ fn of_200_nodes_an_overview_comes_first_and_then_one_nodes_neighbours() {
         browser.js(&click(&space));
         browser.shows("it is open", &format!("!{space}"));
     }
-    browser.shows("all nodes are drawn", &format!("{NODES} === 200"));
+    browser.shows("all nodes are drawn", &format!("{NODES} === 130"));
     assert_readable(&mut browser, "in the whole graph");
-    assert_clean(&browser, &robot);
-}
 
-#[test]
-fn a_death_recolours_a_box_where_it_is() {
-    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
-    let client = robot.client();
-    let doomed = FakeNode::start("/doomed");
-    doomed.publish(&client, "/scan", "x/Y");
-    let viewer = FakeNode::start("/viewer");
-    viewer.subscribe(&client, "/scan", "x/Y");
-    let mut browser = Browser::start(&robot.scratch);
-    browser.screen(390, 844, true);
-    open(&mut browser, &robot);
-    browser.shows("the graph", "document.querySelector('#picture .line')");
-    browser.js("window.drawn = document.querySelector('#picture svg'); window.layouts = performance.getEntriesByName('layout').length; 0");
-    let same = "window.drawn === document.querySelector('#picture svg') \
-                && performance.getEntriesByName('layout').length === window.layouts";
-    let dead = format!(
-        "{same} && {}.classList.contains('dead')",
-        draws("node", "/doomed")
-    );
-    drop(doomed);
-    browser.shows("the dead node is red in the same picture", &dead);
-    let first = "document.querySelector('#trouble').getBoundingClientRect()";
-    browser.shows(
-        "it is named on the first screen, right after the condition",
-        &format!(
-            "document.querySelector('#condition + #trouble').innerText.includes('/doomed') && {first}.bottom < 844"
-        ),
-    );
-    // The rescue unregisters it.
-    robot.crash_master();
-    browser.shows(
-        "it is unregistered",
-        "document.querySelector('#trouble').innerText.includes('unregistered')",
-    );
-    browser.shows("and still where it was", &dead);
-    assert_clean(&browser, &robot);
-}
-
-#[test]
-fn a_few_keys_lead_to_each_part_of_the_page_and_to_each_node() {
-    let robot = paper(80);
-    let mut browser = Browser::start(&robot.scratch);
-    browser.screen(1280, 900, false);
+    // A few keys lead to each part of the page and to each node.
     for part in ["graph", "time", "lists"] {
         browser.open("about:blank");
         open(&mut browser, &robot);
-        browser.shows("the overview", &format!("{NODES} === 80"));
+        browser.shows("the overview", &format!("{NODES} === 130"));
         let mut keys = 0;
         while browser.js("document.activeElement.hash") != format!("#{part}") {
             browser.press("Tab");
@@ -155,7 +113,7 @@ fn a_few_keys_lead_to_each_part_of_the_page_and_to_each_node() {
 }
 
 #[test]
-fn the_time_line_marks_deaths_restarts_and_rescues() {
+fn a_death_recolours_a_box_where_it_is_and_marks_the_time_line() {
     let mut robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let client = robot.client();
     let old = FakeNode::start("/again");
@@ -165,12 +123,51 @@ fn the_time_line_marks_deaths_restarts_and_rescues() {
     new.publish(&client, "/scan", "x/Y");
     let doomed = FakeNode::start("/doomed");
     doomed.publish(&client, "/scan", "x/Y");
-    drop(doomed);
-    robot.crash_master();
+    let viewer = FakeNode::start("/viewer");
+    viewer.subscribe(&client, "/scan", "x/Y");
     let mut browser = Browser::start(&robot.scratch);
-    browser.screen(1280, 900, false);
+    browser.screen(390, 844, true);
     open(&mut browser, &robot);
+    browser.shows("the graph", "document.querySelector('#picture .line')");
+    browser.js("window.drawn = document.querySelector('#picture svg'); window.layouts = performance.getEntriesByName('layout').length; 0");
+    let same = "window.drawn === document.querySelector('#picture svg') \
+                && performance.getEntriesByName('layout').length === window.layouts";
+    let dead = format!(
+        "{same} && {}.classList.contains('dead')",
+        draws("node", "/doomed")
+    );
+    drop(doomed);
+    browser.shows("the dead node is red in the same picture", &dead);
+    // It comes before everything else, with its name.
+    browser.shows("the condition is another one", &condition_is("Nodes died"));
+    let banner = browser.js("document.querySelector('#condition').innerText");
+    let banner = banner.as_str().unwrap();
+    assert!(banner.contains("/doomed since"), "{banner}");
+    assert_eq!(
+        browser.js("document.querySelector('#condition').dataset.is"),
+        "warn"
+    );
+    let first = "document.querySelector('#trouble').getBoundingClientRect()";
+    browser.shows(
+        "it is named on the first screen, right after the condition",
+        &format!(
+            "document.querySelector('#condition + #trouble').innerText.includes('/doomed') && {first}.bottom < 844"
+        ),
+    );
     let mark = |lane: &str| format!("document.querySelector('#lanes .{lane} .mark')");
+    browser.shows("its mark on the time line", &mark("died"));
+    let marked = browser.js(&format!("{}.dataset.at", mark("died")));
+
+    // The rescue unregisters it.
+    robot.crash_master();
+    browser.shows(
+        "it is unregistered",
+        "document.querySelector('#trouble').innerText.includes('unregistered')",
+    );
+    browser.shows("and still where it was", &dead);
+
+    // The time line marks deaths, restarts and rescues.
+    browser.screen(1280, 900, false);
     for (lane, text) in [
         ("restarted", "/again restarted"),
         ("died", "/doomed died"),
@@ -179,6 +176,9 @@ fn the_time_line_marks_deaths_restarts_and_rescues() {
         let shown = format!("{}.ariaLabel.includes('{text}')", mark(lane));
         browser.shows(&format!("a mark of {lane}"), &shown);
     }
+    // The log has the node's end, which changed the state.
+    let moved = format!("{}.dataset.at !== {marked}", mark("died"));
+    browser.shows("the mark is where the node was unregistered", &moved);
     browser.js(&format!("{}.click()", mark("died")));
     browser.shows(
         "a mark shows what it changed",
