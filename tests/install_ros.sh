@@ -42,8 +42,9 @@ has_pam_systemd() {
     return 1
 }
 
+# With `grep -q`, busybox may get SIGPIPE, which counts under `set -o pipefail`.
 has_dhcp() {
-    busybox udhcpd --help 2>&1 | grep -q udhcpd && busybox udhcpc --help 2>&1 | grep -q udhcpc
+    busybox udhcpd --help 2>&1 | grep udhcpd >/dev/null && busybox udhcpc --help 2>&1 | grep udhcpc >/dev/null
 }
 
 can_import() { # MODULES
