@@ -54,7 +54,7 @@ within() { # SECONDS COMMAND...
     shift
     until "$@"; do
         [ "$SECONDS" -lt "$end" ] || return 1
-        sleep 0.05
+        sleep 0.1
     done
 }
 
