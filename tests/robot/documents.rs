@@ -74,6 +74,10 @@ pub(super) fn run_on_a_computer(script: &str) -> String {
         .args(["timeout", "--kill-after=5", "240", "bash", "-euc", script])
         .env("REPOSITORY", ROOT)
         .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
+        .env(
+            "QUICK_ROSVERSION",
+            Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("quick-rosversion"),
+        )
         .current_dir(ROOT)
         .output()
         .unwrap();
