@@ -4,7 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
-use crate::support::{Scratch, comes_true, eventually};
+use ros1_master::xmlrpc::{self, Reply, Value};
+
+use crate::support::{PATIENCE, Scratch, encode_call, eventually, params};
 
 const BOOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/boot_systemd.sh");
 const PROGRAM: &str = "/opt/rosrescue/rosrescue";
@@ -117,12 +119,30 @@ impl Booted {
         ));
     }
 
-    /// Makes a call of the Master API at the robot's port. Returns the answer as Python prints it.
+    /// Makes a call of the Master API at the robot's port. Returns the value in the answer.
     #[track_caller]
-    pub(super) fn call(&self, call: &str) -> String {
-        self.run(&format!(
-            "/usr/bin/python3 -c 'import xmlrpc.client as x; print(x.ServerProxy(\"http://127.0.0.1:11311\").{call})'"
-        ))
+    pub(super) fn call(&self, method: &str, params: Vec<Value>) -> Value {
+        let body = String::from_utf8(encode_call(method, params)).unwrap();
+        let answer = self.run(&format!(
+            "curl -fsS -H 'Content-Type: text/xml' --data-binary @- http://127.0.0.1:11311/ <<'END'\n{body}\nEND"
+        ));
+        match xmlrpc::decode_reply(answer.as_bytes()) {
+            Ok(Reply::Value(Value::Array(mut answer))) if answer.first() == Some(&1.into()) => {
+                answer.pop().unwrap()
+            }
+            other => panic!("{method}: {other:?}"),
+        }
+    }
+
+    #[track_caller]
+    pub(super) fn set_kept(&self) {
+        self.call("setParam", params!["/test", "/kept", 7]);
+    }
+
+    #[track_caller]
+    pub(super) fn assert_kept(&self, when: &str) {
+        let kept = self.call("getParam", params!["/test", "/kept"]);
+        assert_eq!(kept, 7.into(), "{when}");
     }
 
     pub(super) fn property(&self, name: &str) -> String {
@@ -132,16 +152,39 @@ impl Booted {
         value.trim().to_owned()
     }
 
+    /// Waits until a property of the service matches: `pattern` are arguments of `grep`. The loop runs on the simulated computer, because
+    /// it takes several programs to get there.
     #[track_caller]
-    pub(super) fn wait_protected(&self) {
-        let protected = || self.property("StatusText").starts_with("protected");
-        if !comes_true(protected) {
+    fn wait_property(&self, name: &str, pattern: &str) {
+        let looks = 10 * PATIENCE.as_secs();
+        let script = format!(
+            "for look in $(seq {looks}); do
+                 systemctl show --value -p {name} rosrescue.service | grep -q {pattern} && exit
+                 sleep 0.1
+             done
+             exit 1"
+        );
+        if self.try_run(&script).is_err() {
             let units = "rosrescue.service rosrescue.socket";
             let look = format!(
                 "systemctl cat {units}; systemctl status -l {units}; journalctl -u rosrescue -n 60"
             );
-            panic!("the service is not protected: {:?}", self.output(&look));
+            panic!(
+                "{name} of the service is not {pattern}: {:?}",
+                self.output(&look)
+            );
         }
+    }
+
+    #[track_caller]
+    pub(super) fn wait_protected(&self) {
+        self.wait_property("StatusText", "^protected");
+    }
+
+    /// Waits until the service has another worker than the one with this process id.
+    #[track_caller]
+    pub(super) fn wait_another_worker(&self, worker: &str) {
+        self.wait_property("MainPID", &format!("-vxe {worker} -e 0"));
     }
 
     /// All files in folders where an installation could leave something.
@@ -208,11 +251,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     assert!(robot.try_run("pgrep -x roscore").is_err());
     assert!(robot.property("Before").contains("myrobot.service"));
     robot.run("pgrep -x -u robot rosmaster; test -s /home/robot/.ros/log/latest-chkpt.yaml");
-    assert!(
-        robot
-            .call("setParam(\"/test\", \"/kept\", 7)")
-            .starts_with("[1,")
-    );
+    robot.set_kept();
     let verified = robot.output("systemd-analyze verify rosrescue.service rosrescue.socket");
     let complaints = String::from_utf8_lossy(&verified.stderr).into_owned();
     assert!(!complaints.contains("rosrescue"), "{complaints}");
@@ -232,15 +271,8 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
         let worker = robot.property("MainPID");
         robot.run(&format!("kill -{signal} {worker}"));
         // systemd keeps the port open, so the call waits.
-        assert!(
-            robot
-                .call("getParam(\"/test\", \"/kept\")")
-                .ends_with(" 7]\n"),
-            "{signal}"
-        );
-        eventually("another worker", || {
-            !["0", &worker].contains(&&*robot.property("MainPID"))
-        });
+        robot.assert_kept(signal);
+        robot.wait_another_worker(&worker);
         let journal = robot.run("journalctl -u rosrescue.service");
         assert!(
             journal.contains(&format!("Failed with result '{result}'")),
@@ -257,11 +289,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     eventually("another master", || {
         robot.run("pgrep -x rosmaster || true") != master
     });
-    assert!(
-        robot
-            .call("getParam(\"/test\", \"/kept\")")
-            .ends_with(" 7]\n")
-    );
+    robot.assert_kept("after a death of the master");
 
     // The service is installed again with other options. A unit file that is not rosrescue's is refused.
     let worker = robot.property("MainPID");
@@ -279,15 +307,9 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     robot.run(&format!(
         "SUDO_USER=robot ROS_HOSTNAME=localhost {PROGRAM} install --yes -- core -t 6"
     ));
-    eventually("another worker", || {
-        !["0", &worker].contains(&&*robot.property("MainPID"))
-    });
+    robot.wait_another_worker(&worker);
     assert!(robot.property("ExecStart").contains("core -t 6"));
-    assert!(
-        robot
-            .call("getParam(\"/test\", \"/kept\")")
-            .ends_with(" 7]\n")
-    );
+    robot.assert_kept("with other options");
 
     robot.run("rm /etc/systemd/system/rosrescue.service.d/test.conf");
     robot.run(&format!("{PROGRAM} uninstall --yes"));

@@ -1,9 +1,10 @@
 //! The catkin package: built by catkin, and used by rosrun and roslaunch.
 
-use std::fs;
+use std::fs::{self, File};
 use std::os::unix::fs::symlink;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use crate::support::{
@@ -15,20 +16,30 @@ use rustix::process::Signal;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Makes a workspace in which catkin has built and installed the package, with the program under test.
+/// A workspace in which catkin has built and installed the package, with the program under test. It is made once. Another
+/// test process that also needs it waits until this one has ended.
 #[track_caller]
-fn workspace(scratch: &Scratch) {
-    let source = scratch.path("src");
-    fs::create_dir(&source).unwrap();
+fn workspace() -> &'static Path {
+    static WORKSPACE: OnceLock<(PathBuf, File)> = OnceLock::new();
+    let (folder, _) = WORKSPACE.get_or_init(|| {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("catkin-workspace");
+        let lock = File::create(folder.with_extension("lock")).unwrap();
+        lock.lock().unwrap();
+        let _ = fs::remove_dir_all(&folder);
+        build(&folder);
+        (folder, lock)
+    });
+    folder
+}
+
+#[track_caller]
+fn build(folder: &Path) {
+    let source = folder.join("src");
+    fs::create_dir_all(&source).unwrap();
     symlink(ROOT, source.join("rosrescue")).unwrap();
     let program = format!("-DROSRESCUE_PROGRAM={}", env!("CARGO_BIN_EXE_rosrescue"));
     let output = Command::new("catkin_make")
-        .args([
-            "--directory",
-            scratch.path("").to_str().unwrap(),
-            &program,
-            "install",
-        ])
+        .args(["--directory", folder.to_str().unwrap(), &program, "install"])
         // catkin works only with the system's Python.
         .env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin")
         .output();
@@ -40,7 +51,7 @@ fn workspace(scratch: &Scratch) {
 /// `program` in the installed workspace.
 fn ros(scratch: &Scratch, program: &str, port: u16) -> Command {
     let mut command = ros_command(scratch, "sh", port);
-    let setup = scratch.path("install/setup.sh");
+    let setup = workspace().join("install/setup.sh");
     let setup = setup.to_str().unwrap();
     command.args(["-c", &format!(". {setup} && exec \"$0\" \"$@\""), program]);
     command.env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin");
@@ -64,7 +75,6 @@ fn roslaunch_logs(scratch: &Scratch) -> String {
 #[test]
 fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     let scratch = Scratch::new();
-    workspace(&scratch);
     let port = free_port();
     let output = ros(&scratch, "rosrun", port)
         .args(["rosrescue", "rosrescue", "--version"])
@@ -116,7 +126,6 @@ fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
 #[test]
 fn rosrescue_ends_with_roslaunch_unless_roslaunch_was_killed() {
     let scratch = Scratch::new();
-    workspace(&scratch);
     let start = |port| {
         let mut roslaunch = ros(&scratch, "roslaunch", port);
         roslaunch.args(["rosrescue", "core.launch", "args:=--no-rosout"]);
@@ -155,7 +164,6 @@ fn rosrescue_ends_with_roslaunch_unless_roslaunch_was_killed() {
 #[test]
 fn the_launch_file_uses_a_master_that_is_already_there() {
     let scratch = Scratch::new();
-    workspace(&scratch);
     let master = crate::support::Rosmaster::start(&scratch);
     let run_id = master.client().ok(
         "setParam",

@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
 use super::booted::Booted;
-use crate::support::{Scratch, eventually};
+use crate::support::Scratch;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -14,21 +14,34 @@ const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 fn packages() -> &'static [PathBuf; 2] {
     static PACKAGES: OnceLock<[PathBuf; 2]> = OnceLock::new();
     PACKAGES.get_or_init(|| {
-        ["0.2.0", "0.2.1"].map(|version| {
-            let output = Command::new("packaging/build-deb.sh")
-                .args(["--debug", "--version", version])
-                .current_dir(ROOT)
-                .stderr(Stdio::inherit())
-                .output()
-                .unwrap();
-            assert!(
-                output.status.success(),
-                "packaging/build-deb.sh: {output:?}"
-            );
-            let name = String::from_utf8(output.stdout).unwrap();
-            Path::new(ROOT).join(name.trim())
-        })
+        let output = Command::new("packaging/build-deb.sh")
+            .args(["--debug", "--version", "0.2.0"])
+            .current_dir(ROOT)
+            .stderr(Stdio::inherit())
+            .output()
+            .unwrap();
+        assert!(
+            output.status.success(),
+            "packaging/build-deb.sh: {output:?}"
+        );
+        let old = String::from_utf8(output.stdout).unwrap();
+        let old = Path::new(ROOT).join(old.trim());
+        let new = old.with_file_name(name(&old).replace("0.2.0", "0.2.1"));
+        repack(&old, &new);
+        [old, new]
     })
+}
+
+/// Makes the package `new` of the same files, with version 0.2.1.
+#[track_caller]
+fn repack(old: &Path, new: &Path) {
+    const REPACK: &str = r#"dpkg-deb -R "$0" "$2" && sed -i 's/^Version: .*/Version: 0.2.1/' "$2/DEBIAN/control" &&
+        dpkg-deb -Zgzip -z1 -b "$2" "$1""#;
+    let scratch = Scratch::new();
+    let mut shell = Command::new("sh");
+    shell.args(["-c", REPACK]).args([old, new]);
+    let output = shell.arg(scratch.path("parts")).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
 }
 
 /// Runs `script` in a fresh Debian, with the packages in /given.
@@ -113,7 +126,7 @@ fn the_package_has_the_documents_and_examples_and_no_link_leads_nowhere() {
     assert!(
         unpack
             .arg("-x")
-            .args([&packages()[1], &folder])
+            .args([&packages()[0], &folder])
             .status()
             .unwrap()
             .success()
@@ -142,6 +155,8 @@ fn the_package_has_the_documents_and_examples_and_no_link_leads_nowhere() {
 fn an_upgrade_does_not_disturb_a_running_robot_and_removal_ends_its_service() {
     let [old, new] = packages();
     let robot = Booted::new();
+    // Otherwise each dpkg indexes the manual pages of all packages, for seconds.
+    robot.run("rm -f /var/lib/man-db/auto-update");
     let install = |package: &Path| robot.run(&format!("dpkg -i {}", robot.give(package)));
     let said = install(old);
     assert!(said.contains("sudo rosrescue install"), "{said}");
@@ -155,7 +170,7 @@ fn an_upgrade_does_not_disturb_a_running_robot_and_removal_ends_its_service() {
     robot.run("systemctl enable --now rosrescue.socket rosrescue.service");
     robot.wait_protected();
     robot.run("pgrep -x rosmaster; test -s /var/lib/rosrescue/log/latest-chkpt.yaml");
-    robot.call("setParam(\"/test\", \"/kept\", 7)");
+    robot.set_kept();
     let (worker, master) = (robot.property("MainPID"), robot.run("pgrep -x rosmaster"));
     let said = install(new);
     assert!(
@@ -164,14 +179,8 @@ fn an_upgrade_does_not_disturb_a_running_robot_and_removal_ends_its_service() {
     );
     assert_eq!(robot.property("MainPID"), worker);
     robot.run("systemctl kill --signal=KILL --kill-who=main rosrescue.service");
-    eventually("another worker", || {
-        !["0", &worker].contains(&&*robot.property("MainPID"))
-    });
-    assert!(
-        robot
-            .call("getParam(\"/test\", \"/kept\")")
-            .ends_with(" 7]\n")
-    );
+    robot.wait_another_worker(&worker);
+    robot.assert_kept("with another worker");
     assert_eq!(robot.run("pgrep -x rosmaster"), master);
     robot.run("systemctl disable --now rosrescue.socket rosrescue.service");
 
