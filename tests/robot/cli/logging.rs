@@ -4,7 +4,8 @@ use std::fs::{self, File};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 
 use crate::support::{
-    Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, in_both_modes, request,
+    Forkserver, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, behind, eventually, free_port,
+    request, status,
 };
 
 /// Standard error is a file in this test. rosrescue recognises it by device and inode, as it does a socket of journald.
@@ -69,21 +70,45 @@ fn repeated_log_lines_are_limited_to_ten() {
     assert_eq!(said, 10, "{log:?}");
 }
 
-in_both_modes!(after_many_deaths_the_last_lines_say_that_the_master_is_back);
+/// Enough deaths for the limit of log lines. In a crash loop a core waits 10 s before each further start.
+const DEATHS: usize = 11;
 
-fn after_many_deaths_the_last_lines_say_that_the_master_is_back(mode: Mode) {
-    let mut robot = Robot::start(mode);
-    // In a crash loop a core waits 10 s before each further start.
-    let deaths = if mode == Mode::Core { 12 } else { 15 };
-    for _ in 0..deaths {
+#[test]
+fn after_many_deaths_of_its_master_a_cores_last_lines_say_that_it_is_back() {
+    let mut robot = Robot::start(Mode::Core);
+    for _ in 0..DEATHS {
         robot.crash_master();
     }
+    assert_last_lines_are_good(&robot.rescue, Mode::Core);
+}
+
+#[test]
+fn after_many_deaths_of_its_master_a_proxys_last_lines_say_that_it_is_back() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let mut masters = Forkserver::new(&scratch);
+    let mut master = masters.start(port, "");
+    let rescue = Setup::proxy(&scratch, port).start();
+    for _ in 0..DEATHS {
+        masters.kill(master);
+        master = masters.start(port, "");
+        eventually("calls pass to the new master", || {
+            let status = status(&rescue.client());
+            status["open"] == true && status["master_pid"] == master
+        });
+    }
+    assert_last_lines_are_good(&rescue, Mode::Proxy);
+}
+
+/// Asserts that the log ends with the good news, and that not every death is in it.
+#[track_caller]
+fn assert_last_lines_are_good(rescue: &Rescue, mode: Mode) {
     eventually("the crash loop is over", || {
-        let log = robot.rescue.stderr();
+        let log = rescue.stderr();
         log.iter()
             .any(|line| line.contains("the crash loop is over"))
     });
-    let log = robot.rescue.stderr();
+    let log = rescue.stderr();
     let is_waiting = [
         "the master is away",
         "waiting for the master",
@@ -112,7 +137,7 @@ fn after_many_deaths_the_last_lines_say_that_the_master_is_back(mode: Mode) {
         let unasked = lines.windows(2).any(|pair| pair == [false, false]);
         assert!(!unasked, "{all_clear} without an alarm: {log:#?}");
         let told = log.iter().filter(|line| line.contains(alarms[0])).count();
-        assert!(told < deaths, "limited: {told}");
+        assert!(told < DEATHS, "limited: {told}");
     }
 }
 

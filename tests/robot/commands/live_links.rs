@@ -22,7 +22,13 @@ fn a_link_that_was_broken_is_found_and_named() {
         let words = [&["check", "--live"], more].concat();
         Tool::rosrescue(&robot.scratch, robot.port(), &words)
     };
-    // There are four connections of /chatter, and those of /rosout.
+    // There are four connections of /chatter, and those of /rosout. Each check is a program of its own, so the test first
+    // waits without it.
+    for listener in [&nodes[1], &nodes[3]] {
+        for talker in ["/talker_py", "/talker_cpp"] {
+            listener.wait_messages(talker, 1);
+        }
+    }
     eventually("all links are made", || {
         let checked = check(&[]);
         checked.exit() == 0 && checked.stdout.ends_with("No problems found.")

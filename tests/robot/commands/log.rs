@@ -3,7 +3,7 @@
 use ros1_master::xmlrpc::Value;
 use serde_json::Value as Json;
 
-use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes, page, params};
+use crate::support::{FakeNode, Mode, Robot, Tool, eventually, page, params};
 
 fn run(robot: &Robot, arguments: &[&str]) -> Tool {
     Tool::rosrescue(&robot.scratch, robot.port(), arguments)
@@ -82,10 +82,9 @@ fn fill_generations(robot: &Robot) {
     }
 }
 
-in_both_modes!(the_log_shows_who_changed_what_and_the_state_at_any_time);
-
-fn the_log_shows_who_changed_what_and_the_state_at_any_time(mode: Mode) {
-    let robot = Robot::start(mode);
+#[test]
+fn the_log_shows_who_changed_what_and_the_state_at_any_time() {
+    let robot = Robot::start(Mode::Core);
     let client = robot.client();
     client.ok("setParam", params!["/tuner", "/arm/gain", 1]);
     client.ok("setParam", params!["/tuner", "/wifi/password", "geheim"]);
