@@ -2,8 +2,9 @@
 
 use std::fs;
 use std::io::{ErrorKind, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 use super::process::{Process, behind};
 use super::rescue::{Rescue, Setup};
@@ -77,7 +78,6 @@ impl SmallDisk {
 /// A disk that misbehaves on request (`tests/failing/disk.c`), for the checkpoint of a rosrescue that runs
 /// [on](Self::under) it.
 pub(crate) struct FailingDisk {
-    library: PathBuf,
     folder: PathBuf,
     state: PathBuf,
 }
@@ -99,27 +99,33 @@ pub(crate) enum Trouble {
     ReadOnly,
 }
 
-impl FailingDisk {
-    pub(crate) fn new(scratch: &Scratch) -> Self {
-        let library = scratch.path("disk.so");
+/// The compiled `tests/failing/disk.c`. Another test program may use it already.
+fn failing_disk() -> &'static Path {
+    static LIBRARY: OnceLock<PathBuf> = OnceLock::new();
+    LIBRARY.get_or_init(|| {
+        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("failing-disk.so");
+        let half = library.with_extension(format!("half-{}", std::process::id()));
         let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/disk.c");
         let mut compiler = Command::new("gcc");
         compiler.args(["-shared", "-fPIC", "-o"]);
-        let compiled = compiler.arg(&library).arg(source).status();
+        let compiled = compiler.arg(&half).arg(source).status();
         assert!(compiled.expect("gcc runs").success());
+        fs::rename(half, &library).unwrap();
+        library
+    })
+}
+
+impl FailingDisk {
+    pub(crate) fn new(scratch: &Scratch) -> Self {
         let state = scratch.path("disk.state");
         let folder = scratch.path("");
-        Self {
-            library,
-            folder,
-            state,
-        }
+        Self { folder, state }
     }
 
     /// Runs `setup` with all files of its robot on this disk.
     pub(crate) fn under(&self, setup: Setup) -> Setup {
         setup
-            .env("LD_PRELOAD", &self.library)
+            .env("LD_PRELOAD", failing_disk())
             .env("DISK_PATH", &self.folder)
             .env("DISK_STATE", &self.state)
     }

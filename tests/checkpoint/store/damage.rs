@@ -1,6 +1,7 @@
 //! Files that are damaged, belong to another program, or are gone.
 
-use std::fs;
+use std::fs::{self, File};
+use std::path::Path;
 
 use checkpoint_store::{OpenError, Store};
 
@@ -227,4 +228,45 @@ fn a_previous_generation_of_a_later_history_adds_nothing() {
         (Some(restored), vec![])
     );
     assert!(loaded.exact, "{:?}", loaded.damage);
+}
+
+#[test]
+fn what_cannot_be_read_is_kept_and_replaced_by_the_previous_generation() {
+    let make_folder = |path: &Path| {
+        fs::remove_file(path).unwrap();
+        fs::create_dir_all(path.join("within")).unwrap();
+    };
+    let make_too_large = |path: &Path| {
+        let file = File::options().write(true).open(path).unwrap();
+        file.set_len((1 << 30) + 1).unwrap();
+    };
+    for spoil in [&make_folder as &dyn Fn(&Path), &make_too_large] {
+        let (folder, path) = place();
+        let mut store = started(&path, 3);
+        store.begin(&checkpoint(3)).unwrap();
+        drop(store);
+        spoil(&path);
+        let look = |path: &Path| {
+            let metadata = fs::metadata(path).unwrap();
+            (metadata.file_type(), metadata.len())
+        };
+        let before = look(&path);
+        let (mut store, loaded) = Store::open(&path).unwrap();
+        let loaded = loaded.unwrap();
+        assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+        assert_eq!(seqs(&loaded.records), [1, 2, 3]);
+        let damage = &loaded.damage[0];
+        assert!(
+            damage.contains("cannot read") && !loaded.exact,
+            "{damage:?}"
+        );
+        store.begin(&checkpoint(3)).unwrap();
+        store.append(&[entry(4)]).unwrap();
+        drop(store);
+        let loaded = Store::open(&path).unwrap().1.unwrap();
+        assert_eq!(loaded.checkpoint, Some(checkpoint(3)));
+        assert_eq!(loaded.records.len(), 1);
+        let aside = folder.path().join("c.yaml.unreadable-1");
+        assert_eq!(look(&aside), before);
+    }
 }

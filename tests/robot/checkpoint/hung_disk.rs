@@ -38,6 +38,7 @@ fn assert_reads_go_on<T: Send + 'static>(
             if over {
                 break;
             }
+            thread::sleep(Duration::from_millis(20));
         }
     });
     assert!(rounds > 1, "no read is answered during the write");

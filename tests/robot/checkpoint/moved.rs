@@ -47,115 +47,107 @@ fn second(scratch: &Scratch, checkpoint: PathBuf) -> Setup {
 }
 
 /// Runs `deed` while no calls come, and waits until rosrescue is protected again. Checks that a second rosrescue is
-/// refused then, and that nothing is lost when rosrescue and the master are killed.
-fn assert_survives(rescue: &mut Rescue, deed: impl FnOnce(&Path), second: impl Fn() -> Setup) {
-    rescue.client().set_param("/before", 1);
+/// refused then, and that nothing is lost when rosrescue and the master are killed. `round` makes values differ from those
+/// of other rounds.
+fn assert_survives(
+    rescue: &mut Rescue,
+    round: i32,
+    deed: impl FnOnce(&Path),
+    second: impl Fn() -> Setup,
+) {
+    let values = [("/before", round), ("/between", -round), ("/after", round)];
+    let set = |rescue: &Rescue, (name, value)| rescue.client().set_param(name, value);
+    set(rescue, values[0]);
     deed(&rescue.checkpoint());
     within(SAID, "the report", || {
         eventually("rosrescue reports that it is unprotected", || {
             said(rescue, "unprotected: ") > 0
         });
     });
-    rescue.client().set_param("/between", 2);
+    set(rescue, values[1]);
     eventually("rosrescue is protected again", || {
         said(rescue, "protected again") > 0 && status(&rescue.client())["unprotected"].is_null()
     });
     assert_refused(second());
-    rescue.client().set_param("/after", 3);
+    set(rescue, values[2]);
     let master = rescue.client().master_pid().unwrap();
     rescue.kill();
     signal(master, Signal::KILL);
     rescue.start_again();
     rescue.wait_serving();
-    for (name, value) in [("/before", 1), ("/between", 2), ("/after", 3)] {
+    for (name, value) in values {
         assert_eq!(rescue.client().param(name), Some(value.into()), "{name}");
     }
-    assert_eq!(rescue.terminate().code(), Some(0));
 }
 
-fn assert_deed_survived(deed: impl FnOnce(&Path)) {
-    let scratch = Scratch::new();
-    let mut rescue = robot(&scratch);
-    let checkpoint = rescue.checkpoint();
-    let second = || second(&scratch, checkpoint.clone());
-    let deed = |path: &Path| {
-        deed(path);
-        assert_refused(second());
-    };
-    assert_survives(&mut rescue, deed, second);
-}
-
+/// Whether a file beside the checkpoint has this content.
 fn kept(checkpoint: &Path, content: &[u8]) -> bool {
-    let aside = checkpoint.with_extension("yaml.broken-1");
-    fs::read(aside).is_ok_and(|kept| kept == content)
+    let files = fs::read_dir(checkpoint.parent().unwrap()).unwrap();
+    let mut files = files.map(|file| file.unwrap().path());
+    files.any(|file| fs::read(file).is_ok_and(|kept| kept == content))
 }
 
-#[test]
-fn a_renamed_checkpoint_folder_is_noticed_and_nothing_is_lost() {
-    assert_deed_survived(|checkpoint| {
-        let folder = checkpoint.parent().unwrap();
-        fs::rename(folder, folder.with_extension("old")).unwrap();
-    });
+fn rename_folder(checkpoint: &Path) {
+    let folder = checkpoint.parent().unwrap();
+    fs::rename(folder, folder.with_extension("old")).unwrap();
 }
 
-#[test]
-fn a_deleted_lock_file_is_replaced_and_still_keeps_others_out() {
-    assert_deed_survived(|checkpoint| {
-        fs::remove_file(checkpoint.with_extension("yaml.lock")).unwrap();
-    });
+fn delete_lock_file(checkpoint: &Path) {
+    fs::remove_file(checkpoint.with_extension("yaml.lock")).unwrap();
 }
 
-/// A process that shares only the folder, as in another container, is refused too.
+fn truncate(checkpoint: &Path, length: u64) {
+    let file = File::options().write(true).open(checkpoint).unwrap();
+    file.set_len(length).unwrap();
+}
+
+fn overwrite(checkpoint: &Path) {
+    let file = File::options().write(true).open(checkpoint).unwrap();
+    file.write_all_at(b"something else", 300).unwrap();
+}
+
+const FOREIGN: &[u8] = b"use_sim_time: true\n";
+
+fn replace(checkpoint: &Path) {
+    let other = checkpoint.with_file_name("other.yaml");
+    fs::write(&other, FOREIGN).unwrap();
+    fs::rename(other, checkpoint).unwrap();
+}
+
+/// After each change, the next one finds another rosrescue, which continues from the checkpoint.
 #[test]
-fn a_deleted_lock_file_still_keeps_another_container_out() {
+fn a_changed_checkpoint_is_noticed_and_nothing_is_lost() {
+    let deeds = [
+        ("renamed", &rename_folder as &dyn Fn(&Path)),
+        ("without a lock file", &delete_lock_file),
+        ("empty", &|checkpoint| truncate(checkpoint, 0)),
+        ("truncated", &|checkpoint| truncate(checkpoint, 200)),
+        ("overwritten", &overwrite),
+        ("replaced", &replace),
+    ];
     let scratch = Scratch::new();
     let mut rescue = robot(&scratch);
     let checkpoint = rescue.checkpoint();
+    let here = || second(&scratch, checkpoint.clone());
+    // A process that shares only the folder, as in another container, is refused too.
     let elsewhere = || {
-        second(&scratch, checkpoint.clone()).wrapped(|command| {
+        here().wrapped(|command| {
             let mut unshare = Command::new("unshare");
             unshare.args(["--mount", "--"]);
             crate::support::behind(unshare, command)
         })
     };
-    let deed = |path: &Path| {
-        fs::remove_file(path.with_extension("yaml.lock")).unwrap();
-        assert_refused(elsewhere());
-    };
-    assert_survives(&mut rescue, deed, elsewhere);
-}
-
-#[test]
-fn a_truncated_checkpoint_is_noticed_and_nothing_is_lost() {
-    for length in [0, 200] {
-        assert_deed_survived(|checkpoint| {
-            let file = File::options().write(true).open(checkpoint).unwrap();
-            file.set_len(length).unwrap();
-        });
+    for (round, (what, deed)) in (1..).zip(deeds) {
+        println!("{what}");
+        let deed = |path: &Path| {
+            deed(path);
+            assert_refused(here());
+            if what == "without a lock file" {
+                assert_refused(elsewhere());
+            }
+        };
+        assert_survives(&mut rescue, round, deed, elsewhere);
     }
-}
-
-#[test]
-fn an_overwritten_checkpoint_is_noticed_and_nothing_is_lost() {
-    assert_deed_survived(|checkpoint| {
-        let file = File::options().write(true).open(checkpoint).unwrap();
-        file.write_all_at(b"something else", 300).unwrap();
-    });
-}
-
-#[test]
-fn a_file_that_replaces_the_checkpoint_is_kept() {
-    const FOREIGN: &[u8] = b"use_sim_time: true\n";
-    let scratch = Scratch::new();
-    let mut rescue = robot(&scratch);
-    let checkpoint = rescue.checkpoint();
-    let deed = |path: &Path| {
-        let other = scratch.path("other.yaml");
-        fs::write(&other, FOREIGN).unwrap();
-        fs::rename(other, path).unwrap();
-    };
-    let second = || second(&scratch, checkpoint.clone());
-    assert_survives(&mut rescue, deed, second);
     assert!(kept(&checkpoint, FOREIGN));
 }
 
@@ -172,7 +164,7 @@ fn an_unmounted_checkpoint_folder_is_noticed_and_nothing_is_lost() {
         assert!(disk.on(&umount).status().unwrap().success());
         assert_refused(second());
     };
-    assert_survives(&mut rescue, deed, second);
+    assert_survives(&mut rescue, 1, deed, second);
     // The file is in the folder below the mount, where every process sees it.
     assert!(checkpoint.is_file());
 }
