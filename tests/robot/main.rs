@@ -160,8 +160,9 @@ mod restart {
     mod worker;
 }
 
-/// Installation as a service of a real systemd, and as a package.
-mod service {
+/// Installation as a service of a real systemd, as a package and in a catkin workspace. A new checkout first makes a Debian
+/// for that, so these tests begin early: tests begin in the order of their names.
+mod installation {
     mod booted;
     mod catkin;
     mod containers;
