@@ -344,6 +344,7 @@ impl Dispatcher {
     fn arrive(&mut self, view: &View, items: Vec<Item>) {
         for mut item in items {
             let is_answered = view.gate == State::Frozen
+                && view.leads
                 && item.patience().is_some()
                 && self.answer_if_unchanged(view.now, &mut item);
             if !is_answered {
@@ -487,7 +488,7 @@ impl Dispatcher {
             if !is_due(item) {
                 continue;
             }
-            if !view.gate.is_open() {
+            if !view.gate.is_open() || !view.leads {
                 // The gate may open later, and the master behind it may hang.
                 item.set_patience(Some(view.now + PATIENCE));
                 continue;

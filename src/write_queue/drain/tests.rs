@@ -24,6 +24,7 @@ use crate::{
     write_queue::{
         WriteQueue,
         batch::{AnswerAndDelivery, CallAnswer},
+        dispatcher::PATIENCE,
         write_queue,
     },
 };
@@ -87,7 +88,8 @@ impl Served {
 
     async fn submit(&self, call: Request) -> oneshot::Receiver<AnswerAndDelivery> {
         let request = (Head::default(), Bytes::from_static(b"<methodCall/>"));
-        let (item, answered) = Item::of_client(request, Some(Arc::new(call)), None);
+        let patience = Some(Instant::now() + PATIENCE);
+        let (item, answered) = Item::of_client(request, Some(Arc::new(call)), patience);
         self.queue.submit(item).await;
         answered
     }
@@ -153,4 +155,31 @@ async fn a_fault_is_answered_when_what_ran_is_known_or_the_master_is_gone() {
         panic!("{answer:?}");
     };
     assert_eq!(results.len(), 1);
+}
+
+/// While this process stood still, another computer may have led and acknowledged another value. Then the write changes
+/// something.
+#[tokio::test]
+async fn a_computer_without_a_lease_answers_no_write_that_seems_to_change_nothing() {
+    let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), 1.into()]);
+    let mut mirror = Master::default();
+    mirror.apply(&set);
+    let served = Served::new(mirror).await;
+    served.ledger.lease.set(Some(Instant::now()));
+    let mut while_open = served.submit(set.clone()).await;
+    let patience = tokio::time::sleep(2 * PATIENCE);
+    tokio::select! {
+        _ = &mut while_open => panic!("answered without a lease"),
+        () = patience => {}
+    }
+    served.ledger.begin_injection();
+    let mut while_frozen = served.submit(set).await;
+    tokio::select! {
+        _ = &mut while_frozen => panic!("answered without a lease"),
+        () = tokio::time::sleep(PATIENCE) => {}
+    }
+    served.ledger.shut_gate(State::StandingIn);
+    served.ledger.lease.set(None);
+    let answers = [while_open.await, while_frozen.await];
+    assert!(answers.iter().all(Result::is_ok));
 }
