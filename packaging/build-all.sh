@@ -2,7 +2,7 @@
 # packaging/build-all.sh [--sign KEY] [arm64|armhf]...: builds the Debian packages for amd64 and these processors, or for
 # all three, on an amd64 computer. They are in target/packages, with a bill of materials (CycloneDX), SHA256SUMS and, with
 # a key of gpg, SHA256SUMS.asc. zig links for glibc 2.17 and compiles C for the other processors. The bytes depend on the
-# commit, on Rust's version and on whether there is an mdBook, and not on folders.
+# commit, on the versions of Rust and dpkg and on whether there is an mdBook, and not on folders.
 #
 # Needs Rust with rustup, python3-venv and dpkg-dev. Installs zig, cargo-zigbuild and cargo-cyclonedx into target/tools.
 # Without rustup, CARGO_UNSTABLE_BUILD_STD builds Rust's standard library from its sources (docs/packaging.md).

@@ -50,7 +50,8 @@ if [ -z "$triple" ]; then
     [ "$profile" = dist ] || strip "$root/usr/bin/rosrescue"
     # dpkg-shlibdeps runs only where the sources of a package are.
     : >"$stage/debian/control"
-    depends=$(cd "$stage" && dpkg-shlibdeps -O debian/rosrescue/usr/bin/rosrescue | sed 's/^shlibs:Depends=//')
+    depends=$(cd "$stage" && dpkg-shlibdeps -O debian/rosrescue/usr/bin/rosrescue)
+    depends=${depends#shlibs:Depends=}
 else
     case $triple in
     x86_64-*) processor=amd64 ;;
@@ -90,7 +91,7 @@ rosrescue ($version) unstable; urgency=medium
 
  -- The maintainers of rosrescue <maintainers@rosrescue.invalid>  $(LC_ALL=C date -u -R -d "@${SOURCE_DATE_EPOCH:-0}")
 END
-chmod -R u=rwX,go=rX "$root"
+chmod -R u=rwX,go=rX,a-s "$root"
 
 echo /etc/default/rosrescue >"$control/conffiles"
 (cd "$root" && find etc usr -type f -print0 | LC_ALL=C sort -z | xargs -0 md5sum >DEBIAN/md5sums)
@@ -99,14 +100,16 @@ echo /etc/default/rosrescue >"$control/conffiles"
     echo "Version: $version"
     echo "Architecture: $processor"
     echo "Depends: $depends"
-    echo "Installed-Size: $(du -sk --apparent-size "$root" | cut -f 1)"
+    # In KiB. The size of a folder would depend on this computer's file system.
+    find "$root/etc" "$root/usr" -type f -printf '%s\n' |
+        awk '{ kib += int(($1 + 1023) / 1024) } END { print "Installed-Size: " kib }'
 } >"$control/control"
 
 mkdir -p "$output"
 package=$output/rosrescue_${version}_$processor.deb
-# Packages for tests are made quickly.
-quick=
-[ "$profile" = dist ] || quick="-Zgzip -z1"
-# shellcheck disable=SC2086 # several words or none
-dpkg-deb $quick --root-owner-group --build "$root" "$package" >/dev/null
+# Every dpkg reads xz; that of Ubuntu would write zstd. Packages for tests are made quickly.
+compression=-Zxz
+[ "$profile" = dist ] || compression="-Zgzip -z1"
+# shellcheck disable=SC2086 # several words
+dpkg-deb $compression --root-owner-group --build "$root" "$package" >/dev/null
 echo "$package"
