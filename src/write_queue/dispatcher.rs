@@ -340,7 +340,8 @@ impl Dispatcher {
         in_flight.iter().chain(&self.queue)
     }
 
-    /// Queues calls. While the mirror is frozen, it answers those that change nothing at once.
+    /// Queues calls. While the mirror is frozen and no other computer can lead, it answers those that change nothing at
+    /// once.
     fn arrive(&mut self, view: &View, items: Vec<Item>) {
         for mut item in items {
             let is_answered = view.gate == State::Frozen
@@ -489,7 +490,8 @@ impl Dispatcher {
                 continue;
             }
             if !view.gate.is_open() || !view.leads {
-                // The gate may open later, and the master behind it may hang.
+                // The gate may open later, and the master behind it may hang. Without a lease, another computer may have
+                // acknowledged another value.
                 item.set_patience(Some(view.now + PATIENCE));
                 continue;
             }

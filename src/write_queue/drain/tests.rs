@@ -157,23 +157,23 @@ async fn a_fault_is_answered_when_what_ran_is_known_or_the_master_is_gone() {
     assert_eq!(results.len(), 1);
 }
 
-/// While this process stood still, another computer may have led and acknowledged another value. Then the write changes
-/// something.
+/// While this process stood still, another computer may have led and acknowledged that the node has unregistered. Then
+/// the registration changes something.
 #[tokio::test]
 async fn a_computer_without_a_lease_answers_no_write_that_seems_to_change_nothing() {
-    let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), 1.into()]);
+    let publish = Request::new(Method::RegisterPublisher, ["/b", "/t", "x/Y", PUBLISHER]);
     let mut mirror = Master::default();
-    mirror.apply(&set);
+    mirror.apply(&publish);
     let served = Served::new(mirror).await;
     served.ledger.lease.set(Some(Instant::now()));
-    let mut while_open = served.submit(set.clone()).await;
+    let mut while_open = served.submit(publish.clone()).await;
     let patience = tokio::time::sleep(2 * PATIENCE);
     tokio::select! {
         _ = &mut while_open => panic!("answered without a lease"),
         () = patience => {}
     }
     served.ledger.begin_injection();
-    let mut while_frozen = served.submit(set).await;
+    let mut while_frozen = served.submit(publish).await;
     tokio::select! {
         _ = &mut while_frozen => panic!("answered without a lease"),
         () = tokio::time::sleep(PATIENCE) => {}
