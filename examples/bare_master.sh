@@ -16,7 +16,7 @@ ask() { # METHOD ARGUMENT...
     for argument in /example "$@"; do
         params+="<param><value>$argument</value></param>"
     done
-    curl -s -m 5 -H 'Content-Type: text/xml' "$ROS_MASTER_URI" \
+    curl -s --noproxy '*' -m 5 -H 'Content-Type: text/xml' "$ROS_MASTER_URI" \
         -d "<methodCall><methodName>$method</methodName><params>$params</params></methodCall>"
 }
 master_pid() { ask getPid | sed -n 's/.*<int>\([0-9]*\)<.*/\1/p' | tail -n 1; }
