@@ -169,8 +169,8 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
     fleet.computers[leader].set_param("/steady", 7);
     for cut in [leader, (leader + 1) % 3] {
         await_param(&fleet, "/steady", 7);
-        // A computer that lacks a record of which the leader's answer to it has told does not answer reads. The last such
-        // records are of the leader's own rosout, which starts after a takeover.
+        // A computer answers no reads while it lacks a record that the leader has announced to it. The last such records
+        // are of the leader's own rosout, which starts after a takeover.
         let leads = &fleet.computers[fleet.await_whole()];
         eventually("the leader's rosout is registered", || {
             let client = leads.client();

@@ -90,6 +90,7 @@ fn a_leader_without_etcd_stops_leading_although_all_reach_it() {
     traffic.await_writes(&[0, 1, 2]);
     fleet.assert_streams_whole(&[0, 1, 2], &mark);
     let lonely = &fleet.computers[leader];
+    assert!(!lonely.role_is("leading"));
     eventually("the computer is alone", || lonely.role_is("alone"));
     lonely.set_param("/alone", 1);
     for &other in &rest {

@@ -174,14 +174,10 @@ fn no_crash_of_the_master_is_visible_through_rosrescue() {
     let mut tally = Tally::default();
     let (scripts, alone) = scripts();
     for (path, script) in &scripts {
-        // The modes differ only in how a master dies and who starts the next one.
+        // A core differs in how its master dies and who starts the next one.
         let dies = |step: &Step| matches!(step, Step::Crash { .. } | Step::Away);
-        let modes: &[bool] = match script.steps.iter().any(dies) {
-            true => &[false, true],
-            false => &[false],
-        };
-        for core in modes.iter().copied() {
-            let reads = READS[usize::from(core)];
+        let core = script.steps.iter().any(dies);
+        for (core, reads) in [(false, READS[0]), (core, READS[1])] {
             println!("{path}, core: {core}, reads: {reads}");
             crashes::run(script, &nodes, core, reads, &mut tally).unwrap();
         }

@@ -97,7 +97,7 @@ for name; do
         >"$log" 2>&1 || status=1
     # shellcheck disable=SC2086 # splitting is intended
     run "$release" $force env $unordered \
-        ROSRESCUE_SEQUENCES=12 ROSRESCUE_CRASH_SEQUENCES=12 ROSRESCUE_CALLS=150 \
+        ROSRESCUE_SEQUENCES=12 ROSRESCUE_CRASH_SEQUENCES=12 ROSRESCUE_CRASHES=3 ROSRESCUE_CALLS=150 \
         "$(program differential)" --test-threads 2 --show-output --exact \
         a_bare_rosmaster_answers_as_the_model_does no_crash_of_the_master_is_visible_through_rosrescue \
         >"$log.differential" 2>&1 || status=1

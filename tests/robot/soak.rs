@@ -460,8 +460,9 @@ impl Stage<'_> {
         });
     }
 
-    /// Kills the processes of one of the [`KINDS`], and waits until calls pass to a master again. Half of the kills come right after an
-    /// answer, which a process that answers too early would not survive; the others at a random step of a write.
+    /// Kills the processes of one of the [`KINDS`], and waits until calls pass to a master again. Half of the kills come
+    /// right after an answer, which a process that answers too early would not survive; the others at a random step of a
+    /// write.
     #[track_caller]
     fn kill_some(&mut self, kind: u64, dice: &mut Dice) {
         let (what, guardian, with_worker, with_master) = match kind {

@@ -78,7 +78,7 @@ impl Node {
         node
     }
 
-    /// Waits until all of `nodes` are ready. Nodes that start at the same time make the computer wait less.
+    /// Waits until all of `nodes` are ready. This takes less time than to start one after the other.
     #[track_caller]
     pub(crate) fn all_ready<const COUNT: usize>(mut nodes: [Self; COUNT]) -> [Self; COUNT] {
         for node in &mut nodes {

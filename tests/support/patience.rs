@@ -48,7 +48,7 @@ fn look_until<T>(span: Duration, mut look: impl FnMut() -> Option<T>) -> Option<
     None
 }
 
-/// Pauses between two looks, longer the longer the wait since `start` already takes.
+/// Pauses between two looks, the longer the more time has passed since `start`.
 fn pause(start: Instant) {
     sleep((start.elapsed() / 20).clamp(STEP, LONGEST_STEP));
 }

@@ -159,8 +159,8 @@ impl Robot {
         })
     }
 
-    /// Waits until the real master's state is `wanted`; panics with the difference. What changes the state meanwhile, such
-    /// as a health check, takes seconds.
+    /// Waits until the real master's state is `wanted`; panics with the difference. A health check that changes it
+    /// takes seconds, so this looks only every 200 ms.
     #[track_caller]
     pub(crate) fn await_state(&self, wanted: &State, when: &str) {
         let start = Instant::now();

@@ -16,7 +16,11 @@ fn rosrescue_serves_calls_without_a_writable_checkpoint() {
     fs::write(&file, "a file").unwrap();
     let folder = scratch.path("folder");
     fs::create_dir(&folder).unwrap();
-    for checkpoint in [file.join("chkpt.yaml"), folder.clone()] {
+    for checkpoint in [
+        file.join("chkpt.yaml"),
+        folder.clone(),
+        "/proc/chkpt.yaml".into(),
+    ] {
         let mut rescue = Setup::core(&scratch, free_port())
             .at_checkpoint(checkpoint.clone())
             .start();

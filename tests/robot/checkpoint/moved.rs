@@ -114,7 +114,8 @@ fn replace(checkpoint: &Path) {
     fs::rename(other, checkpoint).unwrap();
 }
 
-/// After each change, the next one finds another rosrescue, which continues from the checkpoint.
+/// rosrescue is killed after each change and starts again, so the next change meets a process that has continued from the
+/// checkpoint.
 #[test]
 fn a_changed_checkpoint_is_noticed_and_nothing_is_lost() {
     let deeds = [
@@ -148,6 +149,7 @@ fn a_changed_checkpoint_is_noticed_and_nothing_is_lost() {
         };
         assert_survives(&mut rescue, round, deed, elsewhere);
     }
+    assert_eq!(rescue.terminate().code(), Some(0));
     assert!(kept(&checkpoint, FOREIGN));
 }
 
@@ -165,6 +167,7 @@ fn an_unmounted_checkpoint_folder_is_noticed_and_nothing_is_lost() {
         assert_refused(second());
     };
     assert_survives(&mut rescue, 1, deed, second);
+    assert_eq!(rescue.terminate().code(), Some(0));
     // The file is in the folder below the mount, where every process sees it.
     assert!(checkpoint.is_file());
 }

@@ -1,5 +1,5 @@
-//! A checkpoint that cannot be read at the start. Its previous generation is restored, and the file or folder at the
-//! path is kept.
+//! A checkpoint that cannot be read at the start. Its previous generation is restored, and what is at the path is
+//! kept.
 
 use std::fs;
 use std::os::unix::fs::FileTypeExt;

@@ -49,7 +49,7 @@ fn node(scratch: &Scratch, library: Library, port: u16, node: &str, name: &str) 
 }
 
 /// Nodes of both libraries find each other with a master and after its death, and with the next master, if `revive` starts
-/// it. The masters that rosrescue starts speak IPv4 to it.
+/// it. A core speaks IPv4 with its own masters, so this last part is left out for a core.
 fn nodes_find_each_other<T>(
     scratch: &Scratch,
     rescue: &Rescue,

@@ -152,8 +152,8 @@ impl Booted {
         value.trim().to_owned()
     }
 
-    /// Waits until a property of the service matches: `pattern` are arguments of `grep`. The loop runs on the simulated computer, because
-    /// it takes several programs to get there.
+    /// Waits until `grep` with the arguments `pattern` finds something in a property of the service. The loop runs on the
+    /// simulated computer, because each command that is sent there takes several processes.
     #[track_caller]
     fn wait_property(&self, name: &str, pattern: &str) {
         let looks = 10 * PATIENCE.as_secs();

@@ -25,15 +25,18 @@ fn workspace() -> &'static Path {
         let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("catkin-workspace");
         let lock = File::create(folder.with_extension("lock")).unwrap();
         lock.lock().unwrap();
-        let _ = fs::remove_dir_all(&folder);
-        build(&folder);
+        if folder.exists() {
+            fs::remove_dir_all(&folder).unwrap();
+        }
+        build(&folder, &lock);
         (folder, lock)
     });
     folder
 }
 
+/// `lock` stays locked until the processes of the build have ended, even if this one is killed.
 #[track_caller]
-fn build(folder: &Path) {
+fn build(folder: &Path, lock: &File) {
     let source = folder.join("src");
     fs::create_dir_all(&source).unwrap();
     symlink(ROOT, source.join("rosrescue")).unwrap();
@@ -42,6 +45,7 @@ fn build(folder: &Path) {
         .args(["--directory", folder.to_str().unwrap(), &program, "install"])
         // catkin works only with the system's Python.
         .env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin")
+        .stdin(lock.try_clone().unwrap())
         .output();
     let output =
         output.expect("catkin_make is not installed: tests/run.sh installs catkin and cmake");

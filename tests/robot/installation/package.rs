@@ -1,5 +1,6 @@
 //! The Debian package, in a fresh Debian made by debootstrap, and under a systemd.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
@@ -9,11 +10,15 @@ use crate::support::Scratch;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Two versions of the package, 0.2.0 and 0.2.1, which are made once. This takes two minutes if cargo-deb is missing.
+/// Two versions of the package, 0.2.0 and 0.2.1, which are made once. Another test process that also needs them waits until
+/// this one has ended.
 #[track_caller]
 fn packages() -> &'static [PathBuf; 2] {
-    static PACKAGES: OnceLock<[PathBuf; 2]> = OnceLock::new();
-    PACKAGES.get_or_init(|| {
+    static PACKAGES: OnceLock<([PathBuf; 2], File)> = OnceLock::new();
+    let (packages, _) = PACKAGES.get_or_init(|| {
+        let lock =
+            File::create(Path::new(env!("CARGO_TARGET_TMPDIR")).join("package.lock")).unwrap();
+        lock.lock().unwrap();
         let output = Command::new("packaging/build-deb.sh")
             .args(["--debug", "--version", "0.2.0"])
             .current_dir(ROOT)
@@ -28,8 +33,9 @@ fn packages() -> &'static [PathBuf; 2] {
         let old = Path::new(ROOT).join(old.trim());
         let new = old.with_file_name(name(&old).replace("0.2.0", "0.2.1"));
         repack(&old, &new);
-        [old, new]
-    })
+        ([old, new], lock)
+    });
+    packages
 }
 
 /// Makes the package `new` of the same files, with version 0.2.1.

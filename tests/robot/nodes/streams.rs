@@ -170,6 +170,8 @@ fn no_message_is_lost_when_core_and_its_master_are_killed_again_and_again() {
         robot.await_gate();
         assert!(alive(master), "the living master was not adopted");
     }
+    set_speed(&robot, &users, restarts + 1);
+    answered(&clients);
     assert_eq!(users[0].said("failed"), Vec::<String>::new());
     streams.assert_whole(&robot);
 }

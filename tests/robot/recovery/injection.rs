@@ -1,4 +1,4 @@
-//! The new master dies at every single call of the injection. The master that finally lives has the exact state, whatever
+//! The new master dies at any call of the injection; each run plays some of them. The master that finally lives has the exact state, whatever
 //! happened before, and no node notices. The simulation of the write queue plays several deaths in a row.
 
 use std::collections::BTreeMap;
@@ -204,11 +204,9 @@ fn a_new_master_may_die_at_any_call_of_the_injection() {
     }
     proxied.live();
     before.assert_same(&State::read(&proxied.bare()), "at the end");
-    assert!(
-        number - LOOK >= 60,
-        "the injection had only {} calls",
-        number - LOOK
-    );
+    // The injection ended between the last two deaths.
+    let calls = number - LOOK - APART;
+    assert!(calls >= 45, "the injection had only {calls} calls");
     let client = proxied.rescue.client();
     eventually("the status says crash loop", || {
         status(&client)["crash_loop"] == true

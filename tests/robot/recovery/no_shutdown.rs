@@ -5,13 +5,13 @@ use std::sync::atomic::{AtomicI32, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, FakeNode, Library, Mode, Robot, eventually, eventually_some, holds, in_both_modes,
-    params, status,
+    Client, FakeNode, Library, Mode, Node, Robot, eventually, eventually_some, holds,
+    in_both_modes, params, status,
 };
 use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// Number of outages. `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once only for the first five
+/// Number of outages. For a proxy, `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once only for the first five
 /// deaths within a minute.
 fn outages(mode: Mode) -> usize {
     let rounds = std::env::var("ROSRESCUE_TEST_ROUNDS");
@@ -237,9 +237,10 @@ fn a_newer_node_that_the_new_master_knows_is_not_shut_down() {
 fn real_nodes_restarted_during_an_outage_are_not_shut_down() {
     let mut robot = Robot::start(Mode::Core);
     let start = |robot: &Robot| {
-        [(Library::Roscpp, "cpp"), (Library::Rospy, "py")].map(|(library, name)| {
+        let talkers = [(Library::Roscpp, "cpp"), (Library::Rospy, "py")];
+        Node::all_ready(talkers.map(|(library, name)| {
             robot.spawn_node(library, "talker", &[&format!("__name:={name}")])
-        })
+        }))
     };
     let mut talkers = start(&robot);
     let listener = robot.node(Library::Roscpp, "listener", &[]);

@@ -1,5 +1,5 @@
 //! After an outage the registrations are those that living nodes report, and all subscribers have been notified of
-//! every change. `paper/case_2_not_yet_told.rs` has a master that dies at every point while it notifies nodes.
+//! every change. `paper/case_2_not_yet_told.rs` has a master that dies at five points while it notifies nodes.
 
 use std::path::Path;
 use std::time::Duration;
