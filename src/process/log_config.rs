@@ -15,25 +15,7 @@ pub(super) const VARIABLE: &str = "ROS_PYTHON_LOG_CONFIG_FILE";
 /// Logs to the file only. rosmaster's default configuration also has a handler for the screen,
 /// which imports half of rospy. Without that handler rosmaster starts in 72 ms instead of 132 ms,
 /// and master.log stays the same.
-const TEXT: &str = "\
-# Written by rosrescue for the rosmaster that it supervises: as ROS's own, without the screen.
-[loggers]
-keys=root
-[handlers]
-keys=file
-[formatters]
-keys=default
-[logger_root]
-level=INFO
-handlers=file
-[handler_file]
-class=handlers.RotatingFileHandler
-level=DEBUG
-formatter=default
-args=(os.environ['ROS_LOG_FILENAME'],'a', 50000000, 4)
-[formatter_default]
-format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
-";
+const TEXT: &str = include_str!("rosmaster_logging.conf");
 
 /// A sealed file in memory, which every child process inherits.
 #[derive(Clone, Debug)]
