@@ -1,5 +1,6 @@
-//! The new master dies at any call of the injection; each run plays some of them. The master that finally lives has the exact state, whatever
-//! happened before, and no node notices. The simulation of the write queue plays several deaths in a row.
+//! The new master dies at any call of the injection; each run plays some of them. The master that finally lives has the
+//! exact state, whatever happened before, and no node notices. The simulation of the write queue plays several deaths in a
+//! row.
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -11,8 +11,8 @@ use crate::support::{
 use ros1_master::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// Number of outages. For a proxy, `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once only for the first five
-/// deaths within a minute.
+/// Number of outages. For a proxy, `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once only for the
+/// first five deaths within a minute.
 fn outages(mode: Mode) -> usize {
     let rounds = std::env::var("ROSRESCUE_TEST_ROUNDS");
     match mode {
