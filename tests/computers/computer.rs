@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::PathBuf;
-use std::process::Command;
+use std::process::{Command, ExitStatus};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
@@ -308,6 +308,11 @@ impl Computer {
         let mut etcd = self.etcd.take().expect("an etcd");
         send(&etcd, Signal::KILL);
         etcd.wait();
+    }
+
+    /// The exit status of this computer's etcd. `None` while it runs.
+    pub(crate) fn etcd_ended(&mut self) -> Option<ExitStatus> {
+        self.etcd.as_mut()?.exited()
     }
 
     /// Whether this computer's etcd belongs to a majority.

@@ -85,10 +85,17 @@ impl Fleet {
     }
 
     #[track_caller]
-    pub(crate) fn await_etcd(&self) {
-        for computer in &self.computers {
+    pub(crate) fn await_etcd(&mut self) {
+        for computer in &mut self.computers {
             let what = format!("etcd of {} is healthy", computer.name);
-            eventually(&what, || computer.etcd_is_healthy());
+            eventually(&what, || {
+                let ended = computer.etcd_ended();
+                assert_eq!(
+                    ended, None,
+                    "etcd ended; `. tests/install_etcd.sh` unpacks one"
+                );
+                computer.etcd_is_healthy()
+            });
         }
     }
 
