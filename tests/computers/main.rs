@@ -48,7 +48,7 @@ mod wiring;
 
 /// Waits for the turn of a test; see [`support::turn`].
 fn turn() -> support::Turn {
-    support::turn(2)
+    support::turn(3)
 }
 
 /// Number of rounds in which computers are killed, cut off or told to hand over: `usual`, or `ROSRESCUE_ROUNDS`.
