@@ -55,19 +55,33 @@ pub(super) fn add_ros_paths(command: &mut Command, program: &Path, depth: usize)
     else {
         return;
     };
-    for (variable, folder) in [
-        ("PYTHONPATH", "lib/python3/dist-packages"),
-        ("LD_LIBRARY_PATH", "lib"),
+    let libraries = prefix.join("lib");
+    let modules = python_folders(&libraries);
+    for (variable, folders) in [
+        ("PYTHONPATH", modules),
+        ("LD_LIBRARY_PATH", vec![libraries]),
     ] {
         let own = std::env::var_os(variable).unwrap_or_default();
-        let paths = [prefix.join(folder)]
-            .into_iter()
-            .chain(std::env::split_paths(&own));
+        let paths = folders.into_iter().chain(std::env::split_paths(&own));
         let paths = paths.filter(|path| !path.as_os_str().is_empty());
         if let Ok(joined) = std::env::join_paths(paths) {
             command.env(variable, joined);
         }
     }
+}
+
+/// The folders of Python modules in `lib` of a ROS installation: `python2.7/dist-packages` in ROS's packages up to
+/// Melodic, `python3/dist-packages` in Noetic's, `site-packages` on some other systems.
+fn python_folders(lib: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(lib).into_iter().flatten().flatten();
+    let pythons =
+        entries.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"python"));
+    let folders = pythons.flat_map(|python| {
+        ["dist-packages", "site-packages"].map(|folder| python.path().join(folder))
+    });
+    let mut folders: Vec<_> = folders.filter(|folder| folder.is_dir()).collect();
+    folders.sort();
+    folders
 }
 
 /// The output of `program`, if it ends within `limit`, in the form that roslaunch's `command=` would use.
@@ -128,6 +142,18 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_modules_of_each_python_are_found() {
+        let prefix = tempfile::tempdir().unwrap();
+        assert!(python_folders(prefix.path()).is_empty());
+        let folders = ["python2.7/dist-packages", "python3/dist-packages"];
+        let folders = folders.map(|folder| prefix.path().join(folder));
+        for folder in folders.iter().chain([&prefix.path().join("python3.8")]) {
+            std::fs::create_dir_all(folder).unwrap();
+        }
+        assert_eq!(python_folders(prefix.path()), folders);
+    }
+
+    #[test]
     fn a_ros_in_opt_gets_its_own_paths() {
         let paths = |program: &str, depth| {
             let mut command = Command::new(program);
@@ -137,11 +163,8 @@ mod tests {
             set.collect::<std::collections::HashMap<_, _>>()
         };
         let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
-        let python = std::env::split_paths(&set[OsStr::new("PYTHONPATH")]).next();
-        assert_eq!(
-            python.unwrap(),
-            Path::new("/opt/ros/noetic/lib/python3/dist-packages")
-        );
+        let libraries = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).next();
+        assert_eq!(libraries.unwrap(), Path::new("/opt/ros/noetic/lib"));
         assert!(paths("/usr/bin/rosmaster", 2).is_empty());
     }
 }
