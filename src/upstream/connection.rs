@@ -265,7 +265,7 @@ impl Connection {
 
     /// Like [`Self::call`], for a call of a node's slave API.
     pub async fn call_node(&mut self, call: &xmlrpc::Call) -> Result<Reply, CallError> {
-        self.decoded(xmlrpc::encode_call(call)).await
+        self.decoded(xmlrpc::encode_node_call(call)).await
     }
 
     /// Sends `body` and decodes the reply.

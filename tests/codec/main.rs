@@ -19,9 +19,10 @@ use proptest::prelude::*;
 
 use cases::{any_value, double, mess, returnable, text};
 use documents::{odd_documents, params, refused_documents};
-use peer::{Peer, hex};
+use peer::{Peer, hex, unhex};
 use ros1_master::xmlrpc::{
-    Call, DecodeError, Python, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
+    Call, DecodeError, Python, Reply, Value, decode_call, decode_reply, encode_call,
+    encode_node_call, encode_reply,
 };
 
 /// A value in the notation of `peer.py`.
@@ -248,6 +249,20 @@ fn cpython_understands_our_calls_and_answers_with_our_bytes() {
         let ours = encode_reply(&Reply::Value(value.clone()));
         let theirs = peer.echo(&value);
         prop_assert_eq!(String::from_utf8(ours), String::from_utf8(theirs));
+        Ok(())
+    });
+}
+
+#[test]
+fn calls_of_nodes_are_written_as_cpythons_client_writes_them() {
+    let cases = proptest::collection::vec(returnable(), 0..4);
+    with_peer(&cases, |peer, params| {
+        let call = Call::new("paramUpdate", params);
+        let theirs = unhex(&peer.ask("dumps", &encode_call(&call)));
+        prop_assert_eq!(
+            String::from_utf8(encode_node_call(&call)),
+            String::from_utf8(theirs)
+        );
         Ok(())
     });
 }

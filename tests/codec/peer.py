@@ -4,6 +4,7 @@
     reply HEX   how a Python client understands an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
     fault HEX   the text of the fault that a server answers to a request
     echo HEX    the answer, in hex, of a server whose method `echo` returns its parameter
+    dumps HEX   the same request, in hex, as a Python client writes it
 """
 import decimal
 import struct
@@ -91,10 +92,16 @@ def echo(body):
     return server._marshaled_dispatch(body).hex()
 
 
+def dumps(body):
+    values, method = xmlrpc.client.loads(body)
+    # As ServerProxy calls it.
+    return xmlrpc.client.dumps(values, method, encoding="utf-8").encode().hex()
+
+
 for line in sys.stdin:
     verb, _, document = line.strip().partition(" ")
     try:
-        answer = {"call": call, "reply": reply, "fault": fault, "echo": echo}[verb](bytes.fromhex(document))
+        answer = {"call": call, "reply": reply, "fault": fault, "echo": echo, "dumps": dumps}[verb](bytes.fromhex(document))
     except Exception as error:
         answer = "raise %s %r" % (type(error).__name__, str(error)[:100])
     print(answer, flush=True)

@@ -1,4 +1,4 @@
-//! Encodes calls compactly, and answers exactly as CPython's server writes them.
+//! Encodes calls to a master compactly, and calls to nodes and answers exactly as CPython writes them.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -34,6 +34,24 @@ pub(crate) fn encode_call_of(method: &str, params: &[Value]) -> Vec<u8> {
         writer.raw("</param>");
     }
     writer.raw("</params></methodCall>");
+    writer.out.into_bytes()
+}
+
+/// Encodes a call of a node byte for byte as rosmaster does, that is like `dumps` of CPython's `xmlrpc.client`.
+///
+/// Boards find the arguments by searching for texts such as `<value><string>/master</string></value>`: they have never
+/// met other ones (the STM32 port of ROS, mROS). CPython must be able to encode the arguments.
+pub fn encode_node_call(call: &Call) -> Vec<u8> {
+    let mut writer = Writer::new(Form::Python);
+    writer.raw("<?xml version='1.0'?>\n<methodCall>\n<methodName>");
+    writer.escaped(&call.method);
+    writer.raw("</methodName>\n<params>\n");
+    for param in &call.params {
+        writer.raw("<param>\n");
+        writer.value(param);
+        writer.raw("</param>\n");
+    }
+    writer.raw("</params>\n</methodCall>\n");
     writer.out.into_bytes()
 }
 
