@@ -14,7 +14,11 @@ use ros1_master::{
 use socket2::SockRef;
 use tokio::{net::TcpStream, time::timeout};
 
-use crate::{resolver, ros_env::MasterUri, upstream::Connection};
+use crate::{
+    resolver,
+    ros_env::MasterUri,
+    upstream::{CallError, Connection},
+};
 pub(crate) use rescue_core::health::Reaction;
 
 /// Largest accepted reply of a node, in bytes.
@@ -168,7 +172,10 @@ async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Valu
         }
         // The node lacks the method.
         Ok(Reply::Fault { .. }) => (Reaction::Alive, None),
-        Ok(Reply::Value(_)) | Err(_) => (Reaction::Silent, None),
+        // Some boards answer in their own words. A master does not look at answers.
+        Ok(Reply::Value(_)) => (Reaction::Alive, None),
+        Err(CallError::NotXmlRpc { status, .. }) if status.is_success() => (Reaction::Alive, None),
+        Err(_) => (Reaction::Silent, None),
     }
 }
 

@@ -53,7 +53,7 @@ pub enum Reaction {
     Alive,
     /// The node's port refuses connections, so its process is gone.
     Dead,
-    /// There was no valid answer in time. That does not prove that the node is dead.
+    /// There was no answer in time. That does not prove that the node is dead.
     Silent,
 }
 

@@ -83,6 +83,7 @@ impl Responder {
         }
         let (uri, get_pid) = (address.to_string(), master::get_pid());
         match client::call_for_value(&uri, &get_pid, ANSWER_LIMIT).await {
+            (Reaction::Alive, None) if speaks(address).await.is_none() => Self::Other,
             (Reaction::Alive, pid) => Self::Master(pid.as_ref().and_then(Value::as_int)),
             (Reaction::Dead, _) => Self::Nobody,
             (Reaction::Silent, _) if page.is_err() => Self::Silent,

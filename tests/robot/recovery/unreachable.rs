@@ -1,11 +1,14 @@
 //! Nodes that could not be reached get all pending notifications as soon as they can be reached.
 //! `tests/timing/unreachable.rs` tests which nodes they delay.
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use ros1_master::xmlrpc::Reply;
+
 use crate::support::{
-    FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually, free_port, holds,
-    names, status,
+    Client, FakeMaster, FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually,
+    free_port, holds, names, params, status,
 };
 
 /// Real nodes behind a cable that is cut during an outage and repaired later.
@@ -82,6 +85,53 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
         let unreachable = names(&status(&client)["unreachable"]);
         assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
     }
+}
+
+/// A master does not look at answers. Boards search what they get for texts that every rosmaster sends.
+#[test]
+fn boards_that_answer_in_their_own_words_are_told_each_change_as_by_a_master() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
+    let client = robot.client();
+    let answers = [
+        FakeMaster::proper(&Reply::Value("hmm".into())),
+        b"HTTP/1.1 200 OK\r\nContent-Length: 7\r\n\r\n<broken".to_vec(),
+    ];
+    let boards = answers.map(|answer| {
+        let told = Arc::new(Mutex::new(String::new()));
+        let last = told.clone();
+        let board = FakeMaster::start(move |body| {
+            let body = String::from_utf8_lossy(body);
+            if body.contains("publisherUpdate") {
+                *last.lock().unwrap() = body.into_owned();
+            }
+            answer.clone()
+        });
+        (board, told)
+    });
+    for (index, (board, _)) in boards.iter().enumerate() {
+        let (name, api) = (format!("/board{index}"), Client::new(board.port()).uri());
+        let subscription = params![name, "/topic", "std_msgs/String", api];
+        client.ok("registerSubscriber", subscription);
+    }
+    robot.take_master_away();
+    let mut publishers = Vec::new();
+    for number in 1..=3 {
+        let publisher = FakeNode::start(&format!("/publisher{number}"));
+        publisher.publish(&client, "/topic", "std_msgs/String");
+        publishers.push(publisher);
+        let all: String = publishers
+            .iter()
+            .map(|publisher| format!("<value><string>{}</string></value>\n", publisher.api))
+            .collect();
+        for (_, told) in &boards {
+            eventually(&format!("a board is told publisher {number}"), || {
+                let told = told.lock().unwrap();
+                told.contains("<value><string>/master</string></value>") && told.contains(&all)
+            });
+        }
+    }
+    let unreachable = names(&status(&client)["unreachable"]);
+    assert_eq!(unreachable, Vec::<String>::new());
 }
 
 #[test]
