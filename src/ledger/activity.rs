@@ -473,10 +473,14 @@ fn is_recent(at: Instant, now: Instant) -> bool {
     now.duration_since(at) < NOTICE_MEMORY
 }
 
+/// Forgets old notices if there are too many. The newest ones are those that a master may still owe.
 fn forget<K: std::hash::Hash + Eq>(notices: &mut IndexMap<K, Noted>, now: Instant) {
     if notices.len() > NOTICES {
         notices.retain(|_, noted| is_recent(noted.at, now));
-        notices.truncate(NOTICES);
+        if notices.len() > NOTICES {
+            notices.sort_by(|_, a, _, b| a.at.cmp(&b.at));
+            notices.drain(..NOTICES / 4);
+        }
     }
 }
 

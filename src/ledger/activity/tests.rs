@@ -185,3 +185,28 @@ fn a_key_is_kept_once_for_all_its_subscribers() {
     let changes = activity.take_outbox().changes;
     assert!(changes.len() == NOTICES && changes.iter().all(is_shared));
 }
+
+#[test]
+fn of_too_many_changes_the_newest_are_remembered() {
+    let start = Instant::now();
+    let mut activity = Activity::default();
+    let change = |activity: &mut Activity, key: &str, at| {
+        let mut noticed = Noticed::new(false);
+        noticed.param_update(&["http://s:1/".to_owned()], key, &Value::Int(1));
+        activity.applied(at, &publish("/a", "/t"), noticed, |_| true);
+    };
+    for index in 0..NOTICES {
+        change(&mut activity, &format!("/key{index}/"), start);
+    }
+    // A repeated change is new, although its key is an old one.
+    let now = start + Duration::from_millis(1);
+    change(&mut activity, "/key0/", now);
+    change(&mut activity, "/last/", now);
+    let owed = activity.take_owed(now).params;
+    let is_owed = |key: &str| owed.iter().any(|(_, owed)| &**owed == key);
+    assert!(
+        is_owed("/key0/") && is_owed("/last/"),
+        "{} owed",
+        owed.len()
+    );
+}
