@@ -230,9 +230,10 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                 Reaction::Alive => {}
             }
             let Displaced { node, api, .. } = &displaced;
-            if health::is_displaced_node(&displaced, interview.pid, interview.claims.as_ref())
-                && !is_taken(&nodes, api)
-            {
+            if is_taken(&nodes, api) {
+                return;
+            }
+            if health::is_displaced_node(&displaced, interview.pid, interview.claims.as_ref()) {
                 rarely!(
                     info,
                     node,
@@ -241,9 +242,23 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                 );
                 nodes.stats.notifications_sent.count();
                 client::call(api, &master::shutdown(node), nodes.timeout).await;
+            } else {
+                rarely!(
+                    info,
+                    node,
+                    api,
+                    "a node whose name another node has taken is not told to shut down: it may not be the one that \
+                     answers at its address"
+                );
             }
             return;
         }
+        rarely!(
+            info,
+            node = displaced.node,
+            api = displaced.api,
+            "a node whose name another node has taken is not told to shut down: it does not answer"
+        );
     });
 }
 

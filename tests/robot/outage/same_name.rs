@@ -103,6 +103,11 @@ fn a_node_that_now_has_the_port_is_not_shut_down_during_an_outage_either() {
         second.publish(&robot.client(), "/chatter", "std_msgs/String");
         assert_ne!(port_of(&robot.client(), "/twin"), port);
         assert_unharmed(&other);
+        if !is_registered {
+            robot.rescue.wait_line("the log says so", |line| {
+                line.contains("is not told to shut down: it may not be the one that answers")
+            });
+        }
     }
 }
 
