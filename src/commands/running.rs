@@ -1,6 +1,6 @@
 //! Finds and asks the running rosrescue.
 
-use std::{io, time::Duration};
+use std::{io, net::SocketAddr, time::Duration};
 
 use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
@@ -56,11 +56,8 @@ impl Running {
 
     /// Gets the page at `path`.
     pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), CommandFailure> {
-        let request = Request::get(path)
-            .header(HOST, self.address.authority())
-            .header(ACCEPT, "text/plain, application/json");
-        self.exchange(request.body(Full::default()), ANSWER_LIMIT)
-            .await
+        let request = Request::get(path).header(ACCEPT, "text/plain, application/json");
+        self.exchange(request, Bytes::new(), ANSWER_LIMIT).await
     }
 
     /// Gets the status.
@@ -71,8 +68,15 @@ impl Running {
             schema: u32,
             version: String,
         }
-        let (_, json) = self.get("/status.json").await?;
+        let (code, json) = self.get("/status.json").await?;
         let at = &self.address;
+        if code == StatusCode::FORBIDDEN {
+            let why = String::from_utf8_lossy(&json);
+            return Err(CommandFailure::Failed(format!(
+                "{at} refuses: {}",
+                why.trim()
+            )));
+        }
         let versioned = serde_json::from_slice(&json).map_err(|_| {
             self.silent("another program answers there, perhaps a bare rosmaster".to_owned())
         })?;
@@ -97,12 +101,8 @@ impl Running {
         limit: Duration,
     ) -> Result<Reply, CommandFailure> {
         let body = xmlrpc::encode_call(&Call::new(method, params));
-        let request = Request::post("/RPC2")
-            .header(CONTENT_TYPE, "text/xml")
-            .header(HOST, self.address.authority());
-        let answer = self
-            .exchange(request.body(Full::new(body.into())), limit)
-            .await?;
+        let request = Request::post("/RPC2").header(CONTENT_TYPE, "text/xml");
+        let answer = self.exchange(request, body.into(), limit).await?;
         xmlrpc::decode_reply(&answer.1)
             .map_err(|error| self.nobody(format!("it gives no answer to calls: {error}")))
     }
@@ -114,20 +114,28 @@ impl Running {
         }
     }
 
+    /// Sends a request. Its `Host` is the address and not the name that was given, because rosrescue refuses to show pages
+    /// under a name that is not its computer's own, and the reader of a status may have another name for it.
     async fn exchange(
         &self,
-        request: http::Result<Request<Full<Bytes>>>,
+        request: http::request::Builder,
+        body: Bytes,
         limit: Duration,
     ) -> Result<(StatusCode, Bytes), CommandFailure> {
         let deadline = Instant::now() + limit;
         let connect = async {
             let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
-            TcpStream::connect(&*addresses).await
+            let stream = TcpStream::connect(&*addresses).await?;
+            let there = stream.peer_addr()?;
+            // Without the zone of an IPv6 address.
+            let there = SocketAddr::new(there.ip(), there.port()).to_string();
+            io::Result::Ok((stream, there))
         };
-        let stream = match timeout_at(deadline, connect).await {
+        let (stream, there) = match timeout_at(deadline, connect).await {
             Ok(connected) => connected.map_err(|error| self.nobody(error.to_string()))?,
             Err(_) => return Err(self.nobody(format!("no connection in {} s", limit.as_secs()))),
         };
+        let request = request.header(HOST, there).body(Full::new(body));
         match timeout_at(deadline, try_exchange(stream, request)).await {
             Ok(answer) => answer.map_err(|error| self.silent(error.to_string())),
             Err(_) => Err(self.silent(format!("no answer in {} s", limit.as_secs()))),

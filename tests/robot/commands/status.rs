@@ -2,12 +2,34 @@
 
 use std::io::{Read, Write};
 use std::net::TcpListener;
+use std::process::Command;
 use std::thread;
 
 use crate::support::{
     FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, State, Tool, eventually, free_port,
     page, params,
 };
+
+/// rosrescue shows pages only under the names of its own computer, because of pages in browsers. A command is none.
+#[test]
+fn a_robot_is_found_under_a_name_that_only_the_reader_of_the_status_knows() {
+    let robot = Robot::start(Mode::Core);
+    let hosts = robot.scratch.path("hosts");
+    std::fs::write(&hosts, "127.0.0.1 other-name\n").unwrap();
+    let status = Command::new("unshare")
+        .args(["--mount", "sh", "-ec"])
+        .arg("mount --bind \"$0\" /etc/hosts; exec \"$@\"")
+        .arg(hosts)
+        .args([env!("CARGO_BIN_EXE_rosrescue"), "status"])
+        .env(
+            "ROS_MASTER_URI",
+            format!("http://other-name:{}", robot.port()),
+        )
+        .output()
+        .unwrap();
+    let printed = String::from_utf8_lossy(&status.stdout);
+    assert!(printed.starts_with("protected, since "), "{status:?}");
+}
 
 /// A robot whose nodes are dead is not well because its master is. A node that stops cleanly is no trouble.
 #[test]
