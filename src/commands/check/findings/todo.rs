@@ -46,5 +46,6 @@ pub(super) fn first_address(host: Option<&Host>) -> String {
 
 /// How to free space on the disk of ROS's logs. `rosclean purge` would delete the checkpoint, too.
 pub(super) fn delete_logs() -> String {
-    "`find ~/.ros/log -name '*.log*' -mtime +2 -delete` deletes old logs".to_owned()
+    "`find ~/.ros/log -name '*.log*' -not -name 'latest-chkpt*' -mtime +2 -delete` deletes old logs"
+        .to_owned()
 }
