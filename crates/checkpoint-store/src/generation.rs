@@ -1,7 +1,7 @@
 //! Writes a new *generation* of the checkpoint, a file that replaces the present one, while records are appended to the
 //! present one.
 
-use std::io;
+use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
@@ -111,7 +111,10 @@ impl<S: Storage> CompactionPlan<S> {
         let path = names.fresh(generation);
         let file = match self.write_at(&path, &encoded.bytes) {
             Err(StoreError::Io { source, .. })
-                if source.kind() == io::ErrorKind::StorageFull && self.make_room() =>
+                if matches!(
+                    source.kind(),
+                    ErrorKind::StorageFull | ErrorKind::QuotaExceeded
+                ) && self.make_room() =>
             {
                 self.write_at(&path, &encoded.bytes)
             }
@@ -392,7 +395,7 @@ pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) 
     let mut rest = bytes;
     while !rest.is_empty() {
         match storage.append(file, rest)? {
-            0 => return Err(io::ErrorKind::WriteZero.into()),
+            0 => return Err(ErrorKind::WriteZero.into()),
             taken => rest = rest.get(taken..).unwrap_or_default(),
         }
     }

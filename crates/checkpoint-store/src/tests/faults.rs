@@ -4,6 +4,8 @@ use super::*;
 
 const EIO: i32 = 5;
 const ENOSPC: i32 = 28;
+/// A disk quota is used up.
+const EDQUOT: i32 = 122;
 const EROFS: i32 = 30;
 
 #[test]
@@ -214,6 +216,12 @@ fn a_file_that_would_become_too_large_is_rewritten() {
 /// The previous generation is dropped, the present one is not.
 #[test]
 fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
+    for full in [ENOSPC, EDQUOT] {
+        the_previous_generation_makes_room(full);
+    }
+}
+
+fn the_previous_generation_makes_room(full: i32) {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -222,9 +230,9 @@ fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
     }
     let names = store.place.names.clone();
     assert!(fs.read(&names.previous(), 1 << 20).is_ok());
-    fs.arm(0, Fault::Once(ENOSPC));
+    fs.arm(0, Fault::Once(full));
     assert!(model.begin(&mut store));
-    fs.arm(0, Fault::Errno(ENOSPC));
+    fs.arm(0, Fault::Errno(full));
     model.append(&mut store, 1);
     assert!(!model.begin(&mut store));
     fs.disarm();
