@@ -136,18 +136,20 @@ fn boards_are_answered_as_by_a_bare_master() {
     let state = encode_call("getSystemState", params!["/script"]);
     let compare = |node: &str| {
         twins.same(&board(node));
-        for kind in [
-            "application/x-www-form-urlencoded",
-            "text/plain",
-            "application/json",
-            "",
+        for header in [
+            "Content-Type: application/x-www-form-urlencoded",
+            "Content-Type: text/plain",
+            "Content-Type: application/json",
+            "Content-Type: ",
+            // mROS
+            "Host: ",
+            // Java 11
+            "Connection: Upgrade, HTTP2-Settings\r\nUpgrade: h2c\r\nHTTP2-Settings: AAMAAABkAAQAAP__",
         ] {
             let length = state.len();
-            let head = format!(
-                "POST / HTTP/1.1\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\n\r\n"
-            );
+            let head = format!("POST / HTTP/1.1\r\n{header}\r\nContent-Length:{length}\r\n\r\n");
             let answer = twins.same(&[head.as_bytes(), &state].concat());
-            assert!(answer.text().contains(node), "{kind}");
+            assert!(answer.text().contains(node), "{header}");
         }
     };
     compare("/first");

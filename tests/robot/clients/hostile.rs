@@ -210,6 +210,13 @@ fn more_large_bodies_than_fit_into_memory_are_accepted_in_turn() {
     });
     let tree = robot.bare().param("/large").unwrap();
     assert_eq!(tree.as_struct().unwrap().len(), requests.len());
+    // A body in chunks does not say how long it is. This one does not end.
+    let mut wire = client.connect().unwrap();
+    let head = "POST /RPC2 HTTP/1.1\r\nHost: robot\r\nContent-Type: text/xml\r\nTransfer-Encoding: chunked\r\n\r\n";
+    let chunk = format!("10000\r\n{}\r\n", "z".repeat(0x10000));
+    wire.send((head.to_owned() + &chunk.repeat(17)).as_bytes())
+        .unwrap();
+    assert_eq!(wire.response().unwrap().code, 413);
 }
 
 /// rosmaster does not read the body after a head that it refuses. The rest in that connection must not become
