@@ -21,30 +21,11 @@ ros_has_rosout() {
     return 1
 }
 
-has_libfaketime() {
-    for library in /usr/lib/*/faketime/libfaketimeMT.so.1; do
-        [ ! -r "$library" ] || return 0
-    done
-    return 1
-}
-
 # Prints PACKAGES unless CHECK succeeds.
 need() { # PACKAGES CHECK...
     packages=$1
     shift
     "$@" >/dev/null 2>&1 || echo "$packages"
-}
-
-has_pam_systemd() {
-    for library in /lib/*/security/pam_systemd.so; do
-        [ ! -r "$library" ] || return 0
-    done
-    return 1
-}
-
-# With `grep -q`, busybox may get SIGPIPE, which counts under `set -o pipefail`.
-has_dhcp() {
-    busybox udhcpd --help 2>&1 | grep udhcpd >/dev/null && busybox udhcpc --help 2>&1 | grep udhcpc >/dev/null
 }
 
 can_import() { # MODULES
@@ -79,19 +60,8 @@ ros_missing() {
     need pkg-config command -v pkg-config
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs
-    need libfaketime has_libfaketime
     need rosbash command -v rosrun
-    need catkin command -v catkin_make
-    need cmake command -v cmake
-    need make command -v make
-    need debootstrap command -v debootstrap
-    need systemd-sysv test -x /lib/systemd/systemd
-    need dbus command -v dbus-daemon
-    need libpam-systemd has_pam_systemd
     need procps command -v pgrep
-    need dpkg-dev command -v dpkg-shlibdeps
-    need keepalived command -v keepalived
-    need busybox has_dhcp
 }
 
 install_missing() { # PACKAGES...

@@ -17,6 +17,7 @@ if ! command -v cargo >/dev/null; then
 fi
 
 . tests/install_ros.sh
+. tests/install_tools.sh
 . tests/install_robot.sh
 . tests/install_chromium.sh
 . tests/install_etcd.sh

@@ -8,6 +8,7 @@
 set -eu
 cd "$(dirname "$0")/../.."
 . tests/install_ros.sh
+. tests/install_tools.sh
 work=${CARGO_TARGET_DIR:-target}/field/containers
 root=$work/root
 mkdir -p "$work/nodes"

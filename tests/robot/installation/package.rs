@@ -64,7 +64,7 @@ fn in_fresh_debian(script: &str) -> String {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(
         output.status.success(),
-        "{errors} (needs root and debootstrap, see tests/install_ros.sh)"
+        "{errors} (needs root and debootstrap, see tests/install_tools.sh)"
     );
     String::from_utf8(output.stdout).unwrap()
 }
