@@ -1,7 +1,7 @@
 //! Recognises a request of this process that comes back to it: the master's address is rosrescue's own.
 //!
-//! Each request to a master has a number that nobody can guess, used once and only while the request is open. A constant
-//! would be a weapon: a program that has seen it in a request could send it and end rosrescue.
+//! The first request of each connection to a master has a number that nobody can guess, used once and only while the
+//! request is open. A constant would be a weapon: a program that has seen it in a request could send it and end rosrescue.
 
 use std::{
     collections::BTreeSet,
