@@ -137,11 +137,16 @@ impl MasterConfig {
     /// Pause between two renewals of the [`Sentinel`](crate::upstream::sentinel::Sentinel). It is shorter for a `--timeout`
     /// of less than 0.8 s, because that master closes idle connections sooner. The `-t` of an external master is unknown.
     pub(crate) fn renewal(&self) -> Duration {
+        self.socket_timeout().map_or(RENEWAL, |limit| {
+            RENEWAL.min((limit / 2).max(SHORTEST_RENEWAL))
+        })
+    }
+
+    /// The master's socket timeout; see [`SupervisedConfig::socket_timeout`]. `None` if it has none or it is unknown.
+    pub(crate) fn socket_timeout(&self) -> Option<Duration> {
         match self {
-            Self::External(_) => RENEWAL,
-            Self::Supervised(supervised) => supervised.socket_timeout().map_or(RENEWAL, |limit| {
-                RENEWAL.min((limit / 2).max(SHORTEST_RENEWAL))
-            }),
+            Self::External(_) => None,
+            Self::Supervised(supervised) => supervised.socket_timeout(),
         }
     }
 }

@@ -39,6 +39,8 @@ use crate::{resolver, ros_env::MasterUri};
 const MAX_REPLY: usize = 512 << 20;
 /// Time limit for connecting. A host that drops packets never answers.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
+/// How long before the master closes an idle connection it is no longer used.
+const IDLE_RESERVE: Duration = Duration::from_millis(500);
 
 /// Header in each request to the master, with the number of an [open request](open_requests). A rosrescue that receives
 /// a number of its own is its own master.
@@ -163,6 +165,8 @@ pub struct Upstream {
     address: watch::Sender<MasterUri>,
     probe_timeout: Duration,
     probe_count: u32,
+    /// Longest time for which a connection may have been idle. `None` without limit.
+    idle_most: Option<Duration>,
     /// The master's addresses from the last successful lookup.
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
     /// Number of connections for writes.
@@ -201,11 +205,25 @@ impl Upstream {
             address: watch::Sender::new(address),
             probe_timeout,
             probe_count,
+            idle_most: None,
             found: watch::Sender::new(None),
             writers: watch::Sender::new(0),
             verification: Mutex::default(),
             open_calls: Mutex::default(),
         }
+    }
+
+    /// For a master that closes each connection that has been idle for `timeout`, as rosmaster does with `-t`. A call that
+    /// meets the close looks like the death of the master, so connections are given up a little earlier.
+    pub(crate) fn with_socket_timeout(mut self, timeout: Option<Duration>) -> Self {
+        self.idle_most = timeout.map(|timeout| timeout - IDLE_RESERVE.min(timeout / 2));
+        self
+    }
+
+    /// Whether the master may be about to close a connection that was used last at `last_used`.
+    fn may_close(&self, last_used: Instant) -> bool {
+        self.idle_most
+            .is_some_and(|most| last_used.elapsed() > most)
     }
 
     pub fn address(&self) -> MasterUri {
@@ -437,6 +455,27 @@ pub(crate) async fn test_master() -> (
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_connection_is_given_up_before_the_master_closes_it() {
+        let uri = MasterUri::parse("http://127.0.0.1:11312").unwrap();
+        for (timeout, idle, may_close) in [
+            (None, 3_600_000, false),
+            (Some(5_000), 4_400, false),
+            (Some(5_000), 4_600, true),
+            (Some(400), 100, false),
+            (Some(400), 300, true),
+        ] {
+            let upstream = Upstream::new(uri.clone(), Duration::from_secs(1), 3);
+            let upstream = upstream.with_socket_timeout(timeout.map(Duration::from_millis));
+            let last_used = Instant::now() - Duration::from_millis(idle);
+            assert_eq!(
+                upstream.may_close(last_used),
+                may_close,
+                "{timeout:?} {idle}"
+            );
+        }
+    }
 
     /// A container that is started again has another address, and no kernel answers at the old one.
     #[tokio::test(start_paused = true)]

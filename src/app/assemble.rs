@@ -79,11 +79,8 @@ pub(super) async fn assemble(
     let stats: &'static Stats = Box::leak(Box::default());
     let uri = config.advertised.to_string();
     let ledger = Arc::new(ledger(config, beginning, &uri, stats));
-    let upstream = Arc::new(Upstream::new(
-        address,
-        config.probe_timeout,
-        config.probing.count,
-    ));
+    let upstream = Upstream::new(address, config.probe_timeout, config.probing.count);
+    let upstream = Arc::new(upstream.with_socket_timeout(config.master.socket_timeout()));
     let local = Arc::new(LocalNodes::new(config.reap, stats));
     let (write_queue, drain) = write_queue::write_queue(
         Link {

@@ -5,7 +5,7 @@ use std::{
     net::SocketAddr,
     pin::Pin,
     task::{Context, Poll, Waker},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
@@ -61,6 +61,7 @@ pub struct Connection {
     /// Whether the server left the connection open after the last answer.
     keeps_alive: Option<bool>,
     server: Option<HeaderValue>,
+    last_used: Instant,
 }
 
 /// The connection that the caller drives, with the [`Writer`] that counts it if it is for writes. `None` if the
@@ -124,6 +125,7 @@ impl Connection {
             silence,
             keeps_alive: None,
             server: None,
+            last_used: Instant::now(),
         })
     }
 
@@ -159,6 +161,11 @@ impl Connection {
     pub fn is_closed(&mut self) -> bool {
         self.driver.poll(&mut Context::from_waker(Waker::noop()));
         self.sender.is_closed()
+    }
+
+    /// When the last answer came, or the connection was opened.
+    pub(super) fn last_used(&self) -> Instant {
+        self.last_used
     }
 
     /// Whether the server answers more than one call on a connection. `None` before its first answer.
@@ -262,6 +269,7 @@ impl Connection {
         let reply = self.driver.run(exchange).await?;
         self.keeps_alive = Some(reply.keeps_alive);
         self.server = reply.headers.get(SERVER).cloned();
+        self.last_used = Instant::now();
         Ok(reply)
     }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::{RawReply, VerifyError, verify::Verified};
+use super::{RawReply, Upstream, VerifyError, verify::Verified};
 
 /// Longest age at which a prepared connection is still used, because a master may close idle connections. `core` starts
 /// rosmaster with `-t 5`, and timeouts below a second make no sense.
@@ -42,10 +42,13 @@ impl NextConnection {
         useful.then(|| Self::Ahead(ahead(), Instant::now()))
     }
 
-    /// Whether the connection has ended or may end soon.
-    pub(crate) fn is_stale(&mut self) -> bool {
+    /// Whether the connection has ended or may end soon: `upstream`'s master closes connections that are idle for too long.
+    pub(crate) fn is_stale(&mut self, upstream: &Upstream) -> bool {
         match self {
-            Self::Kept(verified) => verified.connection.is_closed(),
+            Self::Kept(verified) => {
+                let connection = &mut verified.connection;
+                connection.is_closed() || upstream.may_close(connection.last_used())
+            }
             Self::Ahead(_, since) => since.elapsed() > AGE_MAX,
         }
     }
@@ -70,7 +73,7 @@ mod tests {
 
     use super::*;
     use crate::upstream::{
-        Upstream, test_master,
+        test_master,
         verify::{self, Verification},
     };
     use rescue_core::replay::Token;
@@ -106,11 +109,15 @@ mod tests {
 
         let (next, _open) = after(reply(true), by_sentinel()).await;
         assert!(matches!(next, Some(NextConnection::Kept(_))));
+        let mut next = next.unwrap();
+        assert!(!next.is_stale(&upstream));
+        let hasty = Upstream::new(upstream.address(), Duration::from_secs(1), 3);
+        assert!(next.is_stale(&hasty.with_socket_timeout(Some(Duration::ZERO))));
 
         let (next, _) = after(reply(false), by_sentinel()).await;
         let (accepted, _) = listener.accept().await.unwrap();
         let mut next = next.unwrap();
-        assert!(!next.is_stale());
+        assert!(!next.is_stale(&upstream));
         let verified = next.ready().await.unwrap();
         drop(accepted);
 
@@ -119,7 +126,7 @@ mod tests {
         let Some(NextConnection::Ahead(made, since)) = next else {
             panic!("{next:?}")
         };
-        assert!(NextConnection::Ahead(made, since - 2 * AGE_MAX).is_stale());
+        assert!(NextConnection::Ahead(made, since - 2 * AGE_MAX).is_stale(&upstream));
 
         // A tunnel may lead to another master before the connection is used.
         let (next, _) = after(reply(false), Verification::TokenAfterwards).await;

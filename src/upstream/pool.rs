@@ -81,7 +81,7 @@ impl Pool {
 
     fn take_idle(&self, incarnation: u64) -> Option<NextConnection> {
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        idle.retain_mut(|(of, next)| *of == incarnation && !next.is_stale());
+        idle.retain_mut(|(of, next)| *of == incarnation && !next.is_stale(&self.upstream));
         idle.pop().map(|(_, next)| next)
     }
 

@@ -149,7 +149,8 @@ impl Drain {
     /// Sends `request` to the master, or without one reads its state.
     fn exchange(&mut self, incarnation: u64, request: Option<(Head, Bytes)>) {
         let mut connection = self.connection.take();
-        connection.take_if(|(of, next)| *of != incarnation || next.is_stale());
+        let upstream = &self.link.upstream;
+        connection.take_if(|(of, next)| *of != incarnation || next.is_stale(upstream));
         let connection = connection.map(|(_, next)| next);
         let span = tracing::debug_span!("request", incarnation);
         let done = round_trip(self.link.clone(), incarnation, connection, request);
