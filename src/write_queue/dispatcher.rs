@@ -18,7 +18,7 @@ use super::{
     resync::ResyncSchedule,
     round_trip::{Failure, Received},
 };
-use rescue_core::{lifecycle::Patience, order::Order};
+use rescue_core::{checkpoint::format::Origin, lifecycle::Patience, order::Order};
 use ros1_master::{
     master::{Effect, Master, Request, Write},
     xmlrpc::{self, Reply},
@@ -93,8 +93,11 @@ pub(super) enum Action {
     Inspect {
         incarnation: u64,
     },
-    /// Have the disk write the record of the call that was just sent.
-    Write,
+    /// Record the call that was just sent, if the master surely accepts it, and have the disk write it.
+    Record {
+        call: Arc<Request>,
+        origin: Origin,
+    },
     /// Drop the request in flight and the connection to the master.
     Disconnect,
     /// Give callers their answers.
@@ -604,13 +607,12 @@ impl Dispatcher {
             let answers = items.iter().filter_map(|item| item.delivery.as_ref());
             order.calls_sent(tells, answers.map(Delivery::number).collect());
         });
-        let mut is_recorded = false;
-        if let [item] = items.as_slice()
-            && !item.is_answered_first()
-            && let Some(call) = item.call.as_ref().filter(|_| item.request().is_some())
-        {
-            is_recorded = self.ledger.record_ahead(call, item.origin);
-        }
+        let single = match items.as_slice() {
+            [item] if !item.is_answered_first() && item.request().is_some() => {
+                item.call.clone().map(|call| (call, item.origin))
+            }
+            _ => None,
+        };
         self.actions.push(match inspects {
             true => Action::Inspect { incarnation },
             false => Action::Send {
@@ -618,8 +620,8 @@ impl Dispatcher {
                 request: batch::outbound(&items),
             },
         });
-        if is_recorded {
-            self.actions.push(Action::Write);
+        if let Some((call, origin)) = single {
+            self.actions.push(Action::Record { call, origin });
         }
         self.exchange = Exchange::InFlight(InFlight {
             incarnation,
@@ -796,7 +798,7 @@ impl Dispatcher {
                     self.take_back(items);
                     return vec![evict::unregistration(eviction, by)];
                 }
-            } else {
+            } else if items.len() > 1 {
                 let calls = items.iter().map_while(|item| item.call.as_deref());
                 let calls: Vec<_> = calls.collect();
                 let judge = &self.judge;
@@ -869,10 +871,7 @@ impl Dispatcher {
             return;
         }
         let answers: Vec<_> = match items.len() {
-            1 => items
-                .into_iter()
-                .map(|item| (item, CallAnswer::Raw(raw.clone())))
-                .collect(),
+            1 => items.into_iter().zip([CallAnswer::Raw(raw)]).collect(),
             _ => items
                 .into_iter()
                 .zip(replies.into_iter().map(CallAnswer::Made))

@@ -108,7 +108,7 @@ impl Drain {
                 silent_since: self.link.upstream.silent_since(),
             };
             for action in self.dispatcher.on(&view, input) {
-                if matches!(action, Action::Write) {
+                if matches!(action, Action::Record { .. }) {
                     self.begin_request().await;
                 }
                 self.carry_out(action);
@@ -134,7 +134,11 @@ impl Drain {
                 request,
             } => self.exchange(incarnation, Some(request)),
             Action::Inspect { incarnation } => self.exchange(incarnation, None),
-            Action::Write => self.link.ledger.write(),
+            Action::Record { call, origin } => {
+                if self.link.ledger.record_ahead(&call, origin) {
+                    self.link.ledger.write();
+                }
+            }
             Action::Disconnect => (self.in_flight, self.connection) = (None, None),
             Action::Answer(answers) => self.answer(answers),
             Action::Report(report) => match report {
@@ -157,8 +161,8 @@ impl Drain {
         self.in_flight = Some(Box::pin(done.instrument(span)));
     }
 
-    /// Sends as much of the request in flight as can be sent without waiting. So the master works on it before the disk's
-    /// thread is woken.
+    /// Sends as much of the request in flight as can be sent without waiting. So the master works on it while the record
+    /// is made, and before the disk's thread is woken.
     async fn begin_request(&mut self) {
         let Some(in_flight) = self.in_flight.as_mut() else {
             return;

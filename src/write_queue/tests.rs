@@ -562,7 +562,9 @@ impl World {
                 }
                 Action::Inspect { incarnation } => self.send(incarnation, None),
                 // The simulated disk looks for records after each step.
-                Action::Write => {}
+                Action::Record { call, origin } => {
+                    self.ledger.record_ahead(&call, origin);
+                }
                 Action::Disconnect => self.in_flight = None,
                 Action::Answer(answers) => self.give(answers),
                 Action::Report(report) => {
