@@ -520,6 +520,8 @@ impl Calls {
             }
         };
         tokio::select! {
+            // On a busy computer both branches may be ready.
+            biased;
             answer = answered => answer.map_err(|_| Closed(UNANSWERED).into()),
             () = held => {
                 self.stats.calls_unanswered.count();

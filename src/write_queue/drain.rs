@@ -1,7 +1,7 @@
 //! Carries out what the [`Dispatcher`] decides: exchanges requests with the master, and gives callers their answers.
 
 use std::{
-    pin::Pin,
+    pin::{Pin, pin},
     sync::Arc,
     task::Poll,
     time::{Duration, Instant},
@@ -67,18 +67,20 @@ impl Drain {
         let mut order_changed = self.link.ledger.order_changed();
         let mut lease = self.link.ledger.lease.changed();
         let mut patience = self.signals.patience.subscribe();
+        let mut alarm = pin!(tokio::time::sleep(Duration::ZERO));
         loop {
-            let deadline = self.dispatcher.deadline();
+            // Each write has a deadline, and hardly any comes. An alarm that is too early costs less than two settings for
+            // each write.
+            if let Some(at) = self.dispatcher.deadline().map(Into::into)
+                && (alarm.is_elapsed() || at < alarm.deadline())
+            {
+                alarm.as_mut().reset(at);
+            }
             let mut changed = false;
             let input = tokio::select! {
-                item = self.items.recv() => match item {
-                    Some(item) => Input::Calls(self.with_others(item)),
-                    None => return,
-                },
-                () = self.gate.changed() => {
-                    changed = true;
-                    Input::Wake
-                }
+                // What has happened comes before the clock: on a busy computer, the master's answer and the end of its time
+                // may both be there.
+                biased;
                 done = wait::for_some(self.in_flight.as_mut()) => {
                     self.in_flight = None;
                     self.connection = done.connection;
@@ -91,12 +93,20 @@ impl Drain {
                         error.failure()
                     }))
                 }
+                () = wait::tick(&mut interval) => Input::Compare,
+                () = self.gate.changed() => {
+                    changed = true;
+                    Input::Wake
+                }
                 // The senders live as long as this task.
+                _ = patience.changed() => Input::Patience(patience.borrow_and_update().clone()),
+                item = self.items.recv() => match item {
+                    Some(item) => Input::Calls(self.with_others(item)),
+                    None => return,
+                },
                 _ = order_changed.changed() => Input::Wake,
                 _ = lease.changed() => Input::Wake,
-                _ = patience.changed() => Input::Patience(patience.borrow_and_update().clone()),
-                () = wait::tick(&mut interval) => Input::Compare,
-                () = wait::sleep_until(deadline.map(Into::into)) => Input::Wake,
+                () = alarm.as_mut(), if !alarm.is_elapsed() => Input::Wake,
             };
             // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = self.gate.observe_change();
