@@ -267,7 +267,8 @@ impl Ledger {
             }
         }
         inner.doubted |= recorded.doubtful;
-        if !entries.is_empty() {
+        let is_new = !entries.is_empty();
+        if is_new {
             // Otherwise the next process would let the master run pending writes after these calls.
             inner.note_acknowledged();
             has_record = true;
@@ -283,7 +284,10 @@ impl Ledger {
         if unrecorded || has_record {
             recorded.mark = inner.mark();
             drop(inner);
-            self.recorded();
+            // Before each answer, the disk syncs once. `record_ahead` has had it do so.
+            if is_new || unrecorded || self.sync != SyncPolicy::Always {
+                self.recorded();
+            }
         }
         Ok(recorded)
     }
