@@ -80,7 +80,7 @@ packaging/build-book.sh >/dev/null || [ $? = 3 ]
 mkdir -p "$share/doc"
 mv target/book-source "$doc"
 [ ! -d target/book ] || mv target/book "$doc/html"
-cp -r examples/systemd examples/grafana examples/prometheus "$doc/examples/"
+cp -r examples/systemd examples/grafana examples/prometheus packaging/keepalived "$doc/examples/"
 cp LICENSE "$doc/copyright"
 # What Debian asks for in place of CHANGELOG.md, which is there too.
 version=${version:-$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)-1}

@@ -10,7 +10,7 @@ for name in $computers; do
     own=${address[$name]}
     inside "$name" mount --bind "$ROSRESCUE" /run/rosrescue
     mkdir -p "$scratch/$name/etc/keepalived"
-    # Change what the document says to change, and the path of the program.
+    # Change what the document says to change.
     sed "s|^\( *\)10.0.0.1$|\1first|; s|^\( *\)$own$|\110.0.0.1|; s|first|10.0.0.1|
         s|unicast_src_ip .*|unicast_src_ip $own|; s|priority .*|priority $priority|; s|/usr/bin/|/run/|" \
         "$REPOSITORY/packaging/keepalived/keepalived.conf" >"$scratch/$name/etc/keepalived/keepalived.conf"

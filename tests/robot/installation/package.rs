@@ -146,6 +146,7 @@ fn the_package_has_the_documents_and_examples_and_no_link_leads_nowhere() {
         "examples/systemd/rosout.service",
         "examples/grafana/rosrescue.json",
         "examples/prometheus/alerts.yaml",
+        "examples/keepalived/keepalived.conf",
     ] {
         assert!(documents.join(file).exists(), "{file}");
     }
