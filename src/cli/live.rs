@@ -27,7 +27,7 @@ pub struct HandoverArgs {
     /// The running rosrescue, on any of the computers of the robot.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// Computer that should lead: its name, the beginning of its name, or its address [default: any follower]
+    /// Computer that should lead: its whole name, its host name, or its IPv4 address [default: any follower]
     #[arg(long, env = "ROSRESCUE_HANDOVER_TO", value_name = "NAME", value_parser = name)]
     pub to: Option<String>,
     /// Longest time to wait for the new leader, in seconds

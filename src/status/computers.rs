@@ -179,7 +179,8 @@ impl Computers {
             .filter(|_| self.leaderless_since.is_none())
     }
 
-    /// Finds the computer that `given` stands for: its whole name, the beginning of exactly one name, or its address.
+    /// Finds the computer that `given` stands for: its whole name, its address, or the part of its name
+    /// before a `-` or `.`. `None` if several computers match.
     pub(crate) fn find(&self, given: &str) -> Option<&str> {
         let names = || self.computers.iter().map(|of| of.name.as_str());
         if let Some(name) = names().find(|name| *name == given) {
