@@ -187,7 +187,7 @@ async fn next_leader(
         }
         if said.elapsed() >= SAY_EVERY {
             said = Instant::now();
-            let leads = now.leads().map_or("nobody", |leader| &*leader.name);
+            let leads = now.leads().map_or("no computer", |leader| &*leader.name);
             let seconds = start.elapsed().as_secs();
             note(&format!(
                 "{leads} leads after {seconds} s, waiting for another computer"

@@ -212,7 +212,7 @@ impl Callers {
             match notified.await {
                 Ok(_) => told.succeed(start.elapsed()),
                 Err(_) => told.fail(format!(
-                    "no paramUpdate in {} s: nobody reaches nodes at {}",
+                    "no paramUpdate in {} s: neither rosrescue nor the master reaches nodes at {}",
                     LIMIT.as_secs(),
                     self.node_api
                 )),

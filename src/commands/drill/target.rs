@@ -105,7 +105,7 @@ impl Target {
     fn worker(&self, status: &Status) -> Result<u32, CommandFailure> {
         if !status.guarded {
             return Err(CommandFailure::Usage(
-                "rosrescue runs without a guardian: nobody would start it again (--no-guardian?)"
+                "rosrescue runs without a guardian: nothing would restart it (--no-guardian?)"
                     .to_owned(),
             ));
         }

@@ -166,7 +166,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
         "{nobody:?}"
     );
     assert!(
-        nobody.stderr.contains("nobody leads after 1 s"),
+        nobody.stderr.contains("no computer leads after 1 s"),
         "{nobody:?}"
     );
     nobody.ended(1);
