@@ -1,9 +1,11 @@
 //! The files for Docker and Kubernetes. The test does not run them: it reads them as their tools would, and
 //! checks that everything they name exists.
 
-use std::process::Command;
+use std::{fs, process::Command};
 
 use serde_json::Value;
+
+use crate::support::Scratch;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 const READ: &str =
@@ -44,6 +46,25 @@ fn hosts(list: &str) -> Vec<&str> {
         rest.split(':').next().unwrap()
     });
     hosts.collect()
+}
+
+/// `setup.bash` of catkin would take `-h` for a call for help, and the container would end.
+#[test]
+fn the_image_gives_options_to_its_command_alone() {
+    let scratch = Scratch::new();
+    let setup = scratch.path("noetic/setup.bash");
+    fs::create_dir_all(setup.parent().unwrap()).unwrap();
+    fs::write(&setup, "given=\"$*\"\nexport given\n").unwrap();
+    let script = fs::read_to_string(format!("{ROOT}/packaging/docker/in_ros")).unwrap();
+    let folder = scratch.path("");
+    let script = script.replace("/opt/ros/", folder.to_str().unwrap());
+    let output = Command::new("bash")
+        .args(["-c", &script, "in_ros", "sh", "-c"])
+        .args(["echo \"$given\" for setup.bash, $1", "sh", "-h"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(said, "-- for setup.bash, -h\n", "{output:?}");
 }
 
 #[test]
