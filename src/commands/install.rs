@@ -18,11 +18,11 @@ use std::{
 };
 
 use self::{
-    caller::{account, caller_environment, named_user},
+    caller::{account, caller_environment, home, named_user},
     service::{Service, read_service},
     system_changes::{Change, SystemChanges, carry_out},
     unit_paths::{UNITS, UnitPaths},
-    units::{MARK, UnitSettings},
+    units::{InstalledService, MARK, UnitSettings},
 };
 use super::{
     CommandFailure, Exit,
@@ -180,16 +180,21 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
     let is_enabled = UNITS
         .iter()
         .all(|unit| paths.systemctl_confirms("is-enabled", unit));
+    let [old_service, new_service] =
+        [&old, &new].map(|dropin| InstalledService::read(paths.user, dropin));
+    let [from, to] = [&old_service, &new_service].map(|it| checkpoint(it, &caller));
+    if (is_running || !old.is_empty())
+        && service.runs_rosmaster
+        && let (Some(from), Some(to)) = (&from, &to)
+        && from != to
+        && from.try_exists().unwrap_or(true)
+    {
+        plan.notes.push(move_note(from, to, run_as.as_deref()));
+    }
     if is_changed && is_running {
-        // The settings that say what runs, and as which user.
-        let key = |text: &str| {
-            let keys = ["User=", "ExecStart=/"];
-            let lines = text.lines();
-            let lines = lines.filter(|line| keys.iter().any(|key| line.starts_with(key)));
-            let words = lines.map(|line| line.split(' ').take(2).collect::<String>());
-            words.collect::<Vec<_>>()
-        };
-        plan.renew(paths, is_socket_new || key(&old) != key(&new));
+        // With another checkpoint, the next rosrescue would not find the running master.
+        let adopts = old_service.runs_like(&new_service) && from == to;
+        plan.renew(paths, is_socket_new || !adopts);
     } else if !is_enabled || (!is_running && paths.systemd_runs()) {
         plan.start(paths, &service, !disabled.is_empty());
     }
@@ -295,6 +300,30 @@ impl SystemChanges {
             self.run(paths.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }
+}
+
+/// The checkpoint of `service`. `None` if this program does not understand its command.
+fn checkpoint(service: &InstalledService, caller: &BTreeMap<String, String>) -> Option<PathBuf> {
+    let (_, command) = service.command.split_first()?;
+    let mut settings = service.settings.clone();
+    let home = home(service.run_as.as_deref(), caller);
+    settings.extend(home.map(|home| ("HOME".to_owned(), home)));
+    let service = read_service(command, &settings).ok()?;
+    Some(service.checkpoint)
+}
+
+/// Says that the checkpoint moves, and how to take the state along. The previous generation is a part of it: one that
+/// an earlier service left at the new place would be read too.
+fn move_note(from: &Path, to: &Path, run_as: Option<&str>) -> String {
+    let copy = match run_as {
+        Some(user) => format!("sudo install -m 600 -o {user}"),
+        None => "cp".to_owned(),
+    };
+    let (from, to) = (from.display(), to.display());
+    format!(
+        "the checkpoint moves from {from} to {to}. To keep the robot's state, copy it first: \
+         `{copy} {from} {to}; {copy} {from}.previous {to}.previous`"
+    )
 }
 
 /// Why root's service must not run the program at this path: its owner could replace it.

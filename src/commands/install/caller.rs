@@ -39,6 +39,18 @@ pub(super) fn named_user(args: &InstallArgs, caller: &BTreeMap<String, String>) 
     args.run_as.clone().or_else(of_caller)
 }
 
+/// The home folder of `user`, or of the caller.
+pub(super) fn home(user: Option<&str>, caller: &BTreeMap<String, String>) -> Option<String> {
+    let Some(user) = user else {
+        return caller.get("HOME").cloned();
+    };
+    let getent = system::Command::new("getent")
+        .args(["passwd", user])
+        .output();
+    let entry = String::from_utf8(getent.ok()?.stdout).ok()?;
+    entry.split(':').nth(5).map(str::to_owned)
+}
+
 /// The name of the user who runs this process.
 fn own_name() -> Result<String, CommandFailure> {
     let output = system::Command::new("id").arg("-un").output();

@@ -1,6 +1,6 @@
 //! The command that the service runs.
 
-use std::{collections::BTreeMap, ffi::OsString, net::SocketAddr};
+use std::{collections::BTreeMap, ffi::OsString, net::SocketAddr, path::PathBuf};
 
 use clap::{CommandFactory, FromArgMatches};
 
@@ -17,6 +17,8 @@ pub(super) struct Service {
     pub(super) listen: Vec<SocketAddr>,
     /// The address where nodes find the service.
     pub(super) advertised: MasterUri,
+    /// By default it is in the home folder, which is `HOME` in the settings.
+    pub(super) checkpoint: PathBuf,
     /// Whether the command is `core`, which starts the master itself.
     pub(super) runs_rosmaster: bool,
     /// Whether the service must find rosmaster on the PATH.
@@ -81,6 +83,7 @@ pub(super) fn read_service(
     Ok(Service {
         listen: config.listen,
         advertised: config.advertised,
+        checkpoint: config.checkpoint,
         runs_rosmaster: rosmaster.is_some(),
         searches_rosmaster: rosmaster.is_some_and(Option::is_none),
     })

@@ -97,6 +97,47 @@ impl UnitSettings<'_> {
     }
 }
 
+/// A service as its unit and its drop-in describe it.
+#[derive(Debug, Default)]
+pub(super) struct InstalledService {
+    pub(super) run_as: Option<String>,
+    /// Environment variables.
+    pub(super) settings: BTreeMap<String, String>,
+    /// The program and its arguments.
+    pub(super) command: Vec<String>,
+}
+
+impl InstalledService {
+    /// Reads the unit and `dropin`, which may be empty.
+    pub(super) fn read(user: bool, dropin: &str) -> Self {
+        let [unit, _] = units(user);
+        let mut service = Self::default();
+        for line in unit.lines().chain(dropin.lines()) {
+            match line.split_once('=') {
+                Some(("User", name)) => service.run_as = Some(name.to_owned()),
+                Some(("Environment", "")) => service.settings.clear(),
+                Some(("Environment", pairs)) => {
+                    let pairs = words(pairs, false).into_iter();
+                    let pairs = pairs.filter_map(|pair| {
+                        let (name, value) = pair.split_once('=')?;
+                        Some((name.to_owned(), value.to_owned()))
+                    });
+                    service.settings.extend(pairs);
+                }
+                Some(("ExecStart", command)) => service.command = words(command, true),
+                _ => {}
+            }
+        }
+        service
+    }
+
+    /// Whether both run the same command of the same program, perhaps with other options, as the same user.
+    pub(super) fn runs_like(&self, other: &Self) -> bool {
+        let [own, others] = [self, other].map(|it| it.command.iter().take(2));
+        self.run_as == other.run_as && own.eq(others)
+    }
+}
+
 /// The units that were disabled when this drop-in was written.
 pub(super) fn disabled(dropin: &str) -> Vec<String> {
     let units = dropin
@@ -122,6 +163,23 @@ fn quoted(word: &str, command: bool) -> String {
     }
     text.push('"');
     text
+}
+
+/// The words of a line in which each is [`quoted`].
+fn words(line: &str, command: bool) -> Vec<String> {
+    let (mut words, mut word) = (Vec::new(), String::new());
+    let (mut letters, mut is_inside) = (line.chars(), false);
+    while let Some(letter) = letters.next() {
+        match letter {
+            '"' => is_inside = !is_inside,
+            ' ' if !is_inside => words.push(std::mem::take(&mut word)),
+            '\\' | '%' => word.extend(letters.next()),
+            '$' if command => word.extend(letters.next()),
+            _ => word.push(letter),
+        }
+    }
+    words.push(word);
+    words
 }
 
 #[cfg(test)]
@@ -159,6 +217,21 @@ mod tests {
         }
         assert!(!service.contains("ROS_HOME"), "{service}");
         assert_eq!(disabled(&service), ["roscore.service"]);
+        let read = InstalledService::read(false, &service);
+        assert_eq!(read.run_as.as_deref(), Some("robot"));
+        assert_eq!(read.settings["ROS_IP"], "10.0.0.7");
+        assert!(!read.settings.contains_key("ROS_HOME"), "{read:?}");
+        assert_eq!(
+            read.command,
+            words(&[
+                "/usr/local/bin/rosrescue",
+                "core",
+                "--checkpoint",
+                "/a b/100%$"
+            ])
+        );
+        let packaged = InstalledService::read(false, "");
+        assert_eq!(packaged.settings["ROS_HOME"], "/var/lib/rosrescue");
         assert!(
             robot
                 .socket()

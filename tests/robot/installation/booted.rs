@@ -311,6 +311,22 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     assert!(robot.property("ExecStart").contains("core -t 6"));
     robot.assert_kept("with other options");
 
+    // With another checkpoint, no master is left behind. The state comes along if it is copied as the plan says.
+    robot.run("install -d -o robot /home/robot/logs");
+    let install = format!(
+        "SUDO_USER=robot ROS_HOSTNAME=localhost ROS_LOG_DIR=/home/robot/logs {PROGRAM} install"
+    );
+    let plan = robot.run(&format!("{install} --dry-run"));
+    let (_, copy) = plan.split_once("copy it first: `").expect(&plan);
+    let copy = copy.split('`').next().unwrap().replace("sudo ", "");
+    let worker = robot.property("MainPID");
+    robot.run(&format!("{copy}; {install} --yes"));
+    robot.wait_another_worker(&worker);
+    robot.wait_protected();
+    robot.run("test -s /home/robot/logs/latest-chkpt.yaml");
+    robot.assert_kept("with another checkpoint");
+    assert_eq!(robot.run("pgrep -cx rosmaster"), "1\n");
+
     robot.run("rm /etc/systemd/system/rosrescue.service.d/test.conf");
     robot.run(&format!("{PROGRAM} uninstall --yes"));
     assert_eq!(robot.files(), before);

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::os::unix::fs::symlink;
+use std::path::Path;
 use std::process::{Command, Output};
 
 use crate::support::Scratch;
@@ -202,6 +203,64 @@ fn install_is_idempotent_and_leaves_files_of_others_alone() {
     assert!(service.exists() && !units.join("rosrescue.service.d").exists());
     let nothing = said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 0);
     assert!(nothing.contains("has installed nothing here"), "{nothing}");
+}
+
+/// Runs `rosrescue install --user ARGUMENTS` beside a running service. Its systemd is a script that confirms all
+/// questions. Needs root.
+fn install_again(scratch: &Scratch, arguments: &[&str]) -> Output {
+    let systemctl = scratch.path("bin/systemctl");
+    fs::create_dir_all(systemctl.parent().unwrap()).unwrap();
+    fs::write(&systemctl, "#!/bin/sh\n").unwrap();
+    let all = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    fs::set_permissions(&systemctl, all).unwrap();
+    let run = "mount -t tmpfs tmpfs /run
+        mkdir -p /run/systemd/system /run/user/systemd/private
+        exec \"$0\" \"$@\"";
+    let mut command = Command::new("unshare");
+    scratch.prepare(&mut command);
+    command
+        .args(["--mount", "sh", "-ec", run, PROGRAM, "install", "--user"])
+        .args(arguments)
+        .env("HOME", scratch.path(""))
+        .env("XDG_RUNTIME_DIR", "/run/user")
+        .env_remove("XDG_CONFIG_HOME")
+        .env_remove("SUDO_USER")
+        .env_remove("ROS_HOME")
+        .env_remove("ROS_LOG_DIR");
+    let path = std::env::var("PATH").unwrap();
+    let folder = scratch.path("bin");
+    command.env("PATH", format!("{}:{path}", folder.display()));
+    command.output().unwrap()
+}
+
+/// A rosrescue with another checkpoint would not find the rosmaster of a killed one.
+#[test]
+fn if_the_checkpoint_moves_the_service_is_stopped_cleanly_and_the_plan_says_so() {
+    let scratch = Scratch::new();
+    let install = |arguments: &[&str]| said(&install_again(&scratch, arguments), 0);
+    install(&["--yes"]);
+    let old = scratch.path(".ros/log/latest-chkpt.yaml");
+    fs::create_dir_all(old.parent().unwrap()).unwrap();
+    fs::write(&old, "").unwrap();
+    let [kill, stop] = ["--signal=KILL", "stop rosrescue.socket"];
+    let [old, new] = [&*old, Path::new("/data/100%.yaml")].map(Path::display);
+    let note = format!(
+        "note    the checkpoint moves from {old} to {new}. To keep the robot's state, copy it first: `cp {old} {new}; \
+         cp {old}.previous {new}.previous`\n"
+    );
+    let options = ["--dry-run", "--", "core", "-t", "6"];
+    let same = install(&options);
+    assert!(same.contains(kill) && !same.contains(stop), "{same}");
+    assert!(!same.contains("note    the checkpoint"), "{same}");
+    let moved = ["--checkpoint", "/data/100%.yaml"];
+    let moved = [&options[..], &moved].concat();
+    let plan = install(&moved);
+    assert!(plan.contains(stop) && !plan.contains(kill), "{plan}");
+    assert!(plan.contains(&note), "{plan}");
+    // The place of the installed service is read from its drop-in.
+    install(&[&["--yes"], &moved[1..]].concat());
+    let again = install(&[&moved[..], &["-w", "4"]].concat());
+    assert!(again.contains(kill) && !again.contains(stop), "{again}");
 }
 
 #[test]
