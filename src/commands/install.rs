@@ -143,6 +143,7 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         false => units::units(paths.user).map(Some),
     };
     let (new, new_socket) = (robot.service(), robot.socket());
+    let own_ports = units::ports(socket_dropin.as_deref());
     let is_socket_new = socket_dropin.as_ref() != Some(&new_socket);
     let wanted = [
         new_unit,
@@ -195,6 +196,14 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         // With another checkpoint, the next rosrescue would not find the running master.
         let adopts = old_service.runs_like(&new_service) && from == to;
         plan.renew(paths, is_socket_new || !adopts);
+        // The running service has its own ports until it is stopped.
+        if disabled.is_empty()
+            && let Some(port) = port_in_use(&service.listen, &own_ports)
+        {
+            plan.obstacles.push(format!(
+                "port {port} is in use: stop the program there or choose another port, then run this again"
+            ));
+        }
     } else if !is_enabled || (!is_running && paths.systemd_runs()) {
         plan.start(paths, &service, !disabled.is_empty());
     }
@@ -279,11 +288,10 @@ impl SystemChanges {
             options.push("--no-block");
         }
         self.run(paths.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
-        let in_use = |address: &SocketAddr| {
-            TcpListener::bind(address).is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
-        };
-        if paths.systemd_runs() && !port_will_be_free && service.listen.iter().any(in_use) {
-            let port = service.listen.first().map_or(0, SocketAddr::port);
+        if paths.systemd_runs()
+            && !port_will_be_free
+            && let Some(port) = port_in_use(&service.listen, &[])
+        {
             self.obstacles.push(format!(
                 "port {port} is in use: stop the robot and its roscore, then run this again"
             ));
@@ -300,6 +308,15 @@ impl SystemChanges {
             self.run(paths.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
         }
     }
+}
+
+/// The port of `addresses` that a program uses, unless it is one of `own`.
+fn port_in_use(addresses: &[SocketAddr], own: &[u16]) -> Option<u16> {
+    let in_use = |address: &&SocketAddr| {
+        TcpListener::bind(address).is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
+    };
+    let mut others = addresses.iter().filter(|at| !own.contains(&at.port()));
+    others.find(in_use).map(SocketAddr::port)
 }
 
 /// The checkpoint of `service`. `None` if this program does not understand its command.

@@ -138,6 +138,14 @@ impl InstalledService {
     }
 }
 
+/// The ports of the socket unit with this drop-in.
+pub(super) fn ports(dropin: Option<&str>) -> Vec<u16> {
+    let lines = dropin.unwrap_or(SOCKET).lines();
+    let addresses = lines.filter_map(|line| line.strip_prefix("ListenStream="));
+    let ports = addresses.map(|address| address.rsplit(':').next().unwrap_or_default().parse());
+    ports.filter_map(Result::ok).collect()
+}
+
 /// The units that were disabled when this drop-in was written.
 pub(super) fn disabled(dropin: &str) -> Vec<String> {
     let units = dropin
@@ -237,12 +245,15 @@ mod tests {
                 .socket()
                 .ends_with("\nListenStream=\nListenStream=11411\n")
         );
+        assert_eq!(ports(Some(&robot.socket())), [11411]);
+        assert_eq!(ports(None), [11311]);
         let robot = UnitSettings {
             listen: &["127.0.0.1:1", "[::1]:1"].map(|address| address.parse().unwrap()),
             ..robot
         };
         let socket = robot.socket();
         assert!(socket.ends_with("\nListenStream=127.0.0.1:1\nListenStream=[::1]:1\n"));
+        assert_eq!(ports(Some(&socket)), [1, 1]);
     }
 
     #[test]

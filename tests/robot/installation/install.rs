@@ -1,6 +1,7 @@
 //! The output and the refusals of `rosrescue install`, without a systemd: nothing is started here.
 
 use std::fs;
+use std::net::TcpListener;
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -261,6 +262,29 @@ fn if_the_checkpoint_moves_the_service_is_stopped_cleanly_and_the_plan_says_so()
     install(&[&["--yes"], &moved[1..]].concat());
     let again = install(&[&moved[..], &["-w", "4"]].concat());
     assert!(again.contains(kill) && !again.contains(stop), "{again}");
+}
+
+/// The running service is stopped before it gets another port.
+#[test]
+fn a_port_in_use_is_refused_while_the_service_runs() {
+    let scratch = Scratch::new();
+    said(&install_again(&scratch, &["--yes"]), 0);
+    let other = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = other.local_addr().unwrap().port();
+    let moved = ["--yes", "--", "core", "-p", &port.to_string()];
+    let refused = said(&install_again(&scratch, &moved), 1);
+    let obstacle = format!("cannot  port {port} is in use");
+    assert!(refused.contains(&obstacle), "{refused}");
+    drop(other);
+    said(&install_again(&scratch, &moved), 0);
+    // The service itself is no obstacle, neither at its old addresses nor at others.
+    let _service = TcpListener::bind(("127.0.0.1", port)).unwrap();
+    for options in [["-t", "6"], ["--listen", "0.0.0.0"]] {
+        said(
+            &install_again(&scratch, &[&moved[..], &options].concat()),
+            0,
+        );
+    }
 }
 
 #[test]
