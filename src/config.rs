@@ -94,6 +94,8 @@ pub struct Config {
     pub sync_interval: Duration,
     /// How long a call waits if only a master can answer it.
     pub hold: Duration,
+    /// How long a write waits for the master before the mirror answers it.
+    pub stand_in_after: Duration,
     /// When a master counts as hung.
     pub probing: Probing,
     /// How long the master may take to answer a probe.
@@ -310,10 +312,10 @@ impl Config {
             sync: args.sync,
             sync_interval: Duration::from_millis(args.sync_interval),
             hold: seconds("--hold", args.hold, 3600.0)?,
+            stand_in_after: Duration::from_millis(args.stand_in_after),
             probing: Probing {
                 interval: Duration::from_millis(args.probe_interval),
                 count: args.probe_count,
-                patience: Duration::from_millis(args.stand_in_after),
                 // `proxy` starts no master, so no start can take too long.
                 start_limit: Duration::MAX,
             },

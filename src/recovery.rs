@@ -297,7 +297,6 @@ impl Driver {
                 AWAY,
                 "the master died before calls could pass to it; the next master gets the state"
             ),
-            Step::SetPatience(patience) => self.write_queue.set_patience(patience),
             Step::Act(action) => return self.act(action).await,
         }
         None

@@ -100,8 +100,8 @@ impl WriteQueue {
         self.signals.batch_lost.notified().await;
     }
 
-    /// Waits until the master has left a write unanswered for the [patience](Self::set_patience), and the mirror can
-    /// answer all calls that the master has not answered.
+    /// Waits until the master has left a write unanswered for as long as [`Patience`] says, and the mirror can answer
+    /// all calls that the master has not answered.
     pub(crate) async fn late(&self) {
         self.signals.is_late.notified().await;
     }
@@ -120,18 +120,11 @@ impl WriteQueue {
     pub(crate) async fn slow(&self) {
         self.signals.slow.notified().await;
     }
-
-    /// Sets how long writes wait for the master.
-    pub(crate) fn set_patience(&self, patience: Patience) {
-        self.signals.patience.send_replace(patience);
-    }
 }
 
 /// Signals between the worker and the recovery.
 #[derive(Debug)]
 struct Signals {
-    /// How long writes wait for the master.
-    patience: watch::Sender<Patience>,
     batch_lost: Notify,
     is_late: Notify,
     has_answered: Notify,
@@ -152,7 +145,6 @@ pub(crate) fn write_queue(
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
     let signals = Arc::new(Signals {
-        patience: watch::Sender::new(patience.clone()),
         batch_lost: Notify::new(),
         is_late: Notify::new(),
         has_answered: Notify::new(),

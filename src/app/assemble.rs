@@ -91,7 +91,7 @@ pub(super) async fn assemble(
         config.resync_interval,
         local.clone(),
         config.writes,
-        Patience::new(config.probing.patience),
+        Patience::new(config.stand_in_after),
     );
     let served = Served::default();
     let nodes = Arc::new(Nodes::new(

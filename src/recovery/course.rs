@@ -6,7 +6,7 @@
 use std::time::{Duration, Instant};
 
 use rescue_core::lifecycle::{
-    Action, Cause, Input, Lifecycle, Patience, Probing, Supervision, evidence::Sample,
+    Action, Cause, Input, Lifecycle, Probing, Supervision, evidence::Sample,
 };
 
 use crate::{
@@ -45,8 +45,6 @@ pub(crate) enum Step {
     NotifyAll,
     /// Report that a master died after the gate was shut for its injection, and before it opened.
     ReportDeathWhileInjected,
-    /// Tell the write queue how long writes wait for the master.
-    SetPatience(Patience),
     /// Carry out this action of the lifecycle. [`Action::StandIn`] and [`Action::OpenGate`] set the gate, too.
     Act(Action),
 }
@@ -117,9 +115,6 @@ impl Course {
             if self.news == News::Owed {
                 steps.add(Step::ExpectEarlier(now + BACKLOG));
             }
-        }
-        if input == Input::LateAnswered {
-            steps.add(Step::SetPatience(self.lifecycle.patience().clone()));
         }
         for action in actions {
             match action {

@@ -303,7 +303,6 @@ mod tests {
             probing: Probing {
                 interval: timeout,
                 count: 1,
-                patience: timeout,
                 start_limit: timeout,
             },
             probe_timeout: timeout,

@@ -75,8 +75,6 @@ pub(super) enum Input {
     Ended(Result<Received, Failure>),
     /// It is time to compare the master with the mirror.
     Compare,
-    /// How long writes wait for the master has changed.
-    Patience(Patience),
     /// Time has passed, the gate or the lease has changed, or calls that waited may go on.
     Wake,
 }
@@ -262,7 +260,6 @@ impl Dispatcher {
                     self.inspections.request();
                 }
             }
-            Input::Patience(patience) => self.patience = patience,
             Input::Wake => {}
         }
         if view.gate
@@ -686,6 +683,7 @@ impl Dispatcher {
         self.exchange = Exchange::LateEnded;
         self.actions.push(Action::Report(match answered {
             true => {
+                self.patience.was_late(now);
                 self.ledger.late_answered(now);
                 Report::LateAnswered
             }
@@ -1094,3 +1092,6 @@ fn registers(call: &Request) -> bool {
 fn subscribes_params(call: &Request) -> bool {
     Write::all(call).any(|write| matches!(write.effect, Effect::SubscribeParam { .. }))
 }
+
+#[cfg(test)]
+mod tests;

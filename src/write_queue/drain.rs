@@ -66,7 +66,6 @@ impl Drain {
         let mut interval = self.resync_interval.map(tokio::time::interval);
         let mut order_changed = self.link.ledger.order_changed();
         let mut lease = self.link.ledger.lease.changed();
-        let mut patience = self.signals.patience.subscribe();
         let mut alarm = pin!(tokio::time::sleep(Duration::ZERO));
         loop {
             // Each write has a deadline, and hardly any comes. An alarm that is too early costs less than two settings for
@@ -99,7 +98,6 @@ impl Drain {
                     Input::Wake
                 }
                 // The senders live as long as this task.
-                _ = patience.changed() => Input::Patience(patience.borrow_and_update().clone()),
                 item = self.items.recv() => match item {
                     Some(item) => Input::Calls(self.with_others(item)),
                     None => return,

@@ -1099,7 +1099,7 @@ fn each_rule_is_needed() {
 }
 
 /// The master's answer, as it comes.
-fn raw(reply: &Reply) -> RawReply {
+pub(super) fn raw(reply: &Reply) -> RawReply {
     RawReply {
         keeps_alive: true,
         status: StatusCode::OK,

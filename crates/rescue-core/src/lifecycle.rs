@@ -126,7 +126,6 @@ pub struct Lifecycle {
     crash_loop: bool,
     their_death: TheirDeath,
     missed: u32,
-    patience: Patience,
     /// The samples of a child that does not answer.
     evidence: Evidence,
     /// Number of consecutive failed spawns.
@@ -149,7 +148,6 @@ impl Lifecycle {
             crash_loop: false,
             their_death: TheirDeath::No,
             missed: 0,
-            patience: Patience::new(probing.patience),
             evidence: Evidence::default(),
             failed_spawns: 0,
             taken_ports: TakenPorts::default(),
@@ -187,11 +185,6 @@ impl Lifecycle {
         self.state_from == StateFrom::Master
     }
 
-    /// How long a write waits for the master before the mirror answers it.
-    pub fn patience(&self) -> &Patience {
-        &self.patience
-    }
-
     /// Whether the decision about `input` needs a [`Sample`] of the child.
     pub fn needs_sample(&self, now: Instant, input: Input) -> bool {
         let sampled = self.evidence.last_at();
@@ -224,7 +217,6 @@ impl Lifecycle {
     /// let probing = Probing {
     ///     interval: Duration::from_secs(1),
     ///     count: 3,
-    ///     patience: Duration::from_millis(100),
     ///     start_limit: Duration::from_secs(30),
     /// };
     /// let mut lifecycle = Lifecycle::new(Supervision::Theirs, probing);
@@ -391,7 +383,6 @@ impl Lifecycle {
             }
             (Lateness::Late, Input::LateAnswered) => {
                 *lateness = Lateness::CatchingUp;
-                self.patience.was_late(now);
                 self.timer = None;
                 vec![Action::CatchUp]
             }

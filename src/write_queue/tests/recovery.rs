@@ -34,7 +34,6 @@ const SETTLE_PAUSE: u64 = 5_000;
 const PROBING: Probing = Probing {
     interval: Duration::from_secs(1),
     count: 3,
-    patience: Duration::from_micros(PATIENCE),
     start_limit: Duration::from_secs(10),
 };
 
@@ -256,9 +255,6 @@ impl World {
                 Step::ExpectEarlier(until) => self.ledger.expect_earlier(until),
                 Step::NotifyAll => self.notify_all(),
                 Step::ReportDeathWhileInjected => self.injection_breaks(),
-                Step::SetPatience(patience) => {
-                    self.dispatch(super::Input::Patience(patience));
-                }
                 Step::Act(action) => self.carry_out(action),
             }
         }

@@ -6,7 +6,6 @@ use super::*;
 const PROBING: Probing = Probing {
     interval: Duration::from_secs(1),
     count: 3,
-    patience: Duration::from_millis(100),
     start_limit: START_LIMIT,
 };
 const START_LIMIT: Duration = Duration::from_secs(30);

@@ -18,8 +18,6 @@ pub struct Probing {
     pub interval: Duration,
     /// Number of unanswered probes in a row after which the master counts as hung.
     pub count: u32,
-    /// How long a write waits for the master before the mirror answers it.
-    pub patience: Duration,
     /// How long a new master may take until it listens. Later it is killed if it hangs.
     pub start_limit: Duration,
 }
@@ -54,8 +52,7 @@ pub enum Input {
     BatchLost,
     /// The master takes too long to answer a call.
     Slow,
-    /// A write has waited for [`Lifecycle::patience`](super::Lifecycle::patience), and the mirror
-    /// can answer it.
+    /// A write has waited for as long as [`Patience`](super::Patience) says, and the mirror can answer it.
     Late,
     /// The master has answered the calls that were outstanding when it was [late](Self::Late).
     LateAnswered,

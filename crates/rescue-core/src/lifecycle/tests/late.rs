@@ -138,22 +138,6 @@ fn a_master_that_ends_while_it_is_late_is_replaced() {
 }
 
 #[test]
-fn the_patience_grows_with_false_alarms() {
-    let mut script = Script::serving(Supervision::Theirs);
-    for _ in 0..8 {
-        script.now += Duration::from_millis(200);
-        script.machine.on(script.now, Input::Late);
-        script.now += Duration::from_millis(200);
-        script
-            .feed(Input::LateAnswered, &[Action::CatchUp])
-            .feed(Input::CaughtUp, &[Action::OpenGate]);
-    }
-    let mut patience = script.machine.patience().clone();
-    assert_eq!(patience.limit_at(script.now), PROBING.patience * 8);
-    assert_eq!(patience.limit_at(script.now + CALM * 7), PROBING.patience);
-}
-
-#[test]
 fn a_starved_or_busy_master_is_left_alone_until_it_answers() {
     for (does, spare) in [(Does::Starve, STARVED), (Does::Work, BUSY)] {
         let mut script = Script::serving(Supervision::Ours);
