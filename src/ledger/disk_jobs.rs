@@ -3,6 +3,7 @@
 
 use std::{
     collections::VecDeque,
+    panic::{AssertUnwindSafe, catch_unwind},
     path::PathBuf,
     sync::{
         Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError,
@@ -24,6 +25,9 @@ pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Why nothing is recorded after [`DISK_PATIENCE`].
 pub(crate) const SILENT: &str = "the disk has not answered for 5 s";
+
+/// Why nothing is recorded after a job has panicked.
+const PANICKED: &str = "a bug in rosrescue: a job on the checkpoint panicked; please report it";
 
 /// Maximum number of jobs that wait for the disk: about one for each client that waits for an answer.
 const JOBS_MAX: usize = 2048;
@@ -99,7 +103,8 @@ impl StoreQueue {
         }
     }
 
-    /// Runs all jobs, unless another thread is doing so. Takes as long as the disk does.
+    /// Runs all jobs, unless another thread is doing so. Takes as long as the disk does. If a job panics, nothing is
+    /// recorded until the next complete checkpoint: the file may end in the middle of a record.
     pub(super) fn work(&self) {
         loop {
             let mut store = match self.store.try_lock() {
@@ -108,7 +113,10 @@ impl StoreQueue {
                 Err(TryLockError::WouldBlock) => return,
             };
             while let Some(job) = self.next() {
-                job(&mut store);
+                if catch_unwind(AssertUnwindSafe(|| job(&mut store))).is_err() {
+                    store.give_up(PANICKED);
+                    self.note_state(&mut store);
+                }
             }
             drop(store);
             // Another thread may have queued a job while this one held the lock. This thread runs that job, too.

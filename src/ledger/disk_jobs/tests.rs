@@ -1,4 +1,4 @@
-use std::{cell::RefCell, ops::Range, sync::mpsc};
+use std::{cell::RefCell, ops::Range, panic::resume_unwind, sync::mpsc};
 
 use checkpoint_store::StoreError;
 use ros1_master::{
@@ -225,4 +225,46 @@ fn the_disks_thread_runs_jobs_as_they_come_and_ends_with_the_journal() {
     }
     drop(journal);
     ends.recv().unwrap_err();
+}
+
+/// Queues a job that panics, without a message on standard error.
+fn panic(journal: &Journal) -> oneshot::Receiver<()> {
+    journal.run(|_| resume_unwind(Box::new("a bug"))).unwrap()
+}
+
+/// The job may have written half a record, after which no other one could be read.
+#[test]
+fn after_a_panic_records_are_in_the_next_complete_checkpoint() {
+    for sync in [SyncPolicy::Interval, SyncPolicy::Always] {
+        let disk = Disk::new();
+        let mut journal = disk.journal(sync);
+        let mut panicked = panic(&journal);
+        append(&mut journal, 0);
+        journal.worker().work();
+        panicked.try_recv().unwrap_err();
+        // No answer waits, and the status says why nothing is recorded.
+        assert_eq!(disk.reached(), seq(0));
+        assert!(unprotected(&journal).unwrap().contains(PANICKED));
+        rewrite(&mut journal, 0..1);
+        assert_eq!(unprotected(&journal), None);
+        append(&mut journal, 1);
+        journal.worker().work();
+        let state = whole(0..2).snapshot;
+        assert_eq!(disk.found(journal), state);
+    }
+}
+
+#[test]
+fn the_disks_thread_runs_jobs_after_one_that_panicked() {
+    let disk = Disk::new();
+    let journal = disk.journal(SyncPolicy::Interval);
+    for _ in 0..3 {
+        let panicked = panic(&journal);
+        journal.worker().wake();
+        panicked.blocking_recv().unwrap_err();
+        let (ran, runs) = mpsc::sync_channel(1);
+        journal.run(move |_| ran.send(()).unwrap());
+        journal.worker().wake();
+        runs.recv_timeout(Duration::from_secs(60)).unwrap();
+    }
 }
