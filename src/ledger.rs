@@ -163,19 +163,19 @@ impl Ledger {
 
     /// Sets the answers to `getPid` and `getUri`.
     pub fn set_identity(&self, pid: i32, uri: String) {
-        self.lock().set_identity((pid, uri));
+        self.lock().mirror.set_identity(pid, uri);
     }
 
     /// The answer to `getUri`: rosrescue's own address.
     pub fn uri(&self) -> String {
-        self.lock().identity.1.clone()
+        self.lock().mirror.uri().to_owned()
     }
 
     /// Sets the answer to `getPid`.
     pub fn set_master_pid(&self, pid: i32) {
-        let mut inner = self.lock();
-        let (_, uri) = inner.identity.clone();
-        inner.set_identity((pid, uri));
+        let mirror = &mut self.lock().mirror;
+        let uri = mirror.uri().to_owned();
+        mirror.set_identity(pid, uri);
     }
 
     pub fn session(&self) -> Session {

@@ -33,8 +33,6 @@ use crate::{
 /// The mirror, the journal, and what keeps them consistent.
 pub(super) struct Inner {
     pub(super) mirror: Master,
-    /// The answers to `getPid` and `getUri`, which are not part of the state.
-    pub(super) identity: (i32, String),
     pub(super) session: Session,
     /// `None` if no checkpoint could be opened. Then the state is unprotected.
     pub(super) journal: Option<Journal>,
@@ -98,7 +96,6 @@ impl Inner {
         let seq = pending.last().max(session.last_seq());
         let mut inner = Self {
             mirror,
-            identity: (-1, String::new()),
             session,
             journal: None,
             seq,
@@ -187,11 +184,6 @@ impl Inner {
         self.outstanding = Outstanding::Awaited;
     }
 
-    pub(super) fn set_identity(&mut self, identity: (i32, String)) {
-        self.mirror.set_identity(identity.0, identity.1.clone());
-        self.identity = identity;
-    }
-
     pub(super) fn adopt(&mut self, state: Master) -> Vec<String> {
         let mut difference = Vec::new();
         let differs = self.mirror != state;
@@ -202,13 +194,13 @@ impl Inner {
         let (python, old) = (self.mirror.python(), self.mirror.is_old());
         // An equal `state` replaces the mirror too, because the new one may be known more exactly.
         let before = std::mem::replace(&mut self.mirror, state);
+        self.mirror.keep_identity(&before);
         self.mirror.keep_origins(&before);
         self.mirror.set_python(python);
         self.mirror.set_old(old);
         if differs {
             self.changed_unrecorded();
         }
-        self.set_identity(self.identity.clone());
         difference
     }
 

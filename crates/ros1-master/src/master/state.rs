@@ -132,6 +132,11 @@ impl Master {
         self.uri = uri;
     }
 
+    /// The answer to `getUri`.
+    pub fn uri(&self) -> &str {
+        &self.uri
+    }
+
     /// Whether answers to reads may differ from rosmaster's. Ignored when two masters are compared.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()
@@ -210,6 +215,11 @@ impl Master {
                 node.from = from;
             }
         }
+    }
+
+    /// Takes from `known` the answers to `getPid` and `getUri`. For a state that was read from a master.
+    pub fn keep_identity(&mut self, known: &Self) {
+        self.set_identity(known.pid, known.uri.clone());
     }
 
     /// Takes from `known` where each node has registered from, if it has the same address in both. For a state that was
