@@ -143,7 +143,7 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         false => units::units(paths.user).map(Some),
     };
     let (new, new_socket) = (robot.service(), robot.socket());
-    let own_ports = units::ports(socket_dropin.as_deref());
+    let own_ports = files[3].parent().map(units::ports).unwrap_or_default();
     let is_socket_new = socket_dropin.as_ref() != Some(&new_socket);
     let wanted = [
         new_unit,
@@ -193,8 +193,8 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         plan.notes.push(move_note(from, to, run_as.as_deref()));
     }
     if is_changed && is_running {
-        // With another checkpoint, the next rosrescue would not find the running master.
-        let adopts = old_service.runs_like(&new_service) && from == to;
+        // With another checkpoint, the next rosrescue would not find the master that this one has started.
+        let adopts = old_service.runs_like(&new_service) && (from == to || !service.runs_rosmaster);
         plan.renew(paths, is_socket_new || !adopts);
         // The running service has its own ports until it is stopped.
         if disabled.is_empty()
@@ -205,7 +205,14 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
             ));
         }
     } else if !is_enabled || (!is_running && paths.systemd_runs()) {
-        plan.start(paths, &service, !disabled.is_empty());
+        // A service that has failed or a proxy that waits for its first master does not run, but its socket listens.
+        let listens =
+            !is_running && paths.systemd_runs() && paths.systemctl_confirms("is-active", UNITS[1]);
+        if listens {
+            plan.run(paths.systemctl(&["stop", UNITS[1]]));
+        }
+        let own = if listens { &own_ports[..] } else { &[] };
+        plan.start(paths, &service, own, !disabled.is_empty());
     }
     if !paths.systemd_runs() {
         plan.notes
@@ -281,7 +288,13 @@ impl SystemChanges {
         (disabled, before)
     }
 
-    fn start(&mut self, paths: &UnitPaths, service: &Service, port_will_be_free: bool) {
+    fn start(
+        &mut self,
+        paths: &UnitPaths,
+        service: &Service,
+        own: &[u16],
+        port_will_be_free: bool,
+    ) {
         let mut options = paths.now_option().to_vec();
         if !service.runs_rosmaster && paths.systemd_runs() {
             // A proxy counts as started once it has a master, which can take long.
@@ -290,7 +303,7 @@ impl SystemChanges {
         self.run(paths.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
         if paths.systemd_runs()
             && !port_will_be_free
-            && let Some(port) = port_in_use(&service.listen, &[])
+            && let Some(port) = port_in_use(&service.listen, own)
         {
             self.obstacles.push(format!(
                 "port {port} is in use: stop the robot and its roscore, then run this again"
@@ -332,14 +345,19 @@ fn checkpoint(service: &InstalledService, caller: &BTreeMap<String, String>) -> 
 /// Says that the checkpoint moves, and how to take the state along. The previous generation is a part of it: one that
 /// an earlier service left at the new place would be read too.
 fn move_note(from: &Path, to: &Path, run_as: Option<&str>) -> String {
-    let copy = match run_as {
-        Some(user) => format!("sudo install -m 600 -o {user}"),
-        None => "cp".to_owned(),
+    let (make, copy) = match run_as {
+        Some(user) => (
+            format!("sudo -u {user} mkdir -p"),
+            format!("sudo install -m 600 -o {user}"),
+        ),
+        None => ("mkdir -p".to_owned(), "cp".to_owned()),
     };
-    let (from, to) = (from.display(), to.display());
+    let folder = to.parent().filter(|folder| !folder.exists());
+    let folder = folder.map(|folder| format!("{make} {}; ", folder.display()));
+    let (folder, from, to) = (folder.unwrap_or_default(), from.display(), to.display());
     format!(
         "the checkpoint moves from {from} to {to}. To keep the robot's state, copy it first: \
-         `{copy} {from} {to}; {copy} {from}.previous {to}.previous`"
+         `{folder}{copy} {from} {to}; {copy} {from}.previous {to}.previous`"
     )
 }
 

@@ -1,6 +1,6 @@
 //! Texts of the systemd units, and of the drop-ins with a robot's own settings.
 
-use std::{collections::BTreeMap, net::SocketAddr, path::Path};
+use std::{collections::BTreeMap, fs, net::SocketAddr, path::Path};
 
 const SERVICE: &str = include_str!("../../../packaging/systemd/rosrescue.service");
 const SOCKET: &str = include_str!("../../../packaging/systemd/rosrescue.socket");
@@ -138,9 +138,20 @@ impl InstalledService {
     }
 }
 
-/// The ports of the socket unit with this drop-in.
-pub(super) fn ports(dropin: Option<&str>) -> Vec<u16> {
-    let lines = dropin.unwrap_or(SOCKET).lines();
+/// The ports of the socket unit with the drop-ins in `folder`, also those that others have written.
+pub(super) fn ports(folder: &Path) -> Vec<u16> {
+    let dropins = fs::read_dir(folder).into_iter().flatten().flatten();
+    let texts = dropins.filter_map(|dropin| fs::read_to_string(dropin.path()).ok());
+    let ports: Vec<_> = texts.flat_map(|text| ports_in(&text)).collect();
+    match ports.is_empty() {
+        true => ports_in(SOCKET),
+        false => ports,
+    }
+}
+
+/// The ports of a socket unit or a drop-in.
+fn ports_in(unit: &str) -> Vec<u16> {
+    let lines = unit.lines();
     let addresses = lines.filter_map(|line| line.strip_prefix("ListenStream="));
     let ports = addresses.map(|address| address.rsplit(':').next().unwrap_or_default().parse());
     ports.filter_map(Result::ok).collect()
@@ -245,15 +256,15 @@ mod tests {
                 .socket()
                 .ends_with("\nListenStream=\nListenStream=11411\n")
         );
-        assert_eq!(ports(Some(&robot.socket())), [11411]);
-        assert_eq!(ports(None), [11311]);
+        assert_eq!(ports_in(&robot.socket()), [11411]);
+        assert_eq!(ports(Path::new("/nowhere")), [11311]);
         let robot = UnitSettings {
             listen: &["127.0.0.1:1", "[::1]:1"].map(|address| address.parse().unwrap()),
             ..robot
         };
         let socket = robot.socket();
         assert!(socket.ends_with("\nListenStream=127.0.0.1:1\nListenStream=[::1]:1\n"));
-        assert_eq!(ports(Some(&socket)), [1, 1]);
+        assert_eq!(ports_in(&socket), [1, 1]);
     }
 
     #[test]

@@ -312,13 +312,14 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     robot.assert_kept("with other options");
 
     // With another checkpoint, no master is left behind. The state comes along if it is copied as the plan says.
-    robot.run("install -d -o robot /home/robot/logs");
     let install = format!(
         "SUDO_USER=robot ROS_HOSTNAME=localhost ROS_LOG_DIR=/home/robot/logs {PROGRAM} install"
     );
     let plan = robot.run(&format!("{install} --dry-run"));
     let (_, copy) = plan.split_once("copy it first: `").expect(&plan);
-    let copy = copy.split('`').next().unwrap().replace("sudo ", "");
+    let copy = copy.split('`').next().unwrap();
+    let copy = copy.replace("sudo -u robot", "setpriv --reuid robot --clear-groups");
+    let copy = copy.replace("sudo ", "");
     let worker = robot.property("MainPID");
     robot.run(&format!("{copy}; {install} --yes"));
     robot.wait_another_worker(&worker);

@@ -3,7 +3,6 @@
 use std::fs;
 use std::net::TcpListener;
 use std::os::unix::fs::symlink;
-use std::path::Path;
 use std::process::{Command, Output};
 
 use crate::support::Scratch;
@@ -244,16 +243,17 @@ fn if_the_checkpoint_moves_the_service_is_stopped_cleanly_and_the_plan_says_so()
     fs::create_dir_all(old.parent().unwrap()).unwrap();
     fs::write(&old, "").unwrap();
     let [kill, stop] = ["--signal=KILL", "stop rosrescue.socket"];
-    let [old, new] = [&*old, Path::new("/data/100%.yaml")].map(Path::display);
+    let (folder, new) = (scratch.path("new"), scratch.path("new/100%.yaml"));
+    let moved = ["--checkpoint", new.to_str().unwrap()];
+    let [old, folder, new] = [&old, &folder, &new].map(|path| path.display());
     let note = format!(
-        "note    the checkpoint moves from {old} to {new}. To keep the robot's state, copy it first: `cp {old} {new}; \
-         cp {old}.previous {new}.previous`\n"
+        "note    the checkpoint moves from {old} to {new}. To keep the robot's state, copy it first: `mkdir -p {folder}; \
+         cp {old} {new}; cp {old}.previous {new}.previous`\n"
     );
     let options = ["--dry-run", "--", "core", "-t", "6"];
     let same = install(&options);
     assert!(same.contains(kill) && !same.contains(stop), "{same}");
     assert!(!same.contains("note    the checkpoint"), "{same}");
-    let moved = ["--checkpoint", "/data/100%.yaml"];
     let moved = [&options[..], &moved].concat();
     let plan = install(&moved);
     assert!(plan.contains(stop) && !plan.contains(kill), "{plan}");
@@ -277,7 +277,7 @@ fn a_port_in_use_is_refused_while_the_service_runs() {
     assert!(refused.contains(&obstacle), "{refused}");
     drop(other);
     said(&install_again(&scratch, &moved), 0);
-    // The service itself is no obstacle, neither at its old addresses nor at others.
+    // The service itself is no obstacle, neither at its old addresses nor at others, nor at those of another drop-in.
     let _service = TcpListener::bind(("127.0.0.1", port)).unwrap();
     for options in [["-t", "6"], ["--listen", "0.0.0.0"]] {
         said(
@@ -285,6 +285,12 @@ fn a_port_in_use_is_refused_while_the_service_runs() {
             0,
         );
     }
+    let service = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = service.local_addr().unwrap().port();
+    let dropin = scratch.path(".config/systemd/user/rosrescue.socket.d/override.conf");
+    fs::write(dropin, format!("[Socket]\nListenStream={port}\n")).unwrap();
+    let moved = ["--yes", "--", "core", "-p", &port.to_string()];
+    said(&install_again(&scratch, &moved), 0);
 }
 
 #[test]
