@@ -216,12 +216,12 @@ impl Connection {
         let is_known = self.keeps_alive == Some(true);
         // No Accept-Encoding is sent, because rosmaster would compress replies in Python.
         let mut request = Request::post(head.path.as_str())
+            // An HTTP proxy on the way refuses a request without it.
+            .header(HOST, &self.host)
             // An empty body needs this header too. Without it rosmaster answers with status 500 and no body.
             .header(CONTENT_LENGTH, body.len());
-        if !is_known || !self.server().is_some_and(needs_only_the_length) {
-            request = request
-                .header(HOST, &self.host)
-                .header(CONTENT_TYPE, "text/xml");
+        if !is_known || !self.server().is_some_and(ignores_types) {
+            request = request.header(CONTENT_TYPE, "text/xml");
         }
         if !is_known {
             request = request.header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")));
@@ -310,9 +310,9 @@ async fn handshake(
     Ok((sender, Box::new(driver)))
 }
 
-/// Whether the server with this `Server` header is that of Python's library, as in rosmaster. It reads neither `Host` nor
+/// Whether the server with this `Server` header is that of Python's library, as in rosmaster. It does not read
 /// `Content-Type`.
-fn needs_only_the_length(server: &str) -> bool {
+fn ignores_types(server: &str) -> bool {
     server.starts_with("BaseHTTP/")
 }
 
@@ -431,15 +431,15 @@ mod tests {
     async fn only_the_first_request_of_a_connection_has_headers_that_a_known_server_does_not_need()
     {
         let first = [
-            "content-length",
             "host",
+            "content-length",
             "content-type",
             "user-agent",
             "x-rosrescue-instance",
         ];
-        let later = ["content-length", "host", "content-type"];
+        let later = ["host", "content-length", "content-type"];
         for (server, later) in [
-            ("BaseHTTP/0.6 Python/3.11.2", &later[..1]),
+            ("BaseHTTP/0.6 Python/3.11.2", &later[..2]),
             ("nginx", &later),
         ] {
             let sent = headers_sent_to(server).await;

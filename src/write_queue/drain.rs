@@ -67,13 +67,15 @@ impl Drain {
         let mut order_changed = self.link.ledger.order_changed();
         let mut lease = self.link.ledger.lease.changed();
         let mut alarm = pin!(tokio::time::sleep(Duration::ZERO));
+        let mut is_set = false;
         loop {
             // Each write has a deadline, and hardly any comes. An alarm that is too early costs less than two settings for
             // each write.
             if let Some(at) = self.dispatcher.deadline().map(Into::into)
-                && (alarm.is_elapsed() || at < alarm.deadline())
+                && (!is_set || at < alarm.deadline())
             {
                 alarm.as_mut().reset(at);
+                is_set = true;
             }
             let mut changed = false;
             let input = tokio::select! {
@@ -104,7 +106,10 @@ impl Drain {
                 },
                 _ = order_changed.changed() => Input::Wake,
                 _ = lease.changed() => Input::Wake,
-                () = alarm.as_mut(), if !alarm.is_elapsed() => Input::Wake,
+                () = alarm.as_mut(), if is_set => {
+                    is_set = false;
+                    Input::Wake
+                }
             };
             // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = self.gate.observe_change();
