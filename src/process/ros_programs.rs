@@ -62,7 +62,8 @@ pub(super) fn add_ros_paths(command: &mut Command, program: &Path, depth: usize)
         ("LD_LIBRARY_PATH", vec![libraries]),
     ] {
         let own = std::env::var_os(variable).unwrap_or_default();
-        let paths = folders.into_iter().chain(std::env::split_paths(&own));
+        // An overlay of the shell comes first, as for roscore.
+        let paths = std::env::split_paths(&own).chain(folders);
         let paths = paths.filter(|path| !path.as_os_str().is_empty());
         if let Ok(joined) = std::env::join_paths(paths) {
             command.env(variable, joined);
@@ -163,7 +164,7 @@ mod tests {
             set.collect::<std::collections::HashMap<_, _>>()
         };
         let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
-        let libraries = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).next();
+        let libraries = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).last();
         assert_eq!(libraries.unwrap(), Path::new("/opt/ros/noetic/lib"));
         assert!(paths("/usr/bin/rosmaster", 2).is_empty());
     }
