@@ -355,6 +355,10 @@ fn a_user_can_install_a_service_without_root() {
     });
     let files = "sh -c 'find .config .local ! -type d 2>/dev/null | sort'";
     let before = robot.run(&as_user(files));
+    // The socket of a proxy that waits for its first master is no obstacle to another choice.
+    robot.run(&as_user(&format!(
+        "{PROGRAM} install --user --yes -- proxy --master http://localhost:1"
+    )));
     robot.run(&as_user(&format!("{PROGRAM} install --user --yes")));
     let status = "systemctl --user show --value -p StatusText rosrescue.service";
     eventually("STATUS=protected", || {
