@@ -107,7 +107,7 @@ mod tests {
         let (_, paths) = set
             .find(|(name, _)| *name == OsStr::new("LD_LIBRARY_PATH"))
             .unwrap();
-        let first = std::env::split_paths(paths.unwrap()).next();
-        assert_eq!(first.unwrap(), Path::new("/opt/ros/noetic/lib"));
+        let last = std::env::split_paths(paths.unwrap()).last();
+        assert_eq!(last.unwrap(), Path::new("/opt/ros/noetic/lib"));
     }
 }
