@@ -190,7 +190,7 @@ impl Others {
                         biased;
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
                         // be cut off, and may become the next leader.
-                        _ = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
+                        Ok(_) = standing.wait_for(|now| *now == Standing::Alone), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, incoming, &mut hold) => answered,
                     };
                     match answered {
@@ -239,8 +239,9 @@ impl Others {
                             }
                         },
                         // When the leader changes, the old leader's answer never comes or no longer counts. A computer
-                        // that is alone answers reads itself.
-                        _ = standing.changed() => {
+                        // that is alone answers reads itself. When rosrescue stops, nothing changes any more, and the leader
+                        // may still answer.
+                        Ok(()) = standing.changed() => {
                             hold.spend(asked.elapsed());
                             removed = removed.or(removes);
                             continue;

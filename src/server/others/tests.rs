@@ -234,6 +234,30 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
     assert_eq!(reply(answer).await, made_by(&get()));
 }
 
+/// The leader may answer while the connections of this computer end.
+#[tokio::test]
+async fn a_call_at_the_leader_is_not_sent_again_when_this_computer_stops() {
+    for call in [get(), set(2)] {
+        let (silent, mut sent) = leader_with(vec![None]).await;
+        let Computer {
+            calls, standing, ..
+        } = Computer::new(silent);
+        let from = "127.0.0.1:4000".parse().unwrap();
+        let head = Head {
+            path: "/RPC2".to_owned(),
+            ..Head::default()
+        };
+        let asked = calls.answer(from, head, call.encode().into(), Some(call.clone()));
+        let stop = async {
+            sent.wait_for(|count| *count > 0).await.unwrap();
+            drop(standing);
+        };
+        let both = async { tokio::join!(asked, stop) };
+        let _ = tokio::time::timeout(Duration::from_millis(200), both).await;
+        assert_eq!(*sent.borrow(), 1, "{call:?}");
+    }
+}
+
 /// The next leader finds nothing to remove. The caller must not be told so if its own call has removed it, and must be
 /// told so if another call has.
 #[tokio::test]
