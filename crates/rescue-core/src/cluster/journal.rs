@@ -17,7 +17,10 @@ use std::ops::Range;
 
 use thiserror::Error;
 
-use crate::checkpoint::format::{self, EncodeError, Record};
+use crate::{
+    checkpoint::format::{self, EncodeError, Record, RecordContent},
+    cluster::merge,
+};
 
 /// Size limit of one transaction's records, in bytes. etcd refuses requests of 1.5 MiB, and one of 1 MB takes 60 ms,
 /// during which nothing else is committed.
@@ -409,8 +412,8 @@ impl Progress {
         }
     }
 
-    /// Notes that the mirror follows a journal entry with these `records`, whose size is `bytes`. Returns the records
-    /// that are new.
+    /// Notes that the mirror follows a journal entry with these `records`, whose size is `bytes` as far as it is known.
+    /// Returns the records that are new.
     ///
     /// # Errors
     ///
@@ -434,7 +437,8 @@ impl Progress {
         }
         if !new.is_empty() {
             self.entries += 1;
-            self.bytes += bytes;
+            // A leader has no entries of its own records, and the entry of a large record only names its parts.
+            self.bytes += bytes.max(new.iter().map(weight).sum());
             self.seq = expected - 1;
         }
         Ok(new)
@@ -458,6 +462,14 @@ impl Progress {
     /// Whether the leader is to write a snapshot.
     pub fn wants_snapshot(&self) -> bool {
         self.entries >= SNAPSHOT_ENTRIES || self.bytes > self.snapshot_bytes.max(SNAPSHOT_BYTES)
+    }
+}
+
+/// The size of a record's values in bytes.
+pub(super) fn weight(record: &Record) -> usize {
+    match &record.entry {
+        RecordContent::Call { call, .. } => merge::weight(call),
+        RecordContent::Session(_) => 0,
     }
 }
 

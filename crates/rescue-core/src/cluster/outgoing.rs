@@ -5,15 +5,12 @@ use std::collections::VecDeque;
 use crate::{
     checkpoint::format::{self, Checkpoint, Record, RecordContent},
     cluster::{
-        journal::{self, JournalError, Keys, Put},
+        journal::{self, JournalError, Keys, Put, weight},
         member::WatchedEntry,
         sharing::{Change, Source},
     },
 };
-use ros1_master::{
-    master::{CALLER_ID, Master, Method, Request},
-    xmlrpc::Value,
-};
+use ros1_master::master::{CALLER_ID, Master, Method, Request};
 
 /// How many changes may be on their way to etcd at once.
 const FIRST: usize = journal::BATCH_RECORDS;
@@ -227,10 +224,7 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
 /// The approximate size of a change in bytes.
 fn weight_of(change: &Change) -> usize {
     match change {
-        Change::Call(record, _) => match &record.entry {
-            RecordContent::Call { call, .. } => call.params().iter().map(Value::size).sum(),
-            RecordContent::Session(_) => 0,
-        },
+        Change::Call(record, _) => weight(record),
         // A state does not count, because replacing it by a state would save nothing.
         Change::State { .. } => 0,
     }

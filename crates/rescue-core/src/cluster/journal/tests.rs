@@ -128,6 +128,10 @@ fn a_snapshot_is_due_when_the_journal_has_outgrown_it() {
     assert!(!progress.wants_snapshot());
     progress.take(vec![record(1000, 1)], 60).unwrap();
     assert!(progress.wants_snapshot());
+    // The parts of a large value are in etcd until the next snapshot, although its entry only names them.
+    let mut progress = Progress::default();
+    progress.take(vec![record(1, 2 << 20)], 0).unwrap();
+    assert!(progress.wants_snapshot());
 }
 
 #[test]
