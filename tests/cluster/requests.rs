@@ -9,6 +9,10 @@ use rescue_core::cluster::{
 };
 use rosrescue::cluster::etcd::{Credentials, Etcd, EtcdError, Options};
 use serde_json::json;
+use tokio::{
+    io::{AsyncReadExt, AsyncWriteExt},
+    net::TcpListener,
+};
 
 use crate::servers::{LIMIT, Servers, keys, settings};
 
@@ -325,6 +329,32 @@ async fn each_endpoint_is_tried_separately_and_a_wrong_one_is_named() {
         );
         client.view(&keys, LIMIT).await.unwrap();
     }
+}
+
+/// An endpoint at ROS's port: rosrescue answers with status 200 and a fault.
+#[tokio::test]
+async fn an_endpoint_that_is_no_etcd_but_answers_is_passed_over() {
+    let servers = Servers::new(1).await;
+    let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let wrong = format!("http://{}", other.local_addr().unwrap());
+    let answers = tokio::spawn(async move {
+        loop {
+            let (mut stream, _) = other.accept().await.unwrap();
+            let answer = b"HTTP/1.1 200 OK\r\nConnection: close\r\nContent-Length: 6\r\n\r\n<xml/>";
+            // The client may have gone.
+            let _ = stream.read(&mut [0; 4096]).await;
+            let _ = stream.write_all(answer).await;
+        }
+    });
+    let client = Etcd::new(&Options {
+        endpoints: vec![wrong, servers.endpoints(0)[0].clone()],
+        access: Credentials::default(),
+    });
+    let client = client.unwrap();
+    for _ in 0..3 {
+        client.view(&keys(), LIMIT).await.unwrap();
+    }
+    answers.abort();
 }
 
 /// etcd has lost data again since the entry was written, perhaps a journal that this computer has not seen.

@@ -301,10 +301,10 @@ impl Client {
                     asked.abort_all();
                     return Err(failure.unwrap_or(EtcdError::Silent { limit }));
                 }
-                Some(done) = asked.join_next() => match done {
-                    Ok((index, Ok(bytes))) => {
+                Some(done) = asked.join_next() => match done.map(|(index, body)| (index, body.and_then(|body| wire::parse(&body)))) {
+                    Ok((index, Ok(answer))) => {
                         self.preferred.store(index, Ordering::Relaxed);
-                        return wire::parse(&bytes);
+                        return Ok(answer);
                     }
                     Ok((_, Err(error))) if error.is_final() => return Err(error),
                     Ok((_, Err(error))) => {
