@@ -145,6 +145,37 @@ fn after_a_reboot_with_nodes_alive_elsewhere_the_session_continues(mode: Mode) {
     talker.assert_no_link_lost();
 }
 
+/// multimaster_fkie's `master_sync` registers nodes of another robot, which may be on all the time.
+#[test]
+fn after_a_reboot_nodes_of_another_robot_do_not_count() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port.to_string(), "--no-rosout"]);
+    let mut rescue = setup.env("ROS_IP", net.near()).at_port(port).start();
+    let client = rescue.client();
+    client.set_param("/gain", 3);
+    let _talker = node_elsewhere(
+        &net,
+        (&scratch, port),
+        2,
+        (Library::Roscpp, "talker", "talker"),
+    );
+    eventually("the node is registered", || {
+        State::try_read(&client).is_ok_and(|state| state.knows("/talker"))
+    });
+    let api = client.ok("lookupNode", params!["/test", "/talker"]);
+    let again = params!["/talker", "/synchronized", "std_msgs/String", api];
+    client.ok("registerPublisher", again);
+    let dead = client.master_pid().expect("a master");
+    rescue.kill();
+    signal(dead, Signal::KILL);
+    eventually("the master is dead", || !alive(dead));
+    rescue.start_after_reboot(&another_boot(&scratch));
+    rescue.wait_serving();
+    assert_eq!(client.param("/gain"), None);
+}
+
 /// Nothing on this computer has survived the reboot, so an answer from the address of a node comes from
 /// another program.
 #[test]
