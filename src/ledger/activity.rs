@@ -9,7 +9,7 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 use rescue_core::order::Subject;
 use ros1_master::{
-    master::{self, Displaced, Master, NoticeSink, Request, Write, WriteTarget},
+    master::{self, Displaced, Effect, Master, NoticeSink, Request, Write, WriteTarget},
     xmlrpc::{Call, Value},
 };
 
@@ -307,6 +307,12 @@ impl Activity {
         };
         let caller = write.caller;
         self.count += 1;
+        // Loggers subscribe to the same parameter at each line. A process that starts again registers topics, too.
+        let is_repeated = matches!(write.effect, Effect::SubscribeParam { .. })
+            && self.last_calls.contains_key(caller);
+        if is_repeated {
+            return;
+        }
         if write.registrant().is_some() {
             self.last_calls
                 .entry(caller.to_owned())

@@ -118,6 +118,24 @@ fn who_is_displaced_is_known_with_what_it_did() {
     assert_eq!(activity.take_owed(now).displaced, []);
 }
 
+/// rospy subscribes to the same parameter at each log line.
+#[test]
+fn a_node_that_logs_all_the_time_is_asked_for_its_process_id_and_keeps_it() {
+    let start = Instant::now();
+    let mut activity = Activity::default();
+    apply(&mut activity, start, &publish("/a", "/rosout"));
+    let log = call("subscribeParam", &["/a", "http://n:1/", "/rosout_disable"]);
+    let second = Duration::from_secs(1);
+    for seconds in 1..5 {
+        apply(&mut activity, start + seconds * second, &log);
+    }
+    assert_eq!(activity.take_unidentified(start + second), ["/a"]);
+    let registered = activity.last_calls("/a").registered;
+    activity.remember_pid("/a", "http://n:1/", registered, 7);
+    apply(&mut activity, start + 5 * second, &log);
+    assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
+}
+
 #[test]
 fn who_was_displaced_by_the_journal_is_told_unless_the_name_is_its_own_again() {
     let now = Instant::now();
