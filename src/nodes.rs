@@ -176,6 +176,7 @@ impl Nodes {
             let nodes = nodes.filter(|(name, api)| {
                 let from = mirror.registered_from(name);
                 unreachable.contains(port_of(api))
+                    && mirror.is_listed(name)
                     && self.local.reach(port_of(api), from).answer_counts()
             });
             nodes.map(|(name, _)| name.to_owned()).collect()

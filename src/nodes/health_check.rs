@@ -497,9 +497,16 @@ pub(super) async fn remove(
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(node);
         let same = mirror.api_of(node) == Some(api) && same(last_calls);
-        same.then(|| (mirror.unregister_calls(node), last_calls))
+        same.then(|| {
+            (
+                mirror.unregister_calls(node),
+                mirror.is_listed(node),
+                last_calls,
+            )
+        })
     });
-    let Some((calls, last_calls)) = found.filter(|(calls, _)| !calls.is_empty()) else {
+    let found = found.filter(|(calls, ..)| !calls.is_empty());
+    let Some((calls, is_listed, last_calls)) = found else {
         return false;
     };
     let condition = Precondition {
@@ -508,7 +515,7 @@ pub(super) async fn remove(
     };
     let call = Request::multicall(calls);
     let reply = nodes.write_queue.call_if(call, condition).await;
-    if reply.is_some() {
+    if reply.is_some() && is_listed {
         nodes.removed.add(node, Instant::now());
     }
     reply.is_some()

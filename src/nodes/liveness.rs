@@ -90,7 +90,7 @@ impl Nodes {
         let unreachable = self.lock().clone();
         let names = local::names(&self.ledger);
         let known = self.liveness.lock();
-        let lives = names.into_iter().map(|named| {
+        let lives = names.into_iter().filter_map(|named| {
             let (name, port) = (named.node, named.port);
             let seen = known.liveness.last_seen(&port);
             let evidence = self.local.evidence(&name);
@@ -110,7 +110,8 @@ impl Nodes {
                     (_, None) => now,
                 },
             };
-            (name, life)
+            // What a node has left behind that stopped cleanly is no dead node.
+            (named.is_listed || health == Health::Alive).then_some((name, life))
         });
         lives.collect()
     }

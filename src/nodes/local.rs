@@ -76,6 +76,8 @@ pub(super) struct Named {
     answered_pid: Option<i32>,
     /// The computer from which the node has registered; `None` for this one.
     pub(super) from: Option<IpAddr>,
+    /// See [`Master::is_listed`](ros1_master::master::Master::is_listed).
+    pub(super) is_listed: bool,
 }
 
 /// All registered names, without rosrescue's own.
@@ -98,6 +100,7 @@ pub(super) fn names(ledger: &Ledger) -> Vec<Named> {
         registered,
         has_answered: pid.is_some(),
         from: mirror.registered_from(node),
+        is_listed: mirror.is_listed(node),
         answered_pid: match pid {
             Some((pid, false)) => Some(pid),
             // An answer from before the last registration may be another process's.

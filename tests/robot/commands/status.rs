@@ -7,7 +7,7 @@ use std::thread;
 
 use crate::support::{
     FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, State, Tool, eventually, free_port,
-    page, params,
+    page, params, port_of,
 };
 
 /// rosrescue shows pages only under the names of its own computer, because of pages in browsers. A command is none.
@@ -42,6 +42,10 @@ fn nodes_that_died_come_before_everything_else() {
     let port = robot.port();
     let status = || Tool::rosrescue(&robot.scratch, port, &["status"]);
     assert!(status().stdout.starts_with("protected, since "));
+    // rospy does this at each log line and never ends it.
+    let api = format!("http://127.0.0.1:{}/", port_of(&robot.client(), "/orderly"));
+    let log = params!["/orderly", api, "/rosout_disable_topics_generation"];
+    robot.client().ok("subscribeParam", log);
     orderly.terminate();
     eventually("the node has unregistered", || {
         State::try_read(&robot.client()).is_ok_and(|state| !state.knows("/orderly"))

@@ -291,6 +291,15 @@ impl Master {
         })
     }
 
+    /// Whether a node shows in `getSystemState`. A node that has stopped cleanly may leave other things behind: rospy never
+    /// ends the parameter subscription that each log line makes, and nobody can end a service that another node has taken
+    /// over.
+    pub fn is_listed(&self, caller_id: &str) -> bool {
+        self.publications(caller_id).next().is_some()
+            || self.subscriptions(caller_id).next().is_some()
+            || self.services_of(caller_id).next().is_some()
+    }
+
     /// The node that provides a service.
     pub fn provider_of(&self, service: &str) -> Option<&str> {
         let entry = self.registry.services.get(service)?;
