@@ -42,7 +42,7 @@ const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 /// How long before the master closes an idle connection it is no longer used.
 const IDLE_RESERVE: Duration = Duration::from_millis(500);
 
-/// Header in each request to the master, with the number of an [open request](open_requests). A rosrescue that receives
+/// Header in the first request of a connection to the master, with the number of an [open request](open_requests). A rosrescue that receives
 /// a number of its own is its own master.
 pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 

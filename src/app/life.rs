@@ -35,7 +35,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     for (port, from) in ports {
         let (api, call) = (port.to_owned(), call.clone());
         questions.spawn(async move {
-            // What this computer has registered for a node elsewhere, a program registered that synchronises masters.
+            // A node elsewhere that was registered from here may belong to another robot: a program synchronises masters.
             (same_boot || from.is_some() && resolver::is_elsewhere(&api, LIFE_SIGN).await)
                 && answer_counts(&api, from).await
                 && client::call(&api, &call, LIFE_SIGN).await == Reaction::Alive

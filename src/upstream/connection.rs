@@ -403,7 +403,7 @@ mod tests {
             for _ in 0..3 {
                 let mut request = Vec::new();
                 while !request.ends_with(b"body") {
-                    stream.read_buf(&mut request).await.unwrap();
+                    assert_ne!(stream.read_buf(&mut request).await.unwrap(), 0);
                 }
                 let head = String::from_utf8(request).unwrap();
                 let names = head

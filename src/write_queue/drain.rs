@@ -99,11 +99,11 @@ impl Drain {
                     changed = true;
                     Input::Wake
                 }
-                // The senders live as long as this task.
                 item = self.items.recv() => match item {
                     Some(item) => Input::Calls(self.with_others(item)),
                     None => return,
                 },
+                // The senders live as long as this task.
                 _ = order_changed.changed() => Input::Wake,
                 _ = lease.changed() => Input::Wake,
                 () = alarm.as_mut(), if is_set => {

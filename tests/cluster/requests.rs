@@ -346,14 +346,21 @@ async fn an_endpoint_that_is_no_etcd_but_answers_is_passed_over() {
             let _ = stream.write_all(answer).await;
         }
     });
-    let client = Etcd::new(&Options {
-        endpoints: vec![wrong, servers.endpoints(0)[0].clone()],
-        access: Credentials::default(),
-    });
-    let client = client.unwrap();
+    let client = |endpoints| {
+        let access = Credentials::default();
+        Etcd::new(&Options { endpoints, access }).unwrap()
+    };
+    let both = client(vec![wrong.clone(), servers.endpoints(0)[0].clone()]);
     for _ in 0..3 {
-        client.view(&keys(), LIMIT).await.unwrap();
+        both.view(&keys(), LIMIT).await.unwrap();
     }
+    let alone = client(vec![wrong.clone()]);
+    let error = alone.view(&keys(), Duration::from_secs(2)).await;
+    let error = error.unwrap_err().to_string();
+    assert!(
+        error.starts_with(&format!("{wrong} does not answer as etcd")),
+        "{error}"
+    );
     answers.abort();
 }
 

@@ -61,6 +61,17 @@ pub enum EtcdError {
 }
 
 impl EtcdError {
+    /// The error in the body of an answer of `endpoint`, which the body does not name.
+    pub(super) fn of(self, endpoint: &str) -> Self {
+        match self {
+            Self::NotEtcd { why, .. } => Self::NotEtcd {
+                endpoint: endpoint.to_owned(),
+                why,
+            },
+            other => other,
+        }
+    }
+
     /// The error in an answer with an HTTP error status.
     pub(super) fn refused(endpoint: &str, status: StatusCode, body: &[u8]) -> Self {
         if let Ok(answer) = serde_json::from_slice::<ErrorAnswer>(body)

@@ -258,13 +258,7 @@ impl Client {
         let cluster = answer.and_then(|bytes| {
             let cluster =
                 wire::parse(&bytes).and_then(|answer: wire::RangeAnswer| answer.cluster());
-            cluster.map_err(|error| match error {
-                EtcdError::NotEtcd { why, .. } => EtcdError::NotEtcd {
-                    endpoint: endpoint.url().to_owned(),
-                    why,
-                },
-                other => other,
-            })
+            cluster.map_err(|error| error.of(endpoint.url()))
         });
         Some(Tried {
             endpoint: endpoint.url().to_owned(),
@@ -301,23 +295,27 @@ impl Client {
                     asked.abort_all();
                     return Err(failure.unwrap_or(EtcdError::Silent { limit }));
                 }
-                Some(done) = asked.join_next() => match done.map(|(index, body)| (index, body.and_then(|body| wire::parse(&body)))) {
-                    Ok((index, Ok(answer))) => {
-                        self.preferred.store(index, Ordering::Relaxed);
-                        return Ok(answer);
-                    }
-                    Ok((_, Err(error))) if error.is_final() => return Err(error),
-                    Ok((_, Err(error))) => {
-                        let round = next % self.endpoints.len() == self.preferred();
-                        let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
-                        ask_at = ask_at.min(tokio::time::Instant::now() + pause);
-                        // The error of an endpoint that answered says more than the error of one that did not.
-                        if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
-                            failure = Some(error);
+                Some(done) = asked.join_next() => {
+                    let Ok((index, body)) = done else { continue };
+                    let url = self.endpoints.get(index).map_or("", |endpoint| endpoint.url());
+                    let answer = body.and_then(|body| wire::parse(&body));
+                    match answer.map_err(|error| error.of(url)) {
+                        Ok(answer) => {
+                            self.preferred.store(index, Ordering::Relaxed);
+                            return Ok(answer);
+                        }
+                        Err(error) if error.is_final() => return Err(error),
+                        Err(error) => {
+                            let round = next % self.endpoints.len() == self.preferred();
+                            let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
+                            ask_at = ask_at.min(tokio::time::Instant::now() + pause);
+                            // The error of an endpoint that answered says more than the error of one that did not.
+                            if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
+                                failure = Some(error);
+                            }
                         }
                     }
-                    Err(_) => {}
-                },
+                }
                 () = tokio::time::sleep_until(ask_at) => {
                     let (client, body, index) = (self.clone(), body.clone(), next % self.endpoints.len());
                     let rest = end.saturating_duration_since(tokio::time::Instant::now());
