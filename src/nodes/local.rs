@@ -148,9 +148,11 @@ impl LocalNodes {
     /// What the address with this `port` proves about a node that has registered from the computer `from`; `None` for
     /// this one.
     pub(super) fn reach(&self, port: &str, from: Option<IpAddr>) -> Reach {
+        let known = self.lock();
         match from {
+            None if known.addresses.is_lost(port) => Reach::Elsewhere { loopback: false },
             None => Reach::Certain,
-            Some(_) => self.lock().reach(port, from),
+            Some(_) => known.reach(port, from),
         }
     }
 

@@ -163,6 +163,25 @@ impl Netns {
         ip(&format!("addr add {net}.1/24 dev {near}"));
     }
 
+    /// Gives [`near`](Self::near) to the other side, and this side another address.
+    pub(crate) fn give_near_away(&self) {
+        self.move_near();
+        self.far_side("add");
+    }
+
+    /// Takes back what [`Self::give_near_away`] gave.
+    pub(crate) fn take_near_back(&self) {
+        self.far_side("del");
+        ip(&format!("addr del {}/24 dev {}", self.moved(), self.near));
+        self.return_near();
+    }
+
+    /// Adds or deletes [`near`](Self::near) on the other side.
+    fn far_side(&self, verb: &str) {
+        let (name, near, far) = (&self.name, self.near(), self.far_device());
+        ip(&format!("-n {name} addr {verb} {near}/24 dev {far}"));
+    }
+
     /// Wraps `command` so that it runs on the other side.
     pub(crate) fn inside(&self, command: &Command) -> Command {
         let mut inside = Command::new("ip");

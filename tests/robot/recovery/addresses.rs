@@ -9,6 +9,36 @@ fn status(robot: &Robot) -> serde_json::Value {
     robot.status().unwrap_or_default()
 }
 
+/// DHCP has given the address to another computer, which refuses connections to the node's port.
+#[test]
+fn a_node_whose_lost_address_a_stranger_has_stays_registered() {
+    let net = Netns::new();
+    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    let client = robot.client();
+    let node = FakeNode::start_on("/here", net.near().parse().unwrap(), 0);
+    node.subscribe(&client, "/topic", "std_msgs/String");
+    let other = FakeNode::start("/other");
+    other.publish(&client, "/topic", "std_msgs/String");
+    eventually("both nodes are alive", || {
+        status(&robot)["alive_nodes"] == 2
+    });
+    let before = robot.settled_state();
+    let told = node.updates("/topic").len();
+    net.give_near_away();
+    eventually("the lost address is reported", || {
+        names(&status(&robot)["lost_addresses"][0]["nodes"]) == ["/here"]
+    });
+    robot.crash_master();
+    eventually("the health check has ended", || {
+        status(&robot)["last_recovery"]["health_check_ms"].is_number()
+    });
+    before.assert_same(&robot.state(), "after the health check");
+    net.take_near_back();
+    eventually("the node is notified again", || {
+        node.updates("/topic").len() > told
+    });
+}
+
 #[test]
 fn nodes_at_a_lost_address_are_reported_and_told_again_when_it_is_back() {
     let rounds = std::env::var("ROSRESCUE_ROUNDS").map_or(5, |rounds| rounds.parse().unwrap());

@@ -61,6 +61,11 @@ impl NodeAddresses {
         changes
     }
 
+    /// Whether the address of the node at `port` is lost. Another computer may have it now.
+    pub fn is_lost(&self, port: &str) -> bool {
+        self.0.get(port).is_some_and(|at| at.lost.is_some())
+    }
+
     /// The ports with lost addresses, each with one address and since when it is lost.
     pub fn lost_ports(&self) -> impl Iterator<Item = (&str, IpAddr, Instant)> {
         let lost = self.0.iter();
@@ -94,6 +99,7 @@ mod tests {
         nodes.set("a", [ip("10.0.0.7")]);
         let lost: Vec<_> = nodes.lost_ports().collect();
         assert_eq!(lost, [("a", ip("10.0.0.7"), now)]);
+        assert!(nodes.is_lost("a") && !nodes.is_lost("b") && !nodes.is_lost("far"));
         let changes = nodes.update(before, now);
         assert_eq!(
             (changes.lost, changes.returned),

@@ -15,7 +15,8 @@ pub enum Reach {
     /// such as another address of that computer. If it refuses connections, that proves something only about a node
     /// that has answered there before.
     Doubtful,
-    /// The address is this computer's, and the node is on another computer. Nothing at the address proves anything.
+    /// The address does not lead to the node: it is this computer's, and the node is on another one, or this computer has
+    /// lost it. Nothing at the address proves anything.
     Elsewhere {
         /// Whether it is a loopback address, so no other computer reaches the node either.
         loopback: bool,
