@@ -192,11 +192,11 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiti
                     Refusal::Dead => outcome.removed = remove_all(nodes, asked).await,
                     _ => {}
                 }
-                if outcome.removed.len() < outcome.names.len() {
+                if Asked::registered_at(nodes, port, &nodes.reaches(port).await).is_empty() {
+                    nodes.clear(port);
+                } else {
                     tracing::debug!(names = ?outcome.names, "a port refuses connections; its nodes stay registered");
                     nodes.mark_unreachable(port, in_check);
-                } else {
-                    nodes.clear(port);
                 }
                 break;
             }
@@ -272,6 +272,10 @@ impl Asked {
                 let Some(reach) = reach.filter(|reach| reach.answer_counts()) else {
                     continue;
                 };
+                // All that is left of it is a service that another node has taken over, which nothing ends.
+                if mirror.unregister_calls(node).is_empty() {
+                    continue;
+                }
                 let pid = activity.pid_of(node, api);
                 let last_calls = activity.last_calls(node);
                 let asked = all.entry(api).or_insert_with(|| Self {
@@ -406,7 +410,7 @@ impl Findings {
             let again =
                 earlier.any(|found| found.node == name.node && found.registered == name.registered);
             let same = |last_calls: LastCalls| last_calls.registered == name.registered;
-            if again && remove(nodes, &name.node, api, same).await {
+            if again && remove(nodes, &name.node, api, same).await == Removal::Node {
                 outcome.removed.push(name.node.clone());
             }
         }
@@ -477,11 +481,21 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
             let (nodes, api) = (nodes.clone(), asked.api.clone());
             removals.spawn(async move {
                 let same = |last_calls| last_calls == before && nodes.gate.is_open();
-                remove(&nodes, &node, &api, same).await.then_some(node)
+                let removal = remove(&nodes, &node, &api, same).await;
+                (removal == Removal::Node).then_some(node)
             });
         }
     }
     removals.join_all().await.into_iter().flatten().collect()
+}
+
+/// What [`remove`] has unregistered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Removal {
+    Nothing,
+    /// What a node has left behind that stopped cleanly. No report names it.
+    Remains,
+    Node,
 }
 
 /// Unregisters a node as the node itself would. Does nothing if the node has come back since it was asked: its address
@@ -491,7 +505,7 @@ pub(super) async fn remove(
     node: &str,
     api: &str,
     same: impl Fn(LastCalls) -> bool,
-) -> bool {
+) -> Removal {
     // Lets the node's queued calls run first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
@@ -505,18 +519,24 @@ pub(super) async fn remove(
             )
         })
     });
-    let found = found.filter(|(calls, ..)| !calls.is_empty());
     let Some((calls, is_listed, last_calls)) = found else {
-        return false;
+        return Removal::Nothing;
     };
+    if calls.is_empty() {
+        return Removal::Remains;
+    }
     let condition = Precondition {
         node: node.to_owned(),
         last_calls,
     };
     let call = Request::multicall(calls);
     let reply = nodes.write_queue.call_if(call, condition).await;
-    if reply.is_some() && is_listed {
-        nodes.removed.add(node, Instant::now());
+    match (reply, is_listed) {
+        (None, _) => Removal::Nothing,
+        (Some(_), false) => Removal::Remains,
+        (Some(_), true) => {
+            nodes.removed.add(node, Instant::now());
+            Removal::Node
+        }
     }
-    reply.is_some()
 }

@@ -251,7 +251,7 @@ async fn probe_port(nodes: Arc<Nodes>, port: String, listening: Arc<Listening>) 
             let dead = mirror.nodes_at(&port).filter(|(name, api)| {
                 let answered = activity.pid_of(name, api).is_some();
                 let reach = reaches.get(*name);
-                reach.is_some_and(|reach| reach.refusal_proves(answered))
+                mirror.is_listed(name) && reach.is_some_and(|reach| reach.refusal_proves(answered))
             });
             dead.map(|(name, _)| name.to_owned()).collect()
         });

@@ -5,7 +5,10 @@ use std::sync::Arc;
 use rescue_core::health::{Death, Evidence, Reap};
 
 use super::{
-    super::{Nodes, health_check},
+    super::{
+        Nodes,
+        health_check::{self, Removal},
+    },
     Named,
 };
 use crate::{clock, ledger::activity::LastCalls, limit::rarely};
@@ -36,6 +39,9 @@ pub(crate) fn unregister_dead(nodes: &Arc<Nodes>, names: &[Named]) {
         drop(known);
         let node = &name.node;
         let how = how(&death, &others);
+        if nodes.local.reap == Reap::Report && !name.is_listed {
+            continue;
+        }
         if nodes.local.reap == Reap::Report {
             rarely!(info, "would have unregistered {node}: {how} (--reap local)");
             continue;
@@ -52,12 +58,16 @@ pub(crate) fn unregister_dead(nodes: &Arc<Nodes>, names: &[Named]) {
 
 async fn unregister(nodes: Arc<Nodes>, node: String, api: String, death: Death, how: String) {
     let same = |calls: LastCalls| calls.registered == death.registered && nodes.gate.is_open();
-    if health_check::remove(&nodes, &node, &api, same).await {
-        nodes.stats.dead_nodes_reaped.count();
-        rarely!(info, "unregistered {node}: {how}");
-    } else {
-        // The next look tries again, if the node is still registered.
-        nodes.local.lock().handled.remove(&node);
+    match health_check::remove(&nodes, &node, &api, same).await {
+        Removal::Node => {
+            nodes.stats.dead_nodes_reaped.count();
+            rarely!(info, "unregistered {node}: {how}");
+        }
+        Removal::Remains => {}
+        Removal::Nothing => {
+            // The next look tries again, if the node is still registered.
+            nodes.local.lock().handled.remove(&node);
+        }
     }
 }
 
