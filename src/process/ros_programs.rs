@@ -71,6 +71,24 @@ pub(super) fn add_ros_paths(command: &mut Command, program: &Path, depth: usize)
     }
 }
 
+/// Names the ROS installation in `/opt/ros` that contains `rosmaster`, as its `setup.bash` does, unless the environment
+/// names one. A service has no shell, and without these variables `rosversion` knows neither ROS nor its packages.
+fn name_ros(command: &mut Command, rosmaster: &Path) {
+    let prefix = rosmaster.ancestors().nth(2);
+    let Some(prefix) = prefix.filter(|prefix| prefix.starts_with(ROS_PREFIXES)) else {
+        return;
+    };
+    let distribution = prefix.file_name().unwrap_or_default().to_owned();
+    for (variable, value) in [
+        ("ROS_DISTRO", distribution),
+        ("ROS_PACKAGE_PATH", prefix.join("share").into()),
+    ] {
+        if std::env::var_os(variable).is_none() {
+            command.env(variable, value);
+        }
+    }
+}
+
 /// The folders of Python modules in `lib` of a ROS installation: `python2.7/dist-packages` in ROS's packages up to
 /// Melodic, `python3/dist-packages` in Noetic's, `site-packages` on some other systems.
 fn python_folders(lib: &Path) -> Vec<PathBuf> {
@@ -92,6 +110,9 @@ pub(crate) async fn output_of(
     limit: Duration,
 ) -> Option<String> {
     let mut command = command(&find_program(program, &["bin"])?);
+    if let Some(rosmaster) = find_program("rosmaster", &["bin"]) {
+        name_ros(&mut command, &rosmaster);
+    }
     command
         .args(arguments)
         .stdin(Stdio::null())
@@ -140,6 +161,8 @@ pub(super) fn is_program(path: &Path) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::{collections::HashMap, ffi::OsString};
+
     use super::*;
 
     #[test]
@@ -154,14 +177,34 @@ mod tests {
         assert_eq!(python_folders(prefix.path()), folders);
     }
 
+    /// The variables that `prepare` sets.
+    fn variables(prepare: impl FnOnce(&mut Command)) -> HashMap<OsString, OsString> {
+        let mut command = Command::new("program");
+        prepare(&mut command);
+        let set = command.as_std().get_envs();
+        let set = set.filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
+        set.collect()
+    }
+
+    #[test]
+    fn a_ros_in_opt_is_named_unless_the_shell_names_one() {
+        let named = |program: &str| variables(|command| name_ros(command, Path::new(program)));
+        let set = named("/opt/ros/melodic/bin/rosmaster");
+        for (variable, value) in [
+            ("ROS_DISTRO", "melodic"),
+            ("ROS_PACKAGE_PATH", "/opt/ros/melodic/share"),
+        ] {
+            let is_ours = std::env::var_os(variable).is_none();
+            let expected = is_ours.then(|| OsString::from(value));
+            assert_eq!(set.get(OsStr::new(variable)), expected.as_ref());
+        }
+        assert!(named("/usr/bin/rosmaster").is_empty());
+    }
+
     #[test]
     fn a_ros_in_opt_gets_its_own_paths() {
         let paths = |program: &str, depth| {
-            let mut command = Command::new(program);
-            add_ros_paths(&mut command, Path::new(program), depth);
-            let set = command.as_std().get_envs();
-            let set = set.filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
-            set.collect::<std::collections::HashMap<_, _>>()
+            variables(|command| add_ros_paths(command, Path::new(program), depth))
         };
         let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
         let libraries = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).last();
