@@ -28,9 +28,9 @@ pub(crate) struct Rosout {
 impl Rosout {
     /// Finds the rosout program. `None` if it is not installed. Its stderr goes to a file next to `checkpoint`.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
-        let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
-            Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
-        })?;
+        let rosmaster = find_program("rosmaster", &["bin"]);
+        let beside = rosmaster.as_deref().and_then(beside);
+        let program = beside.or_else(|| find_program("rosout", &["lib/rosout"]))?;
         Some(Self {
             program,
             output: Output::beside(checkpoint, ".rosout-output.log"),
@@ -86,6 +86,13 @@ impl Rosout {
     pub(crate) async fn last_words(&self) -> String {
         self.output.tail().await
     }
+}
+
+/// The rosout of the ROS installation that contains `rosmaster`. Only there is the one of a ROS that was built from
+/// source or that conda has installed.
+fn beside(rosmaster: &Path) -> Option<PathBuf> {
+    let program = rosmaster.ancestors().nth(2)?.join("lib/rosout/rosout");
+    is_program(&program).then_some(program)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! Nothing is left behind, and no call gets a false answer.
 
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -185,13 +185,15 @@ fn a_rosout_that_ran_elsewhere_is_replaced_when_it_has_ended() {
 }
 
 /// A rosout that ends at once, for example because its libraries are missing, is started again after growing pauses.
-/// The log has its last output.
+/// The log has its last output. It is the one of the ROS that contains rosmaster, as one built from source.
 #[test]
 fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
     let scratch = Scratch::new();
-    let folder = scratch.path("bin");
-    fs::create_dir(&folder).unwrap();
-    let program = folder.join("rosout");
+    let [folder, libraries] = ["ros/bin", "ros/lib/rosout"].map(|folder| scratch.path(folder));
+    fs::create_dir_all(&folder).unwrap();
+    fs::create_dir_all(&libraries).unwrap();
+    symlink("/usr/bin/rosmaster", folder.join("rosmaster")).unwrap();
+    let program = libraries.join("rosout");
     fs::write(&program, "#!/bin/sh\necho no library here >&2\nexit 127\n").unwrap();
     fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
