@@ -50,7 +50,10 @@ impl MasterUri {
             };
             (host, port)
         } else {
-            match authority.split_once(':') {
+            // rosgraph writes no brackets around an IPv6 address.
+            let ipv6 = authority.rsplit_once(':');
+            let ipv6 = ipv6.filter(|(host, _)| host.parse::<Ipv6Addr>().is_ok());
+            match ipv6.or_else(|| authority.split_once(':')) {
                 Some((host, port)) => (host, Some(port)),
                 None => (authority, None),
             }
@@ -230,6 +233,7 @@ mod tests {
             ("http://robot", uri("robot", 11311)),
             ("http://[::1]:5/RPC2", uri("::1", 5)),
             ("http://[fe80::1]", uri("fe80::1", 11311)),
+            ("http://fd00::7:41234/", uri("fd00::7", 41234)),
         ] {
             assert_eq!(MasterUri::parse(text), Ok(expected), "{text}");
         }
