@@ -85,18 +85,31 @@ fn share_or_begin(host: &str) -> watch::Receiver<Option<Found>> {
 }
 
 /// Whether `address` belongs to this computer. If it does, the kernel chooses `address` itself as the source address of
-/// packets to `address`. Sends no packet.
+/// packets to `address`. Sends no packet. A link-local address leads nowhere without its scope, so the kernel's list of
+/// addresses says whose it is.
 pub fn is_own(address: IpAddr) -> bool {
     let any = match address {
         IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
         IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
     };
+    if let IpAddr::V6(link_local) = address
+        && link_local.is_unicast_link_local()
+    {
+        let table = std::fs::read_to_string("/proc/net/if_inet6");
+        return table.is_ok_and(|table| lists(&table, link_local));
+    }
     let source = || {
         let socket = UdpSocket::bind((any, 0))?;
         socket.connect((address, 9))?;
         Ok::<_, io::Error>(socket.local_addr()?.ip())
     };
     address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
+}
+
+/// Whether `table` has `address`: `/proc/net/if_inet6` begins each line with an address of 32 digits.
+fn lists(table: &str, address: Ipv6Addr) -> bool {
+    let address = format!("{:032x}", address.to_bits());
+    table.lines().any(|line| line.starts_with(&address))
 }
 
 /// Sets the port and keeps the scope of an IPv6 address.
@@ -159,6 +172,15 @@ mod tests {
         assert!(under_way().get("::1").is_none());
         let nobody = addresses("nobody.invalid", 4711).await;
         assert!(nobody.is_err(), "{nobody:?}");
+    }
+
+    #[test]
+    fn a_link_local_address_is_found_in_the_kernels_list() {
+        let table = "00000000000000000000000000000001 01 80 10 80       lo\n\
+                     fe800000000000000042acfffe110002 02 40 20 80     eth0\n";
+        let lists = |address: &str| lists(table, address.parse().unwrap());
+        assert!(lists("fe80::42:acff:fe11:2") && !lists("fe80::42:acff:fe11:3"));
+        assert!(!is_own("fe80::1:2:3:4".parse().unwrap()));
     }
 
     /// Puts a lookup that never ends under way.
