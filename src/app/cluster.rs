@@ -150,8 +150,9 @@ impl ClusterDriver {
         if !matches!(input, Input::Wake | Input::Watched { .. }) {
             tracing::trace!(?input, "cluster");
         }
+        let seq = self.last_seq();
         for change in input.member_entries() {
-            self.facts.note_member_entry(change);
+            self.facts.note_member_entry(change, seq);
         }
         let actions = self.member.on(now, input);
         // A limit holds from now on. Without one, this computer is cut off, and the actions say first whom it may notify.

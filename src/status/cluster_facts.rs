@@ -25,7 +25,7 @@ pub struct ClusterFacts {
     pub uncommitted: u64,
     /// Since when etcd does not answer, and why. `None` if it answers.
     pub etcd: Option<(Instant, String)>,
-    /// All computers that have ever taken part, including this one.
+    /// All computers that this one has heard from since this rosrescue started, and this one.
     pub members: Vec<MemberFacts>,
     /// Number of takeovers by this computer.
     pub takeovers: u64,
@@ -56,11 +56,10 @@ pub struct MemberFacts {
     pub uri: String,
     pub version: String,
     pub role: Role,
-    /// The last journal record in the described computer's mirror.
-    pub seq: u64,
-    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
-    /// started.
-    pub last_heard: Option<Instant>,
+    /// Number of journal records that the described computer's mirror lacked when it described itself.
+    pub behind: u64,
+    /// When this computer last heard from the described computer.
+    pub last_heard: Instant,
 }
 
 impl MemberFacts {
@@ -68,8 +67,7 @@ impl MemberFacts {
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
 
     pub(crate) fn is_away(&self) -> bool {
-        self.last_heard
-            .is_none_or(|heard| heard.elapsed() > Self::AWAY_AFTER)
+        self.last_heard.elapsed() > Self::AWAY_AFTER
     }
 }
 
@@ -91,13 +89,13 @@ impl ClusterFacts {
     pub(crate) fn of_three() -> Self {
         let minute = Duration::from_secs(60);
         let before = Instant::now().checked_sub(minute).unwrap();
-        let member = |name: &str, role, seq, heard| MemberFacts {
+        let member = |name: &str, role, behind, last_heard| MemberFacts {
             name: name.to_owned(),
             uri: format!("http://{name}:11311/"),
             version: "0.2.0".to_owned(),
             role,
-            seq,
-            last_heard: heard,
+            behind,
+            last_heard,
         };
         Self {
             name: "pc-2".to_owned(),
@@ -116,9 +114,9 @@ impl ClusterFacts {
             uncommitted: 0,
             etcd: None,
             members: vec![
-                member("pc-3", Role::Following, 40, Some(before)),
-                member("pc-1", Role::Leading, 100, Some(Instant::now())),
-                member("pc-2", Role::Following, 90, Some(Instant::now())),
+                member("pc-3", Role::Following, 60, before),
+                member("pc-1", Role::Leading, 0, Instant::now()),
+                member("pc-2", Role::Following, 2, Instant::now()),
             ],
             takeovers: 0,
             last_takeover: None,

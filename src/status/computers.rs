@@ -69,10 +69,9 @@ pub(crate) struct Computer {
     pub(crate) uri: String,
     pub(crate) version: String,
     pub(crate) role: Role,
-    /// Number of journal records that the described computer's mirror lacks.
+    /// Number of journal records that the described computer's mirror lacked when it described itself.
     pub(crate) behind: u64,
-    /// When this computer last heard from the described computer. `None` if it has heard nothing since this rosrescue
-    /// started, and for this computer itself.
+    /// When this computer last heard from the described computer. `None` for this computer itself.
     pub(crate) heard: Option<f64>,
     /// Whether the described computer has been silent for 15 s.
     pub(crate) away: bool,
@@ -147,14 +146,8 @@ impl Computer {
                 true => facts.role,
                 false => member.role,
             },
-            behind: match is_this {
-                true => facts.behind,
-                false => facts.seq.saturating_sub(member.seq),
-            },
-            heard: member
-                .last_heard
-                .filter(|_| !is_this)
-                .map(clock::wall_time_of),
+            behind: member.behind,
+            heard: (!is_this).then(|| clock::wall_time_of(member.last_heard)),
             away: !is_this && member.is_away(),
         }
     }
@@ -223,13 +216,12 @@ impl Computers {
         for (number, computer) in self.computers.iter().enumerate() {
             let head = if number == 0 { "computers" } else { "" };
             write!(f, "{head:<12}{}", computer.name)?;
-            match (computer.name == self.name, computer.heard) {
-                (true, _) => line!(f, " (this one) {}", computer.doing(self.leads()))?,
-                (false, None) => line!(f, " is AWAY, no contact since the start")?,
-                (false, Some(heard)) if computer.away => {
-                    line!(f, " is AWAY, last contact {}", ago(heard))?;
+            match computer.heard {
+                _ if computer.name == self.name => {
+                    line!(f, " (this one) {}", computer.doing(self.leads()))?;
                 }
-                (false, Some(_)) => line!(f, " {}", computer.doing(self.leads()))?,
+                Some(heard) if computer.away => line!(f, " is AWAY, last contact {}", ago(heard))?,
+                _ => line!(f, " {}", computer.doing(self.leads()))?,
             }
         }
         if let Some(Trouble { since, why }) = &self.etcd_trouble {
@@ -347,16 +339,13 @@ mod tests {
             in_order: false,
         });
         facts.lost_writes = 1;
-        for member in &mut facts.members {
-            member.last_heard = None;
-        }
         assert_eq!(
             lines(&facts),
             [
                 "leader      NONE since THEN; the last was pc-1, term 7",
-                "computers   pc-1 is AWAY, no contact since the start",
+                "computers   pc-1 led",
                 "            pc-2 (this one) is following, 2 records behind",
-                "            pc-3 is AWAY, no contact since the start",
+                "            pc-3 is AWAY, last contact THEN",
                 "etcd        NO ANSWER since THEN: no majority",
                 "not in etcd 3 changes made here",
                 "takeover    THEN from pc-3, took 2.04 s; 2 by this computer so far",

@@ -146,7 +146,7 @@ fn add_cluster(text: &mut String, of: &Computers) {
         ("cluster_behind_records", "records of the journal that this computer's mirror lacks", Some(of.behind as f64)),
         ("cluster_uncommitted_records", "writes made here that etcd does not have yet", Some(of.uncommitted as f64)),
         ("cluster_etcd_up", "whether etcd answers", Some(u8::from(of.etcd_trouble.is_none()).into())),
-        ("cluster_computers", "computers that have ever taken part, this one included", Some(of.computers.len() as f64)),
+        ("cluster_computers", "computers that this one has heard from since its rosrescue started, itself included", Some(of.computers.len() as f64)),
         ("cluster_computers_away", "computers that have not been heard from for 15 s", Some(away as f64)),
         ("cluster_takeovers_total", "takeovers by this computer", Some(of.takeovers as f64)),
         ("cluster_last_takeover_seconds", "duration of the last takeover, from the last sign of the previous leader to the first write answered here", last.map(|last| last.seconds)),

@@ -75,8 +75,9 @@ impl ComputerFacts {
         }
     }
 
-    /// Updates the facts from what a computer has written about itself.
-    pub(super) fn note_member_entry(&mut self, change: &MemberEntryChange) {
+    /// Updates the facts from what a computer has written about itself. `seq` is the last record of the journal that this
+    /// computer knew of until then: a computer writes every 5 s, so what it says is old when the next record comes.
+    pub(super) fn note_member_entry(&mut self, change: &MemberEntryChange, seq: u64) {
         let uri = change.entry.as_ref().map(|entry| &*entry.uri);
         self.addresses.set_address(&change.name, uri);
         let Some(entry) = &change.entry else { return };
@@ -87,8 +88,8 @@ impl ComputerFacts {
             uri: entry.uri.clone(),
             version: entry.version.clone(),
             role: role.unwrap_or(Role::Joining),
-            seq: entry.seq,
-            last_heard: Some(Instant::now()),
+            behind: seq.saturating_sub(entry.seq),
+            last_heard: Instant::now(),
         };
         self.members.insert(change.name.clone(), member);
     }
@@ -100,10 +101,7 @@ impl ComputerFacts {
             .members
             .values()
             .filter(|of| of.name != self.settings.name);
-        let there = others.filter(|of| {
-            of.last_heard
-                .is_some_and(|at| at.elapsed() < MemberFacts::AWAY_AFTER)
-        });
+        let there = others.filter(|of| !of.is_away());
         let names: Vec<&str> = there.map(|of| of.name.as_str()).collect();
         if name == self.settings.name {
             return Err(format!("`{name}` already leads"));
@@ -148,7 +146,7 @@ impl ComputerFacts {
 }
 
 impl ClusterDriver {
-    /// Since when no computer leads, as far as is facts.
+    /// Since when no computer leads, as far as is known.
     fn leaderless(&self) -> Option<Instant> {
         let (role, since) = self.facts.role;
         let gone = match role {
@@ -160,6 +158,11 @@ impl ClusterDriver {
         gone.then_some(sign)
     }
 
+    /// The last record of the journal that this computer knows of.
+    pub(super) fn last_seq(&self) -> u64 {
+        self.member.view().seq().max(self.member.seq())
+    }
+
     /// Updates the status.
     pub(super) fn show(&mut self) {
         self.facts.note_view(self.member.view());
@@ -167,29 +170,29 @@ impl ClusterDriver {
             self.facts.role = (self.member.role(), Instant::now());
         }
         let facts = &self.facts;
+        let last = self.last_seq();
+        let behind = last - self.member.seq();
         let own = self.member.member_entry();
         let own = MemberFacts {
             name: self.member.settings().name.clone(),
             uri: own.uri,
             version: own.version,
             role: self.member.machine().role(),
-            seq: own.seq,
-            last_heard: Some(Instant::now()),
+            behind,
+            last_heard: Instant::now(),
         };
         let others = facts.members.values().filter(|of| of.name != own.name);
         let mut members: Vec<_> = others.cloned().collect();
         members.push(own);
         members.sort_by(|a, b| a.name.cmp(&b.name));
-        let (name, seq) = (self.member.settings().name.clone(), self.member.seq());
-        let last = self.member.view().seq().max(seq);
         let facts = ClusterFacts {
-            name,
+            name: self.member.settings().name.clone(),
             role: facts.role.0,
             since: facts.role.1,
             leader: facts.leader.clone(),
             leaderless: self.leaderless(),
             seq: last,
-            behind: last - seq,
+            behind,
             uncommitted: self.member.uncommitted() as u64,
             etcd: self.trouble.get().or_else(|| {
                 let lost = self.member.etcd_lost()?;

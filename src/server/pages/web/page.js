@@ -328,7 +328,7 @@ function showComputers(cluster) {
     const led = of.role === "leading" && (leaderless || leader?.name !== of.name);
     const role = of.away ? "AWAY" : led ? "led" : ROLES[of.role] ?? of.role;
     const behind = of.away || of.role === "leading" ? "" : of.behind ? `${plural(of.behind, "record")} behind` : "has every record";
-    const heard = isThis ? "this computer" : of.heard ? `last contact ${moment(of.heard)}` : "no contact since the start";
+    const heard = isThis ? "this computer" : `last contact ${moment(of.heard)}`;
     const link = /^https?:/.test(of.uri) ? el("a", { href: of.uri }, of.name) : of.name;
     return el("tr", {}, ...[link, el("span", { class: "health", "data-is": is }, role), behind, heard, of.version].map((cell) => el("td", {}, cell)));
   });
