@@ -125,14 +125,18 @@ impl Context {
     }
 }
 
-/// Whether something restarts the guardian `pid` when it ends: systemd, or the runtime of the
-/// container whose first process it is.
+/// The first process of a container with `docker run --init`, or `init: true` in a compose file. It ends with its child.
+const INITS: [&str; 4] = ["tini", "docker-init", "catatonit", "dumb-init"];
+
+/// Whether something restarts the guardian `pid` when it ends: systemd, or the runtime of its container.
 fn is_restarted(pid: u32) -> bool {
     let parent = process::parent_of(pid);
-    let of_systemd = |parent| process::name_of(parent) == "systemd";
+    let name = parent.map(process::name_of).unwrap_or_default();
     // systemd sets INVOCATION_ID for everything that it starts, but terminals inherit it, so the
     // parent is checked too.
-    pid == 1 || (std::env::var_os("INVOCATION_ID").is_some() && parent.is_some_and(of_systemd))
+    let by_systemd = std::env::var_os("INVOCATION_ID").is_some() && name == "systemd";
+    let by_runtime = pid == 1 || parent == Some(1) && INITS.contains(&name.as_str());
+    by_systemd || by_runtime
 }
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
