@@ -99,6 +99,8 @@ pub(super) struct Computer {
     pub(super) refused: bool,
     /// Counts the processes of this computer.
     pub(super) life: u64,
+    /// Whether this process has been told to stop.
+    pub(super) stops: bool,
     /// The computer hangs until this time.
     pub(super) hangs_until: u64,
     /// The computer has not hung since this time.
@@ -185,6 +187,7 @@ impl Computer {
             up: true,
             refused: false,
             life: 0,
+            stops: false,
             hangs_until: 0,
             undisturbed_since: 0,
             disturbed_until: 0,
@@ -220,6 +223,7 @@ impl Computer {
     /// Starts a new process. The memory of the previous one is lost.
     pub(super) fn start(&mut self, index: usize, plan: &ScheduleOptions) {
         self.life += 1;
+        self.stops = false;
         self.seen_unreadable = 0;
         (self.has_read, self.unaware) = (false, false);
         self.follows_lost = false;

@@ -753,12 +753,18 @@ impl World {
                 News::EtcdLost => self.etcd_is_lost(at),
                 _ => {}
             },
-            Action::EndRosout => inputs.push_back(Input::RosoutEnded),
+            Action::EndRosout => {
+                // Some take longer than a stop may.
+                let most = if self.dice.one_in(8) { 6000 } else { 200 };
+                let time = self.dice.below(most) * MS;
+                self.after(time, Event::Input(at, life, Input::RosoutEnded));
+            }
             Action::EndForNamesake(_) => {
                 self.computers[at].refused = true;
                 self.computers[at].up = false;
             }
-            Action::End => self.computers[at].up = false,
+            Action::End if self.computers[at].up => self.stopped(at),
+            Action::End => {}
             Action::AnswerFromMirror
             | Action::AnswerNothing
             | Action::ShutDownDisplaced(_)

@@ -16,6 +16,8 @@ pub(in super::super) struct ScheduleOptions {
     pub(in super::super) faults: bool,
     /// Whether etcd loses data, too: keys are deleted, or an older copy is restored.
     pub(in super::super) data_loss: bool,
+    /// Whether processes also stop in order.
+    pub(in super::super) stops: bool,
     /// Whether two computers have the same name.
     pub(in super::super) twins: bool,
     pub(in super::super) ttl: Duration,
@@ -31,6 +33,8 @@ pub(in super::super) struct Counts {
     pub(in super::super) reads: u64,
     pub(in super::super) merged: u64,
     pub(in super::super) reported: u64,
+    /// How often a process has stopped in order.
+    pub(in super::super) stopped: u64,
     /// How often a computer noticed that etcd had lost its data.
     pub(in super::super) etcds_lost: u64,
     /// How often etcd's keys were deleted, and how often an older copy was restored.
@@ -48,6 +52,7 @@ impl Counts {
         self.reads += other.reads;
         self.merged += other.merged;
         self.reported += other.reported;
+        self.stopped += other.stopped;
         self.etcds_lost += other.etcds_lost;
         self.deleted += other.deleted;
         self.restored += other.restored;
@@ -161,6 +166,7 @@ impl World {
         // Without data loss, a seed keeps its schedule.
         let kinds = if self.plan.data_loss { 16 } else { 14 };
         let fault = match self.dice.below(kinds) {
+            0 | 1 if self.plan.stops && self.dice.one_in(2) => return self.stop(at),
             0 | 1 => Fault::Kill(at),
             2 => Fault::CutFromEtcd(at),
             3 => Fault::CutPair(at, other),
@@ -371,6 +377,31 @@ impl World {
             self.computers[at].start(at, &plan);
             self.input(at, Input::Begin);
         }
+    }
+
+    /// Tells a process to stop, as `systemctl restart` does.
+    pub(in super::super) fn stop(&mut self, at: usize) {
+        let computer = &mut self.computers[at];
+        if computer.up && !computer.stops {
+            computer.stops = true;
+            self.disturbs(at, 5000 * MS);
+            self.trace(|| format!("{at} is told to stop"));
+            self.input(at, Input::Stop);
+        }
+    }
+
+    /// A process has stopped in order, and its disk is synced. It starts again after a while.
+    pub(super) fn stopped(&mut self, at: usize) {
+        self.trace(|| format!("{at} has stopped"));
+        self.kill(at);
+        let computer = &mut self.computers[at];
+        computer.write_disk();
+        computer.synced = computer.disk.clone();
+        computer.synced_at = self.now;
+        let time = (20 + self.dice.below(4000)) * MS;
+        self.disturbs(at, time);
+        self.counts.stopped += 1;
+        self.after(time, Event::End(Fault::Kill(at)));
     }
 
     pub(in super::super) fn hand_over(&mut self, at: usize) {
