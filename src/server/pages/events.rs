@@ -260,7 +260,7 @@ impl LastCheck {
 }
 
 /// Rounds values that would differ each time without a real change: times of day, which are computed from the present
-/// time, and free bytes.
+/// time, and the free bytes of the disk.
 fn settle(value: &mut Value) {
     match value {
         Value::Number(number) if number.is_f64() => {
@@ -268,13 +268,17 @@ fn settle(value: &mut Value) {
                 *value = ((seconds * 10.0).round() / 10.0).into();
             }
         }
-        Value::Number(number) => {
-            if let Some(bytes) = number.as_u64().filter(|bytes| *bytes > DISK_STEP) {
-                *value = (bytes / DISK_STEP * DISK_STEP).into();
+        Value::Array(elements) => elements.iter_mut().for_each(settle),
+        Value::Object(members) => {
+            for (name, member) in members {
+                match member.as_u64() {
+                    Some(bytes) if name == "disk_free_bytes" => {
+                        *member = (bytes / DISK_STEP * DISK_STEP).into();
+                    }
+                    _ => settle(member),
+                }
             }
         }
-        Value::Array(elements) => elements.iter_mut().for_each(settle),
-        Value::Object(members) => members.values_mut().for_each(settle),
         _ => {}
     }
 }
@@ -283,4 +287,25 @@ fn settle(value: &mut Value) {
 fn event(name: &str, data: &impl Serialize) -> Bytes {
     let data = serde_json::to_string(data).unwrap_or_default();
     format!("event: {name}\ndata: {data}\n\n").into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_and_free_bytes_are_rounded_and_counters_are_not() {
+        let mut status = serde_json::json!({
+            "counters": {"calls": 100_000_007},
+            "journal": {"disk_free_bytes": 123_456_789_012_u64},
+            "nodes": [{"since": 1_764_528_823.123_456, "seconds": 0.123_456}],
+        });
+        settle(&mut status);
+        let expected = serde_json::json!({
+            "counters": {"calls": 100_000_007},
+            "journal": {"disk_free_bytes": 123_400_000_000_u64},
+            "nodes": [{"since": 1_764_528_823.1, "seconds": 0.123_456}],
+        });
+        assert_eq!(status, expected);
+    }
 }
