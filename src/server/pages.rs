@@ -50,6 +50,7 @@ use crate::{
         Board,
         metrics::{metrics, openmetrics},
         stats::Stats,
+        summary::Status,
     },
     upstream::Upstream,
 };
@@ -137,7 +138,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         "/" if accepts(headers, "text/html") => {
             reply(StatusCode::OK, HTML, include_str!("pages/web/page.html"))
         }
-        "/" => text(StatusCode::OK, pages.status().to_string()),
+        "/" => present_status(server, |status| text(StatusCode::OK, status.to_string())).await,
         "/page.css" => reply(StatusCode::OK, "text/css", include_str!("pages/web/page.css")),
         "/page.js" => script(include_str!("pages/web/page.js")),
         "/graph.js" => script(include_str!("pages/web/graph.js")),
@@ -145,7 +146,9 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         "/overview.js" => script(include_str!("pages/web/overview.js")),
         "/layout.js" => script(include_str!("pages/web/layout.js")),
         "/dagre.js" => script(include_str!("pages/web/vendor/dagre.js")),
-        "/status.json" => json(serde_json::to_string_pretty(&pages.status())),
+        "/status.json" => {
+            present_status(server, |status| json(serde_json::to_string_pretty(&status))).await
+        }
         "/state.json" => match Asked::read(uri) {
             asked @ Asked { at: Some(_), .. } => past::state(server, asked).await,
             asked => state(server, asked).await,
@@ -325,6 +328,12 @@ async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
         })
     };
     in_background(work).await
+}
+
+/// Shows the present status. With many nodes it takes long to collect.
+async fn present_status(server: &Arc<Server>, show: fn(Status) -> HttpReply) -> HttpReply {
+    let server = server.clone();
+    in_background(move || show(server.pages.status())).await
 }
 
 /// Makes an answer in a thread that may block.
