@@ -135,9 +135,9 @@ function connect() {
     readState();
   };
   source.onerror = () => {
-    setLink("lost", "no answer from rosrescue, retrying");
     // The browser reconnects by itself after a lost connection, but not after a refusal.
     if (source.readyState === EventSource.CLOSED) setTimeout(refused, 2000);
+    else setLink("lost", "no answer from rosrescue, retrying");
   };
   source.addEventListener("status", (event) => {
     heard = Date.now();
@@ -170,7 +170,7 @@ async function refused() {
       readState();
     }
   } catch {
-    // rosrescue does not answer.
+    setLink("lost", "no answer from rosrescue, retrying");
   }
   connect();
 }
