@@ -38,8 +38,9 @@ const NOTE_AGAIN: Duration = Duration::from_secs(5);
 const SETTLE: Duration = Duration::from_millis(100);
 /// The same pause, as a multiple of the time that the last look took. A look at 10,000 nodes takes longer than [`SETTLE`].
 const SETTLE_LOOKS: u32 = 10;
-/// Number of nodes asked at the same time.
-const AT_ONCE: usize = 8;
+/// Number of nodes asked at the same time. A node that does not answer takes a place for `--node-timeout`, and the others
+/// must have their turn before what is known of them is too old.
+const AT_ONCE: usize = 32;
 
 /// What is known about which nodes are alive.
 #[derive(Debug)]
