@@ -198,8 +198,8 @@ impl Drop for OpenCall<'_> {
 }
 
 impl Upstream {
-    /// Prepares connections to `address`. `instance` identifies this process. A connection also ends after the kernel's
-    /// probes were unanswered, with the count and timeout of rosrescue's own probes.
+    /// Prepares connections to `address`. A connection also ends after the kernel's probes were unanswered, with the count
+    /// and timeout of rosrescue's own probes.
     pub fn new(address: MasterUri, probe_timeout: Duration, probe_count: u32) -> Self {
         Self {
             address: watch::Sender::new(address),

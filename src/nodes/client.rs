@@ -1,10 +1,6 @@
 //! Calls a node at its own port.
 
-use std::{
-    net::{IpAddr, SocketAddr},
-    pin::pin,
-    time::Duration,
-};
+use std::{pin::pin, time::Duration};
 
 use rescue_core::health::Claims;
 use ros1_master::{
@@ -87,13 +83,6 @@ pub(super) async fn call_unless(
         value,
         is_connected,
     })
-}
-
-/// The host of `api`, resolved to its first address. `None` if it has no address within `limit`.
-pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
-    let MasterUri { host, port } = MasterUri::parse(api).ok()?;
-    let found = timeout(limit, resolver::addresses(&host, port)).await;
-    found.ok()?.ok()?.first().map(SocketAddr::ip)
 }
 
 /// A node's answers about itself.
@@ -181,6 +170,8 @@ async fn put(connection: &mut Connection, call: &Call) -> (Reaction, Option<Valu
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
     use socket2::{Domain, Socket, Type};
     use tokio::{io::AsyncReadExt, net::TcpListener};
 

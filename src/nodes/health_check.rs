@@ -6,7 +6,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet},
-    net::{IpAddr, SocketAddr},
+    net::SocketAddr,
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
@@ -16,7 +16,7 @@ use tokio::task::JoinSet;
 use super::{
     Nodes,
     client::{self, Interview, Reaction},
-    notifications,
+    notifications, origin,
 };
 use crate::status::report::HealthCheck;
 use rescue_core::{
@@ -364,23 +364,19 @@ async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
         return false;
     };
     let (_, named) = client::call_for_value(api, &question("getMasterUri"), limit).await;
-    let named = named.as_ref().and_then(Value::as_str);
-    let named = named.map(MasterUri::parse).and_then(Result::ok);
+    let text = named.as_ref().and_then(Value::as_str).unwrap_or_default();
     let own = MasterUri::parse(&nodes.ledger.uri());
-    let (Some(named), Ok(own), Ok(node)) = (named, own, MasterUri::parse(api)) else {
+    let (Ok(named), Ok(own)) = (MasterUri::parse(text), own) else {
         return false;
     };
-    let named_at = addresses(&named, limit).await;
-    let mut at = addresses(&node, limit).await.into_iter();
+    let addresses = async |of| {
+        let found = origin::addresses(of, limit).await.unwrap_or_default();
+        found.iter().map(SocketAddr::ip).collect::<Vec<_>>()
+    };
+    let named_at = addresses(text).await;
+    let mut at = addresses(api).await.into_iter();
     let node_is_here = at.any(resolver::is_own);
     named.names(&own, &named_at, node_is_here, resolver::is_own)
-}
-
-/// The addresses of a host. Empty if none is found within `limit`.
-async fn addresses(at: &MasterUri, limit: Duration) -> Vec<IpAddr> {
-    let found = tokio::time::timeout(limit, resolver::addresses(&at.host, at.port)).await;
-    let found = found.ok().and_then(Result::ok).unwrap_or_default();
-    found.iter().map(SocketAddr::ip).collect()
 }
 
 impl Findings {

@@ -11,7 +11,7 @@ use std::{
 use rescue_core::health::Rates;
 use tokio::sync::{Mutex as Turn, OwnedMutexGuard, Semaphore, SemaphorePermit};
 
-use super::client;
+use super::origin;
 
 /// Number of nodes that are asked at the same time. Each takes two file descriptors, at most until its deadline.
 const AT_ONCE: usize = 64;
@@ -45,7 +45,7 @@ impl Visits {
     /// Waits until the node at `port` may be asked. `None` if its host has no address within `limit`.
     pub(super) async fn admit(&self, port: &str, limit: Duration) -> Option<Admitted<'_>> {
         let turn = self.turn(port).lock_owned().await;
-        let host = client::host(port, limit).await?;
+        let host = origin::addresses(port, limit).await?.first()?.ip();
         let from = {
             let mut rates = self.rates.lock().unwrap_or_else(PoisonError::into_inner);
             rates.reserve(host, Instant::now())
