@@ -19,7 +19,7 @@ use super::{
     body::SMALL,
     compare::Comparisons,
     hold::Hold,
-    others::Others,
+    others::{Others, own_address},
     replies::{
         HttpReply, delivered, encode_with_own_uri, encoded, forwarded, no_shutdown,
         refused_by_rosmaster, xml,
@@ -106,17 +106,14 @@ pub struct Calls {
 #[derive(Clone)]
 pub(super) struct Incoming {
     source: Source,
-    origin: Origin,
+    caller: IpAddr,
 }
 
 impl Incoming {
-    /// A call from `source`, made at the address `caller`. `own` is the address that stands for this computer.
-    pub(super) fn new(source: Source, caller: IpAddr, own: IpAddr) -> Self {
+    /// A call from `source`, made at the address `caller`.
+    pub(super) fn new(source: Source, caller: IpAddr) -> Self {
         let caller = caller.to_canonical();
-        // This computer may lose the address later, and its nodes are still its own.
-        let is_here = resolver::is_own(caller);
-        let origin = Origin::At(if is_here { own } else { caller });
-        Self { source, origin }
+        Self { source, caller }
     }
 }
 
@@ -156,8 +153,7 @@ impl Calls {
         }
         match &self.others {
             None => {
-                let own = IpAddr::V4(Ipv4Addr::LOCALHOST);
-                let incoming = Incoming::new(Source::Here, peer.ip(), own);
+                let incoming = Incoming::new(Source::Here, peer.ip());
                 let mut hold = Hold::new(self.hold);
                 Ok(self
                     .answer_here(head, body, call, incoming, &mut hold)
@@ -493,8 +489,8 @@ impl Calls {
         Ok(delivered(reply, delivery))
     }
 
-    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection, or while
-    /// the master takes too long, the mirror answers only a write that changes nothing.
+    /// Queues a write. While the master is away, is late or gets its state, the mirror answers it from the queue. While the
+    /// mirror is frozen, it answers only a write that changes nothing.
     async fn queue(
         &self,
         head: Head,
@@ -506,7 +502,7 @@ impl Calls {
         let is_answerable = call.as_deref().is_some_and(Request::is_answerable);
         let patience = Some(self.patience().into_std());
         let (item, answered) = Item::of_client((head, body), call, patience);
-        let item = item.came_from(incoming.source, incoming.origin);
+        let item = item.came_from(incoming.source, self.origin(incoming.caller));
         self.write_queue.submit(item).await;
         let mut gate = self.gate.clone();
         let held = async {
@@ -528,6 +524,16 @@ impl Calls {
                 Err(Closed(NOT_IN_TIME).into())
             }
         }
+    }
+
+    /// The origin of a write that was made at the address `caller`. This computer may lose its own address later, and its
+    /// nodes are still its own.
+    fn origin(&self, caller: IpAddr) -> Origin {
+        Origin::At(match (resolver::is_own(caller), &self.others) {
+            (false, _) => caller,
+            (true, None) => IpAddr::V4(Ipv4Addr::LOCALHOST),
+            (true, Some(_)) => own_address(&self.uri),
+        })
     }
 
     /// When the mirror answers instead of the master. If an earlier call waits for the master already, this call does

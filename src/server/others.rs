@@ -185,7 +185,7 @@ impl Others {
                         Some(_) => Source::Forwarded,
                         None => Source::Here,
                     };
-                    let incoming = Incoming::new(source, call.from, own_address(&calls.uri));
+                    let incoming = Incoming::new(source, call.from);
                     let answered = tokio::select! {
                         biased;
                         // A cut-off computer answers only its own nodes. The computer that forwarded this call may not
