@@ -218,7 +218,7 @@ def readme():
     return "\n".join([
         f"Medians with 80 nodes ({caption('pauses')}):",
         "",
-        f"* **Rescue:** {number(RECOVERY.cell('whole state', '80'))} ms from `kill -9` to the complete state in a new master."
+        f"* **Rescue:** {number(RECOVERY.cell('whole state', '80'))} ms from `kill -9` to the whole state in a new master."
         f" Starting rosmaster takes {number(RECOVERY.cell('new port open', '80'))} ms of it.",
         f"* **Pauses:** during a kill, the longest read takes {number(PAUSES.cell('read', CORE))} ms and the longest write {number(PAUSES.cell('write', CORE))} ms.",
         f"* **Cost:** a `getParam` takes {ratio:.1f} times as long as with a bare rosmaster. A single write takes {first(write[0]):.2f} ms instead of {first(write[1]):.2f}.",

@@ -1,6 +1,6 @@
 //! The ledger: the mirror, which is a model of the master's whole state, and the journal of its changes, under one
 //! lock. A write is applied to the mirror and passed to the journal in one step, and its answer waits until the journal
-//! is [written](journal).
+//! is [written](disk_jobs).
 //!
 //! The same lock orders writes and the start of a new incarnation, which is one life of a master process. So a reply of
 //! the old master does not count if it arrives after the state for the new master was taken.
@@ -10,6 +10,7 @@ mod answers;
 pub(crate) mod checkpointer;
 pub(crate) mod delivery;
 pub(crate) mod disk_jobs;
+mod divergences;
 pub(crate) mod durability;
 pub(crate) mod first;
 pub(crate) mod history;
@@ -19,7 +20,6 @@ pub(crate) mod mutant;
 pub(crate) mod owed;
 mod pending;
 mod shared;
-mod summary;
 
 use std::{
     collections::BTreeSet,
@@ -49,7 +49,7 @@ use self::{
     inner::{Inner, Notifier, StateFrom},
     late::{CatchUp, LateState, Missed, Outstanding, notified_once},
     mutant::Mutant,
-    shared::{Agreement, LeaderLease, Shared},
+    shared::{Acknowledged, LeaderLease, Shared},
 };
 use crate::{
     cli::SyncPolicy,
@@ -94,7 +94,7 @@ pub struct Ledger {
     sync_is_late: AtomicBool,
     /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
-    pub(crate) agreement: Agreement,
+    pub(crate) acknowledged: Acknowledged,
     pub(crate) lease: LeaderLease,
     /// The mirror's version in the last complete checkpoint that was written or could not be written.
     attempted: watch::Sender<u64>,
@@ -130,7 +130,7 @@ impl Ledger {
             durable: watch::channel(0).0,
             sync_is_late: AtomicBool::new(false),
             disk_silent: Notify::new(),
-            agreement: Agreement::new(),
+            acknowledged: Acknowledged::new(),
             lease: LeaderLease::new(),
             attempted: watch::channel(0).0,
             work: Notify::new(),
@@ -300,7 +300,7 @@ impl Ledger {
         let mut inner = self.lock();
         let is_certain = !inner.is_frozen()
             && !inner.doubted
-            && matches!(inner.shared, Shared::Nobody)
+            && matches!(inner.shared, Shared::Single)
             && inner.journal.is_some()
             && Write::parse(call).is_some_and(|write| inner.mirror.accepts(&write));
         if !is_certain {
@@ -442,7 +442,7 @@ impl Ledger {
         inner.shared = Shared::Elsewhere;
         inner.order.forget_notifications();
         drop(inner);
-        self.agreement.note_deposed();
+        self.acknowledged.note_deposed();
         last.map(|last| last.seq)
     }
 
@@ -455,7 +455,7 @@ impl Ledger {
     /// the state that the others hold. If this computer's state differs, the others get the whole state.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
-        let times_led = self.agreement.times_led();
+        let times_led = self.acknowledged.times_led();
         let sharing = Sharing::after(seq);
         inner.shared = Shared::Here { times_led, sharing };
         if inner.mirror != *held {
@@ -463,7 +463,7 @@ impl Ledger {
         }
         drop(inner);
         // The other computers have these records. A write that changes nothing waits only for the last of them.
-        self.agreement.reach(seq);
+        self.acknowledged.reach(seq);
         self.shared.notify_one();
     }
 
@@ -485,9 +485,9 @@ impl Ledger {
         }
     }
 
-    /// Decides for each of `calls`, which another computer answered while it was cut off, whether it conflicts with a
-    /// change after record `seq`. That computer sends them under the name `merge`, so changes of this name are no
-    /// conflict. `None` if this computer does not lead, or no longer knows all changes after `seq`.
+    /// Decides for each of another computer's partition writes `calls` whether it conflicts with a change after record `seq`.
+    /// That computer sends them under the name `merge`, so changes of this name are no conflict. `None` if this computer does
+    /// not lead, or no longer knows all changes after `seq`.
     pub(crate) fn merge_verdicts(
         &self,
         seq: u64,

@@ -9,21 +9,22 @@
 //!
 //! This crate does IO and decides as little as possible. From the bottom to the top:
 //!
-//! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
-//! * `clock`, `resolver`, `task`, `wait`: the wall clock; addresses of hosts; starting tasks; waiting for optional events.
-//! * `limit`, [`logging`]: how often a line is logged; where the log goes.
+//! * `clock`: the wall clock. `limit`, [`logging`]: how often a line is logged; where the log goes. `printable`: foreign
+//!   text, made safe to print. `task`, `wait`: starting tasks; waiting for optional events.
+//! * [`cli`], [`ros_env`], [`config`], `resolver`: command line, ROS's environment variables, configuration, addresses of
+//!   hosts.
+//! * [`cluster`]: the robot's keys in etcd, for several computers.
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
-//! * [`cluster`]: the robot's keys in etcd, for several computers.
 //! * `ledger`: mirror and journal under one lock.
-//! * `upstream`: connections to the master.
+//! * `upstream`: connections to the master and to other computers.
 //! * `write_queue`: writes on their way to the master, in order.
+//! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
 //! * `process`: the processes of rosmaster and rosout, and orphans of an earlier rosrescue.
 //! * `nodes`: calls to nodes: health check and notifications.
 //! * `recovery`: watching the master, reading its state, and restoring it.
 //! * `roscore`: roscore's other duties.
 //! * `server`: the side that clients talk to.
-//! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
 //! * [`app`]: assembles the program.
 //! * [`commands`]: the commands that do not serve nodes.
 //! * [`program`]: arguments, logging, signals and exit statuses.

@@ -1,4 +1,5 @@
-//! Watches the nodes, and keeps facts about them that their registrations do not contain.
+//! Watches the nodes: notifies them, asks unreachable and new ones, and runs the regular health check. Keeps facts about
+//! them that their registrations do not contain.
 
 pub(crate) mod addresses;
 pub(crate) mod client;
@@ -22,8 +23,8 @@ use std::{
 };
 
 use rescue_core::{
-    health::{Repeats, Unreachable, port_of},
-    order::Subject,
+    health::{Unreachable, port_of},
+    order::{BesideMaster, Subject},
 };
 use tokio::sync::Notify;
 use tracing::Instrument;
@@ -251,7 +252,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         .local
         .is_regular_check_enabled()
         .then(|| tokio::time::interval_at(first_check, REAP_INTERVAL));
-    let mut repeats = Repeats::<NotifyingChange>::default();
+    let mut repeats = BesideMaster::<NotifyingChange>::default();
     let mut gate = nodes.gate.clone();
     // When to send the notifications that the absent master may not have sent, and whether they were sent.
     let (mut owed_at, mut owed_told) = (None, false);
@@ -303,7 +304,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     }
 }
 
-fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<NotifyingChange>) {
+fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut BesideMaster<NotifyingChange>) {
     let outbox = nodes
         .ledger
         .with_activity(|_, activity| activity.take_outbox());

@@ -1,4 +1,4 @@
-//! Connections to the master. An *incarnation* is one life of a master process; a call must reach the present one.
+//! Connections to the master, and to other computers ([`peer`]). An *incarnation* is one life of a master process; a call must reach the present one.
 
 mod connection;
 pub(crate) mod inspect;

@@ -35,7 +35,7 @@ use self::{
 pub(crate) use self::{dispatcher::PATIENCE, drain::Drain, evict::MoveJudge};
 use crate::{cli::Writes, ledger::Ledger, status::stats::Stats, upstream::Upstream};
 
-/// Maximum number of calls in the channel from the clients to the worker, which always empties it at once.
+/// Maximum number of calls in the channel from the clients to the task, which always empties it at once.
 const CHANNEL: usize = 64;
 
 /// The clients' handle to the queue.
@@ -48,7 +48,7 @@ pub struct WriteQueue {
 
 impl WriteQueue {
     pub(crate) async fn submit(&self, item: Item) {
-        // The worker ends only when rosrescue stops. The answer's sender is dropped then.
+        // The task ends only when rosrescue stops. The answer's sender is dropped then.
         let _ = self.items.send(item).await;
     }
 
@@ -67,8 +67,8 @@ impl WriteQueue {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes the writes in `ask`, which the computer `origin` answered while it was cut off. Leaves out those that
-    /// conflict with changes by other computers. `None` if there is no answer.
+    /// Makes the partition writes of the computer `origin` in `ask`. Leaves out those that conflict with changes by other
+    /// computers. `None` if there is no answer.
     pub(crate) async fn merge(&self, ask: Ask, origin: Origin) -> Option<wire::MergeAnswer> {
         let (item, answered, judged) = merge::item(ask, origin);
         self.items.send(item).await.ok()?;
@@ -122,7 +122,7 @@ impl WriteQueue {
     }
 }
 
-/// Signals between the worker and the recovery.
+/// Signals between the task of the queue and the recovery.
 #[derive(Debug)]
 struct Signals {
     batch_lost: Notify,
@@ -132,7 +132,7 @@ struct Signals {
     slow: Notify,
 }
 
-/// Creates a write queue and its worker. `resync_interval` is the pause between two comparisons of master and mirror;
+/// Creates a write queue and its task. `resync_interval` is the pause between two comparisons of master and mirror;
 /// `None` for never. `judge` judges calls that could make the master shut down an innocent node. `writes` says who
 /// answers writes, and `patience` how long they wait for the master.
 pub(crate) fn write_queue(

@@ -275,7 +275,7 @@ impl ClusterDriver {
                     let _ = ledger.follow_state(state);
                 }
             }
-            Action::Acknowledge(seq) => ledger.agreement.reach(seq),
+            Action::Acknowledge(seq) => ledger.acknowledged.reach(seq),
             Action::TakeAsState => {
                 let state = ledger.take_as_state();
                 self.inbox.push_front(Input::AsState(state));

@@ -114,7 +114,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 beginning = Some((mirror, session, pending, displaced));
             }
             Decision::Fresh(why) => {
-                // A crashed rosrescue may have left its master running. That master is taken over.
+                // A crashed rosrescue may have left its master running. That master is adopted.
                 master_uri = session.master_uri.filter(|_| !session.closed);
                 // The new session keeps this token and counts on, so that its masters show that a copy of the old
                 // checkpoint is older.

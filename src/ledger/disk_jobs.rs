@@ -217,7 +217,7 @@ impl Journal {
     }
 
     /// The handle with which a thread runs the jobs.
-    pub(super) fn worker(&self) -> Arc<StoreQueue> {
+    pub(super) fn store_queue(&self) -> Arc<StoreQueue> {
         Arc::clone(&self.shared)
     }
 

@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use super::{
     Ledger,
     disk_jobs::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
-    shared::Agreed,
+    shared::SharedRecord,
 };
 
 /// Identifies a record that an answer may have to wait for.
@@ -20,8 +20,8 @@ use super::{
 pub struct Mark {
     /// The record's number in this computer's journal. `None` without a journal.
     pub(super) disk: Option<u64>,
-    /// The record's place among the writes that the other computers receive.
-    pub(super) shared: Option<Agreed>,
+    /// The record among those that the other computers get.
+    pub(super) shared: Option<SharedRecord>,
 }
 
 impl Mark {
@@ -69,8 +69,8 @@ impl Ledger {
         (mark != Mark::default()).then_some(mark)
     }
 
-    /// Waits until the records up to `mark` are safe: written to the file, with `--sync always` also synced, and
-    /// replicated to the other computers. Does not wait for a disk that fails or is silent for [`DISK_PATIENCE`]. False
+    /// Waits until the records up to `mark` are safe: written to the file, with `--sync always` also synced, and with
+    /// several computers acknowledged: in etcd, or with `--cluster-sync interval` on their way there. Does not wait for a disk that fails or is silent for [`DISK_PATIENCE`]. False
     /// if another computer leads by now and may not have the records.
     pub async fn durable(&self, mark: Mark) -> bool {
         if let Some(seq) = mark.disk {
@@ -83,7 +83,7 @@ impl Ledger {
             }
         }
         match mark.shared {
-            Some(place) => self.agreement.wait(place).await,
+            Some(place) => self.acknowledged.wait(place).await,
             None => true,
         }
     }
@@ -100,8 +100,8 @@ impl Ledger {
         if self.writes_by_hand.load(Ordering::Relaxed) {
             return;
         }
-        if let Some(worker) = self.worker() {
-            worker.wake();
+        if let Some(queue) = self.store_queue() {
+            queue.wake();
         }
     }
 
@@ -114,22 +114,22 @@ impl Ledger {
     /// Whether records wait for the disk.
     #[cfg(test)]
     pub(crate) fn has_jobs(&self) -> bool {
-        self.worker().is_some_and(|worker| worker.has_jobs())
+        self.store_queue().is_some_and(|queue| queue.has_jobs())
     }
 
     /// Writes the queued records.
     #[cfg(test)]
     pub(crate) fn run_jobs(&self) {
-        if let Some(worker) = self.worker() {
-            worker.work();
+        if let Some(queue) = self.store_queue() {
+            queue.work();
         }
     }
 
     /// Drops the queued records, as a death of the process does.
     #[cfg(test)]
     pub(crate) fn drop_jobs(&self) {
-        if let Some(worker) = self.worker() {
-            worker.drop_jobs();
+        if let Some(queue) = self.store_queue() {
+            queue.drop_jobs();
         }
     }
 
@@ -139,8 +139,8 @@ impl Ledger {
         *self.attempted.borrow() >= version
     }
 
-    fn worker(&self) -> Option<Arc<disk_jobs::StoreQueue>> {
-        self.lock().journal.as_ref().map(Journal::worker)
+    fn store_queue(&self) -> Option<Arc<disk_jobs::StoreQueue>> {
+        self.lock().journal.as_ref().map(Journal::store_queue)
     }
 
     /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded until the next complete

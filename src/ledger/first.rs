@@ -62,7 +62,7 @@ impl Ledger {
             && !inner.doubted
             && !inner.is_unconfirmed()
             && !inner.outstanding.is_abandoned()
-            && matches!(inner.shared, Shared::Nobody)
+            && matches!(inner.shared, Shared::Single)
             && (inner.journal.as_ref().is_some_and(|it| it.protects())
                 || Mutant::AnswersUnprotected.lives())
             && inner.pending.has_room_for(call, UNACKNOWLEDGED_MAX)

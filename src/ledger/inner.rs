@@ -18,12 +18,12 @@ use tokio::sync::Notify;
 use super::{
     activity::{Activity, Noticed},
     disk_jobs::Journal,
+    divergences::Divergences,
     durability::{Mark, Whole},
     late::Outstanding,
     mutant::Mutant,
     pending::{PendingWrites, TooMany},
     shared::Shared,
-    summary::Divergences,
 };
 use crate::{
     clock,
@@ -99,7 +99,7 @@ impl Inner {
             session,
             journal: None,
             seq,
-            shared: Shared::Nobody,
+            shared: Shared::Single,
             version: 0,
             whole: Whole::default(),
             ahead: None,

@@ -1,5 +1,4 @@
-//! Replication: whose writes the ledger holds, how far the other computers have them, and until when this computer may
-//! lead.
+//! Replication: whose writes the ledger holds, which of them may be answered, and until when this computer may lead.
 
 use std::time::Instant;
 
@@ -12,25 +11,25 @@ use crate::wait;
 #[derive(Debug)]
 pub(super) enum Shared {
     /// This is the only computer.
-    Nobody,
+    Single,
     /// Another computer has the master. Only its records are applied and recorded.
     Elsewhere,
     /// This computer has the master. The other computers get its writes.
     Here { times_led: u64, sharing: Sharing },
 }
 
-/// A position in the journal that all computers share: a record's number, and a count of
-/// [`Ledger::leave`](super::Ledger::leave) calls, which tells the terms of this computer apart.
+/// A record among those that the other computers get: its number, and how often this computer has led before, which tells
+/// its terms apart.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Agreed {
+pub(crate) struct SharedRecord {
     times_led: u64,
     pub(super) seq: u64,
 }
 
 impl Shared {
-    pub(super) fn last(&self) -> Option<Agreed> {
+    pub(super) fn last(&self) -> Option<SharedRecord> {
         match self {
-            Self::Here { times_led, sharing } => Some(Agreed {
+            Self::Here { times_led, sharing } => Some(SharedRecord {
                 times_led: *times_led,
                 seq: sharing.last(),
             }),
@@ -39,19 +38,19 @@ impl Shared {
     }
 }
 
-/// How far the other computers have this computer's records.
-pub(crate) struct Agreement(watch::Sender<Agreed>);
+/// The last record of this term whose call may be answered. With `--cluster-sync interval`, etcd may get it later.
+pub(crate) struct Acknowledged(watch::Sender<SharedRecord>);
 
-impl Agreement {
+impl Acknowledged {
     pub(super) fn new() -> Self {
         Self(watch::Sender::default())
     }
 
-    /// Notes that another computer has the master, so what was not agreed never will be.
+    /// Notes that another computer has the master, so calls that still wait get no answer.
     pub(super) fn note_deposed(&self) {
-        self.0.send_modify(|agreed| {
-            *agreed = Agreed {
-                times_led: agreed.times_led + 1,
+        self.0.send_modify(|acknowledged| {
+            *acknowledged = SharedRecord {
+                times_led: acknowledged.times_led + 1,
                 seq: 0,
             }
         });
@@ -61,26 +60,26 @@ impl Agreement {
         self.0.borrow().times_led
     }
 
-    /// The last record of this term that the other computers have or do not need.
+    /// The number of that record.
     pub(crate) fn last(&self) -> u64 {
         self.0.borrow().seq
     }
 
-    /// Notes that the other computers have the records up to `seq`, or do not need them.
+    /// Lets the answers to the calls up to record `seq` go out.
     pub(crate) fn reach(&self, seq: u64) {
-        self.0.send_if_modified(|agreed| {
-            let more = seq > agreed.seq;
-            agreed.seq = agreed.seq.max(seq);
+        self.0.send_if_modified(|acknowledged| {
+            let more = seq > acknowledged.seq;
+            acknowledged.seq = acknowledged.seq.max(seq);
             more
         });
     }
 
-    /// Waits until the other computers have the record at `place`. False if this computer stopped leading before that.
-    pub(super) async fn wait(&self, place: Agreed) -> bool {
-        let mut agreed = self.0.subscribe();
+    /// Waits until the call of this record may be answered. False if this computer stopped leading before that.
+    pub(super) async fn wait(&self, record: SharedRecord) -> bool {
+        let mut acknowledged = self.0.subscribe();
         // This cannot fail: this owns the sender.
-        let reached = agreed.wait_for(|reached| *reached >= place).await;
-        reached.is_ok_and(|reached| reached.times_led == place.times_led)
+        let reached = acknowledged.wait_for(|reached| *reached >= record).await;
+        reached.is_ok_and(|reached| reached.times_led == record.times_led)
     }
 }
 
@@ -255,12 +254,12 @@ mod tests {
         assert_eq!(seqs(&ledger), [8, 9]);
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[0]).await, None);
-        ledger.agreement.reach(8);
+        ledger.acknowledged.reach(8);
         assert_eq!(acknowledged(&ledger, marks[0]).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, None);
-        ledger.agreement.reach(9);
+        ledger.acknowledged.reach(9);
         // A late acknowledgement undoes nothing.
-        ledger.agreement.reach(8);
+        ledger.acknowledged.reach(8);
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
     }
 
@@ -307,7 +306,7 @@ mod tests {
         assert_eq!((seqs(&ledger), cluster_seq()), (vec![8], 8));
         assert_eq!(ledger.pending(), pending);
         assert_eq!(acknowledged(&ledger, again).await, None);
-        ledger.agreement.reach(8);
+        ledger.acknowledged.reach(8);
         assert_eq!(acknowledged(&ledger, again).await, Some(true));
         answer(&ledger, &set(2));
         assert_eq!((seqs(&ledger), cluster_seq()), (vec![9], 9));
@@ -322,7 +321,7 @@ mod tests {
         ledger.leave();
         ledger.lead(0, &Master::default());
         let marks = [set(1), set(2)].map(|call| answer(&ledger, &call));
-        ledger.agreement.reach(1);
+        ledger.acknowledged.reach(1);
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
@@ -330,7 +329,7 @@ mod tests {
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));
-        ledger.agreement.reach(2);
+        ledger.acknowledged.reach(2);
         assert_eq!(acknowledged(&ledger, again).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
     }
@@ -487,7 +486,7 @@ mod tests {
             panic!("{changes:?}");
         };
         assert!(**first == state_of([set(1)]) && **last == state_of([set(3)]));
-        ledger.agreement.reach(8);
+        ledger.acknowledged.reach(8);
         assert_eq!(acknowledged(&ledger, mark).await, None);
     }
 }

@@ -135,14 +135,14 @@ impl InAdvance {
     }
 }
 
-/// An *injection*: the call that gives a master the mirror's state.
+/// An injection that is ready to be sent.
 #[derive(Debug)]
 pub(crate) struct Prepared {
     /// The mirror's version and the next token when this injection was prepared. `None` if it was not prepared in
     /// advance.
     basis: Option<(u64, Token)>,
     plan: DeferredDrop<Plan>,
-    /// Whether this injection restores the mirror's complete state.
+    /// Whether this injection restores the mirror's whole state.
     complete: bool,
 }
 
@@ -166,13 +166,13 @@ pub(crate) trait Contact: Send {
     fn settle(&mut self) -> impl Future<Output = Result<(), ExamineError>> + Send;
 
     /// Makes the first of the two requests that read the master, and compares its token with `token`.
-    fn first_look(
+    fn read_first(
         &mut self,
         token: &Token,
     ) -> impl Future<Output = Result<Inspection, ExamineError>> + Send;
 
     /// Makes the second request, and returns the master's state. `previous` has what cannot be read.
-    fn second_look(
+    fn read_second(
         &mut self,
         first: Inspection,
         previous: &Master,
@@ -279,7 +279,7 @@ impl Examiner {
         let is_new = matches!(manner.known, KnownMaster::New { .. });
         let mut first = match manner.known {
             KnownMaster::New { pid } => Inspection::at_new(pid),
-            _ => self.first_look(master).await?,
+            _ => self.read_first(master).await?,
         };
         let mut resumed = resumes(&first);
         if !is_new && !resumed {
@@ -287,7 +287,7 @@ impl Examiner {
                 master.settle().await?;
             }
             self.ledger.settled();
-            first = self.first_look(master).await?;
+            first = self.read_first(master).await?;
             resumed = resumes(&first);
         }
         let mut examination = Examination {
@@ -391,7 +391,7 @@ impl Examiner {
                     TokenState::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
                 };
-                master.second_look(first, &previous).await?
+                master.read_second(first, &previous).await?
             }
         };
         self.remove_dead_rosout(master, may_be_roscores, bears, &found)
@@ -417,7 +417,7 @@ impl Examiner {
         }
         examination.outcome = match treatment {
             Treatment::Begin => RecoveryOutcome::Begun,
-            Treatment::TakeOver => RecoveryOutcome::Adopted,
+            Treatment::Adopt => RecoveryOutcome::Adopted,
             Treatment::Inject | Treatment::Replace => RecoveryOutcome::Injected,
             Treatment::Reconcile(_) if manner.known == KnownMaster::Nothing => {
                 RecoveryOutcome::Adopted
@@ -430,7 +430,7 @@ impl Examiner {
             _ => log_difference(difference),
         };
         let (state, change) = match treatment {
-            Treatment::Begin | Treatment::TakeOver | Treatment::Inject => {
+            Treatment::Begin | Treatment::Adopt | Treatment::Inject => {
                 (mirror.clone(), Change::Add)
             }
             Treatment::Replace => (mirror.clone(), Change::Replace(before)),
@@ -638,11 +638,11 @@ impl Examiner {
                 return Ok(held);
             };
             // What the master holds now replaces what was expected, and the missing part is injected again.
-            let first = self.first_look(master).await?;
+            let first = self.read_first(master).await?;
             if first.bears() != TokenState::Present && deviation.failed.is_empty() {
                 deviation.failed.push("the token is missing".to_owned());
             }
-            let now = master.second_look(first, plan.expected()).await?;
+            let now = master.read_second(first, plan.expected()).await?;
             if deviation.failed.is_empty() {
                 rarely!(
                     info,
@@ -689,8 +689,8 @@ impl Examiner {
         }
     }
 
-    async fn first_look(&self, master: &mut impl Contact) -> Result<Inspection, ExamineError> {
-        let mut first = master.first_look(&self.ledger.token()).await?;
+    async fn read_first(&self, master: &mut impl Contact) -> Result<Inspection, ExamineError> {
+        let mut first = master.read_first(&self.ledger.token()).await?;
         if !master.python().keeps_order() {
             self.ledger.with_mirror(|mirror| first.arrange_like(mirror));
         }

@@ -176,13 +176,13 @@ impl Contact for LiveMaster {
         }
     }
 
-    async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
+    async fn read_first(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
         self.connected().await?;
         let look = inspect::read_first(&mut self.connection, token);
         self.reach.while_alive(look).await
     }
 
-    async fn second_look(
+    async fn read_second(
         &mut self,
         first: Inspection,
         previous: &Master,

@@ -253,7 +253,7 @@ impl Others {
                     by_mirror = answers == AnsweredCalls::Reads;
                     None
                 }
-                Standing::Nobody { known } => {
+                Standing::NoLeader { known } => {
                     by_mirror = known;
                     None
                 }

@@ -104,7 +104,7 @@ pub struct Pages {
 #[derive(Debug)]
 pub(crate) struct PageState {
     feed: Feed,
-    /// Permit to build the complete state, which happens one request at a time.
+    /// Permit to build the whole state, which happens one request at a time.
     reading: Semaphore,
     /// Permit to read earlier states, which happens for one request at a time, even if its client has gone.
     reading_past: Arc<tokio::sync::Mutex<KnownTimes>>,

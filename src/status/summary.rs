@@ -166,7 +166,7 @@ pub(crate) struct Status {
     pub(crate) master_is_open: bool,
     /// Whether calls pass to the master.
     pub(crate) open: bool,
-    /// Whether calls are answered by the master or the mirror.
+    /// Whether calls are answered: by the master, the mirror or another computer.
     pub(crate) ready: bool,
     /// Whether another computer has the master and calls go there.
     pub(crate) elsewhere: bool,

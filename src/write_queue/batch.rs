@@ -83,10 +83,10 @@ pub(super) enum MadeBy {
 #[derive(Debug)]
 enum AnswerTo {
     Caller(Caller),
-    /// To nobody: the caller has got the mirror's answer before the master has run the call. The two are compared.
+    /// The caller has got the mirror's answer before the master has run the call. The two are compared.
     Comparison(First),
-    /// To nobody: the caller has got the mirror's answer while the batch was in flight.
-    Nobody,
+    /// The caller has got the mirror's answer while the batch was in flight.
+    Answered,
 }
 
 /// The mirror's answer to a call that the master must still run.
@@ -227,7 +227,7 @@ impl Item {
 
     /// Takes the caller, who gets an answer before the master's.
     pub(super) fn take_caller(&mut self) -> Option<Caller> {
-        match std::mem::replace(&mut self.answer_to, AnswerTo::Nobody) {
+        match std::mem::replace(&mut self.answer_to, AnswerTo::Answered) {
             AnswerTo::Caller(caller) => Some(caller),
             other => {
                 self.answer_to = other;
@@ -241,7 +241,7 @@ impl Item {
         let is_dropped = match &self.answer_to {
             AnswerTo::Caller(caller) => caller.0.is_closed(),
             AnswerTo::Comparison(_) => false,
-            AnswerTo::Nobody => true,
+            AnswerTo::Answered => true,
         };
         is_dropped && !matches!(self.made_by, MadeBy::Eviction(_))
     }

@@ -1,5 +1,5 @@
-//! Merges the writes of a computer that was cut off. Writes that conflict with changes by other computers are left out
-//! at the last moment, when no other call is on its way to the master.
+//! Merges another computer's partition writes. Those that conflict with changes by other computers are left out at the last
+//! moment, when no other call is on its way to the master.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -14,7 +14,7 @@
 //! * [`sharing`]: changes that the other computers must get; [`outgoing`]: those that are not in the journal yet.
 //! * [`cut_off`]: the partition writes of this computer.
 //! * [`journal`]: records and snapshots to and from keys and values.
-//! * [`merge`]: which writes of a computer that was cut off still hold.
+//! * [`merge`]: which partition writes still hold.
 //! * [`namesake`]: another computer with this one's name.
 
 pub mod cut_off;

@@ -3,9 +3,14 @@
 //!
 //! The answering node counts as the one that has registered unless there is evidence against that, because losing a
 //! healthy node is worse than keeping a dead one.
+//!
+//! * `kernel`: what the kernel proves about nodes of this computer; `origin`: what an address proves.
+//! * `liveness`, `unreachable`: who is alive, and who does not answer; `rates`, `backoff`: how often a host is asked.
+//! * `moves`: a name that another program registers; `feuds`: two programs that take it from each other.
+//! * `addresses`: nodes at an address that this computer has lost.
 
 mod addresses;
-mod backoff;
+pub(crate) mod backoff;
 mod feuds;
 mod kernel;
 mod liveness;
@@ -13,7 +18,6 @@ mod moves;
 mod mutant;
 mod origin;
 mod rates;
-mod repeats;
 #[cfg(test)]
 mod simulation;
 mod unreachable;
@@ -25,7 +29,6 @@ pub use liveness::{Health, Liveness};
 pub use moves::{Eviction, Moving, Reap};
 pub use origin::Reach;
 pub use rates::Rates;
-pub use repeats::Repeats;
 pub use ros1_master::master::port_of;
 pub use unreachable::Unreachable;
 

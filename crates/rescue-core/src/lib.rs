@@ -5,7 +5,8 @@
 //! * [`hide`]: which values of parameters are not shown.
 //! * [`replay`]: recognising a master, reading its state, and the one call that restores a state in it.
 //! * [`lifecycle`]: when a master is started, examined, probed and killed, and when calls pass to it.
-//! * [`health`]: judging what a node reports; which nodes are unreachable.
+//! * [`health`]: which nodes are alive, dead or unreachable, by their answers and by the kernel; names that move or are
+//!   fought for.
 //! * [`order`]: in which order a node gets the news about a topic, a parameter or its own name.
 //! * [`checkpoint`]: the checkpoint's text, whether its session continues, and how two states differ.
 //! * [`cluster`]: with several computers, which one leads, and whose writes count.

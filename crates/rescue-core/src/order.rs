@@ -17,6 +17,7 @@
 //!
 //! This module is pure: the time and the mirror are arguments.
 
+mod beside_master;
 mod by_subject;
 mod outbox;
 mod subject;
@@ -29,6 +30,7 @@ use std::{
 };
 
 pub use self::{
+    beside_master::BesideMaster,
     by_subject::BySubject,
     outbox::NextNotification,
     subject::{Concern, Recipient, Subject, recipients_of_read},

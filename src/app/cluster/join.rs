@@ -88,7 +88,7 @@ pub(in crate::app) async fn join(
     // A master left by an earlier process may have outdated state.
     block_in_place(|| setup.rosmaster.kill_orphans());
     let known = setup.restored;
-    let (standing, standing_rx) = watch::channel(Standing::Nobody { known });
+    let (standing, standing_rx) = watch::channel(Standing::NoLeader { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
     let position = watch::Sender::new(JournalPosition::default());
     let shown = Arc::new(Shown::new());

@@ -89,7 +89,7 @@ fn begin_whole(
 /// Writes a complete checkpoint.
 fn rewrite(journal: &mut Journal, values: Range<i32>) {
     let done = begin_whole(journal, values);
-    journal.worker().work();
+    journal.store_queue().work();
     done.unwrap().try_recv().unwrap().unwrap();
 }
 
@@ -103,19 +103,19 @@ fn a_record_is_awaited_until_it_is_written_or_synced() {
     let mut journal = disk.journal(SyncPolicy::Interval);
     append(&mut journal, 0);
     assert_eq!(disk.reached(), 0);
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(disk.reached(), 1);
 
     let disk = Disk::new();
     let mut journal = disk.journal(SyncPolicy::Always);
     append(&mut journal, 0);
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(disk.reached(), 0);
     journal.run(|store| {
         let done = store.sync_job().unwrap().run();
         store.synced(done).unwrap();
     });
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(disk.reached(), 1);
     let state = whole(0..1).snapshot;
     assert_eq!(disk.found(journal), state);
@@ -132,12 +132,12 @@ fn records_withheld_from_a_silent_disk_are_in_the_next_complete_checkpoint() {
     append(&mut journal, 1);
     assert_eq!(disk.reached(), 2);
     // The disk answers again: only the first record is written.
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     rewrite(&mut journal, 0..2);
     assert_eq!(unprotected(&journal), None);
     append(&mut journal, 2);
-    journal.worker().work();
+    journal.store_queue().work();
     let state = whole(0..3).snapshot;
     assert_eq!(disk.found(journal), state);
 }
@@ -152,7 +152,7 @@ fn a_whole_checkpoint_from_before_the_second_silence_protects_nothing() {
     append(&mut journal, 1);
     journal.give_up(seq(1));
     append(&mut journal, 2);
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     rewrite(&mut journal, 0..3);
     assert_eq!(unprotected(&journal), None);
@@ -169,7 +169,7 @@ fn a_disk_that_is_given_too_much_is_given_up() {
     }
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     assert!(journal.run(|_| ()).is_none());
-    journal.worker().work();
+    journal.store_queue().work();
     rewrite(&mut journal, 0..2049);
     assert_eq!(unprotected(&journal), None);
     let state = whole(0..2049).snapshot;
@@ -187,11 +187,11 @@ fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
         began.send(()).unwrap();
         hangs.recv().unwrap();
     });
-    let worker = journal.worker();
-    let first = thread::spawn(move || worker.work());
+    let queue = journal.store_queue();
+    let first = thread::spawn(move || queue.work());
     begins.recv().unwrap();
     append(&mut journal, 0);
-    journal.worker().work();
+    journal.store_queue().work();
     assert_eq!(disk.reached(), 0);
     go_on.send(()).unwrap();
     first.join().unwrap();
@@ -219,7 +219,7 @@ fn the_disks_thread_runs_jobs_as_they_come_and_ends_with_the_journal() {
             }
             began.send(thread::current().id()).unwrap();
         });
-        journal.worker().wake();
+        journal.store_queue().wake();
         assert_ne!(begins.recv().unwrap(), thread::current().id());
         assert_eq!(disk.reached(), seq(value));
     }
@@ -240,7 +240,7 @@ fn after_a_panic_records_are_in_the_next_complete_checkpoint() {
         let mut journal = disk.journal(sync);
         let mut panicked = panic(&journal);
         append(&mut journal, 0);
-        journal.worker().work();
+        journal.store_queue().work();
         panicked.try_recv().unwrap_err();
         // No answer waits, and the status says why nothing is recorded.
         assert_eq!(disk.reached(), seq(0));
@@ -248,7 +248,7 @@ fn after_a_panic_records_are_in_the_next_complete_checkpoint() {
         rewrite(&mut journal, 0..1);
         assert_eq!(unprotected(&journal), None);
         append(&mut journal, 1);
-        journal.worker().work();
+        journal.store_queue().work();
         let state = whole(0..2).snapshot;
         assert_eq!(disk.found(journal), state);
     }
@@ -260,11 +260,11 @@ fn the_disks_thread_runs_jobs_after_one_that_panicked() {
     let journal = disk.journal(SyncPolicy::Interval);
     for _ in 0..3 {
         let panicked = panic(&journal);
-        journal.worker().wake();
+        journal.store_queue().wake();
         panicked.blocking_recv().unwrap_err();
         let (ran, runs) = mpsc::sync_channel(1);
         journal.run(move |_| ran.send(()).unwrap());
-        journal.worker().wake();
+        journal.store_queue().wake();
         runs.recv_timeout(Duration::from_secs(60)).unwrap();
     }
 }

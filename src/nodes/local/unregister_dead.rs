@@ -71,14 +71,14 @@ async fn unregister(nodes: Arc<Nodes>, node: String, api: String, death: Death, 
     }
 }
 
-/// How a node has ended, as in `its process 7 ended at 14:03:01, nobody listens at its port`. `others` are the other names
+/// How a node has ended, as in `its process 7 ended at 14:03:01, no process listens at its port`. `others` are the other names
 /// at its port.
 fn how(death: &Death, others: &[&str]) -> String {
     let at = clock::wall_text(clock::wall_time_of(death.since));
     let time = at.get(11..19).unwrap_or(&at);
     let process = death.process.pid;
     let port = match death.taken {
-        false => "nobody listens at its port".to_owned(),
+        false => "no process listens at its port".to_owned(),
         true => format!("{} uses its port now", others.join(", ")),
     };
     format!("its process {process} ended at {time}, {port}")

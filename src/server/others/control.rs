@@ -89,7 +89,7 @@ impl Others {
         }
     }
 
-    /// Makes the writes of a computer that was cut off. `None` if this computer no longer leads.
+    /// Makes another computer's partition writes. `None` if this computer no longer leads.
     async fn merge(&self, calls: &Calls, ask: Ask, origin: Origin) -> Option<HttpReply> {
         let mut standing = self.standing.clone();
         tokio::select! {
@@ -105,7 +105,7 @@ impl Others {
         let settled = standing.wait_for(|now| {
             let waits =
                 matches!(now, Standing::Leads { answers, .. } if *answers != AnsweredCalls::All);
-            !waits && !matches!(now, Standing::Nobody { .. })
+            !waits && !matches!(now, Standing::NoLeader { .. })
         });
         let Ok(now) = tokio::time::timeout(self.hold, settled).await else {
             call.calls.stats.calls_unanswered.count();

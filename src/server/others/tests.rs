@@ -186,7 +186,7 @@ async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
             term: 8,
             answers: AnsweredCalls::All,
         },
-        Standing::Nobody { known: true },
+        Standing::NoLeader { known: true },
         leader(None).await,
     ] {
         let computer = Computer::new(standing);
@@ -199,14 +199,14 @@ async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
 
 #[tokio::test]
 async fn while_nobody_leads_reads_are_the_mirrors_and_a_write_waits_for_the_next_leader() {
-    let computer = Computer::new(Standing::Nobody { known: true });
+    let computer = Computer::new(Standing::NoLeader { known: true });
     let answer = computer.ask("/RPC2", &get()).await.unwrap();
     assert_eq!(reply(answer).await, made_by(&get()));
     assert!(computer.ask("/RPC2", &set(2)).await.is_err());
     // Before the state is known there is nothing to answer with.
     computer
         .standing
-        .send_replace(Standing::Nobody { known: false });
+        .send_replace(Standing::NoLeader { known: false });
     assert!(computer.ask("/RPC2", &get()).await.is_err());
 }
 
@@ -300,7 +300,7 @@ async fn a_removal_counts_as_done_only_if_a_leader_may_have_run_it() {
 
 #[tokio::test]
 async fn who_and_where_the_master_is_each_computer_says_of_itself() {
-    let computer = Computer::new(Standing::Nobody { known: false });
+    let computer = Computer::new(Standing::NoLeader { known: false });
     let uri = Request::new(Method::GetUri, ["/n"]);
     let answer = reply(computer.ask("/RPC2", &uri).await.unwrap()).await;
     let Reply::Value(answer) = answer else {
@@ -430,7 +430,7 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
 /// long it takes.
 #[tokio::test(start_paused = true)]
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
-    let computer = Computer::new(Standing::Nobody { known: true });
+    let computer = Computer::new(Standing::NoLeader { known: true });
     let others = computer.calls.others.clone().unwrap();
     let shown = |term, seq| others.shown.raise(position(term, seq));
     let follows = |term, seq| computer.followed.send_replace(position(term, seq));
@@ -483,7 +483,7 @@ async fn a_subscription_that_is_there_already_waits_for_no_leader() {
         entry: RecordContent::call(subscribe("/a")),
     };
     let prompt = 5 * PATIENCE;
-    for standing in [leader(None).await, Standing::Nobody { known: true }] {
+    for standing in [leader(None).await, Standing::NoLeader { known: true }] {
         let computer = Computer::new(standing);
         computer
             .calls

@@ -103,12 +103,12 @@ impl Contact for SimulatedMaster {
         self.ask(Question::Settle).await.map(|_| ())
     }
 
-    async fn first_look(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
+    async fn read_first(&mut self, token: &Token) -> Result<Inspection, ExamineError> {
         let reply = self.call(Inspection::call(token)).await?;
         Ok(Inspection::decode(&reply, token).unwrap())
     }
 
-    async fn second_look(
+    async fn read_second(
         &mut self,
         first: Inspection,
         previous: &Master,

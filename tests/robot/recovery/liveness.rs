@@ -36,7 +36,10 @@ fn killed_nodes_are_reported_as_dead_and_stay_registered() {
     });
     eventually("the log reports the dead node", || {
         let report = "would have unregistered /talker: ";
-        has_logged(&robot, &[report, &process, "nobody listens at its port"])
+        has_logged(
+            &robot,
+            &[report, &process, "no process listens at its port"],
+        )
     });
     assert_eq!(status()["node_health"]["/talker"]["health"], "dead");
     before.assert_same(&robot.settled_state(), "dead nodes stay registered");

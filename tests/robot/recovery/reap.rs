@@ -60,7 +60,7 @@ fn reap_local_unregisters_a_dead_node_at_once_and_no_stopped_one() {
     println!("unregistered after {:?}", killed.elapsed());
     robot.await_state(&after, "after the node's death");
     eventually("the log and the counter say so", || {
-        let line = ["unregistered /talker: its process", "nobody listens"];
+        let line = ["unregistered /talker: its process", "no process listens"];
         has_logged(&robot, &line) && robot.counter("dead_nodes_reaped") == 1
     });
     // A node that is stopped does not answer, but lives.

@@ -173,7 +173,7 @@ pub struct Record {
     pub entry: RecordContent,
 }
 
-/// A complete state and its position in the journal.
+/// A whole state and its position in the journal.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
     /// Number of the last record in `snapshot`. 0 if there was none.

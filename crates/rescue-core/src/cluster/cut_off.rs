@@ -14,14 +14,14 @@ use crate::{
 };
 use ros1_master::master::{Master, Request};
 
-/// How many periods of being cut off are kept apart.
-const PERIODS_MOST: usize = 8;
-/// How many writes of one period of being cut off can be recognised when they appear in the journal.
+/// How many partitions are kept apart.
+const PARTITIONS_MOST: usize = 8;
+/// How many writes of one partition can be recognised when they appear in the journal.
 const EXPECTED_MOST: usize = 4_000;
 
-/// One period of being cut off.
+/// One partition.
 #[derive(Clone, Debug)]
-pub struct Period {
+pub struct Partition {
     /// The state when this computer was cut off.
     pub base: Master,
     /// The writes answered since this computer was cut off.
@@ -32,7 +32,7 @@ pub struct Period {
     expected: usize,
 }
 
-impl Period {
+impl Partition {
     fn new(base: Master) -> Self {
         Self {
             base,
@@ -43,63 +43,63 @@ impl Period {
     }
 }
 
-/// The periods of being cut off whose writes have not all reached a leader, oldest first.
+/// The partitions whose writes have not all reached a leader, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct CutOff {
-    periods: VecDeque<Period>,
+    partitions: VecDeque<Partition>,
 }
 
 impl CutOff {
     /// Restores what an earlier process left.
     pub fn restored(left: PartitionWrites) -> Self {
-        let mut period = Period::new(left.base);
+        let mut partition = Partition::new(left.base);
         for call in left.calls {
             if Mutant::GuessesByValues.lives() {
-                period.changes.expect([call.clone()]);
+                partition.changes.expect([call.clone()]);
             }
-            period.pending.add(&call);
+            partition.pending.add(&call);
         }
         Self {
-            periods: VecDeque::from([period]),
+            partitions: VecDeque::from([partition]),
         }
     }
 
     /// Notes that an earlier process has seen `state`. What differs there, except by this computer's own writes, was
     /// changed by others.
     pub fn note_seen(&mut self, state: &Master) {
-        for period in &mut self.periods {
+        for partition in &mut self.partitions {
             let mut seen = Changes::default();
-            seen.expect(period.pending.calls().cloned());
-            seen.note_difference(&period.base, state);
-            period.changes.add_all(&seen);
+            seen.expect(partition.pending.calls().cloned());
+            seen.note_difference(&partition.base, state);
+            partition.changes.add_all(&seen);
         }
     }
 
     /// Whether a leader has all partition writes.
     pub fn is_empty(&self) -> bool {
-        self.periods.is_empty()
+        self.partitions.is_empty()
     }
 
-    /// Whether the writes of all periods but the present one have reached a leader.
-    pub fn is_last_period(&self) -> bool {
-        self.periods.len() == 1
+    /// Whether the writes of all partitions but the present one have reached a leader.
+    pub fn is_last_partition(&self) -> bool {
+        self.partitions.len() == 1
     }
 
-    /// Begins a period of being cut off, in the state `base`.
+    /// Begins a partition, in the state `base`.
     pub fn begin(&mut self, base: Master) {
-        // The writes of earlier periods may still be on their way.
+        // The writes of earlier partitions may still be on their way.
         let earlier: Vec<_> = self.calls().cloned().collect();
         let is_empty = self
-            .periods
+            .partitions
             .back()
             .is_some_and(|last| last.pending.is_empty());
-        if is_empty && self.periods.len() > 1 {
-            self.periods.pop_back();
+        if is_empty && self.partitions.len() > 1 {
+            self.partitions.pop_back();
         }
-        // The oldest period stays, because its writes may be on their way. The next two become one.
-        if self.periods.len() >= PERIODS_MOST
-            && let Some(second) = self.periods.remove(2)
-            && let Some(first) = self.periods.get_mut(1)
+        // The oldest partition stays, because its writes may be on their way. The next two become one.
+        if self.partitions.len() >= PARTITIONS_MOST
+            && let Some(second) = self.partitions.remove(2)
+            && let Some(first) = self.partitions.get_mut(1)
         {
             // The others' changes since the first of the two count for both.
             second
@@ -107,32 +107,32 @@ impl CutOff {
                 .calls()
                 .for_each(|call| first.pending.add(call));
         }
-        let mut period = Period::new(base);
-        period.changes.expect(earlier);
-        self.periods.push_back(period);
+        let mut partition = Partition::new(base);
+        partition.changes.expect(earlier);
+        self.partitions.push_back(partition);
     }
 
     /// Notes that the other computers may make these calls of this computer. The calls do not count as their changes.
     pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
-        if let Some(period) = self.periods.back_mut() {
-            period.changes.expect(calls);
+        if let Some(partition) = self.partitions.back_mut() {
+            partition.changes.expect(calls);
         }
     }
 
-    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any period
+    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any partition
     /// of being cut off.
     pub fn expect_in_all(&mut self, calls: &[Request]) {
-        for period in &mut self.periods {
-            period.changes.expect(calls.iter().cloned());
+        for partition in &mut self.partitions {
+            partition.changes.expect(calls.iter().cloned());
         }
     }
 
     /// Notes new records of the journal. They count as others' changes, unless they were expected.
     pub fn note(&mut self, records: &[Record]) {
-        for period in &mut self.periods {
+        for partition in &mut self.partitions {
             for record in records {
                 if let RecordContent::Call { call, .. } = &record.entry {
-                    period.changes.note(record.seq, call);
+                    partition.changes.note(record.seq, call);
                 }
             }
         }
@@ -141,17 +141,17 @@ impl CutOff {
     /// Notes that the journal's state changed from `was` to `is`, without the records in between. `None` stands for
     /// the state when this computer was cut off.
     pub fn note_difference(&mut self, was: Option<&Master>, is: &Master) {
-        for period in &mut self.periods {
-            let was = was.unwrap_or(&period.base);
-            period.changes.note_difference(was, is);
+        for partition in &mut self.partitions {
+            let was = was.unwrap_or(&partition.base);
+            partition.changes.note_difference(was, is);
         }
     }
 
-    /// Returns the others' `state`, changed by those kept writes that conflict with no change by others.
+    /// Returns the others' `state`, changed by those partition writes that conflict with no change by others.
     pub fn on(&self, state: &Master) -> Master {
         let mut state = state.clone();
-        for period in &self.periods {
-            for call in merge::merge(&period.changes, &state, period.pending.calls()).send {
+        for partition in &self.partitions {
+            for call in merge::merge(&partition.changes, &state, partition.pending.calls()).send {
                 state.apply_telling(&call, &mut ());
             }
         }
@@ -164,7 +164,7 @@ impl CutOff {
         changes: impl IntoIterator<Item = &'a Change>,
         given: bool,
     ) -> Vec<Request> {
-        let Some(period) = self.periods.back_mut() else {
+        let Some(partition) = self.partitions.back_mut() else {
             return Vec::new();
         };
         let mut calls = Vec::new();
@@ -181,49 +181,52 @@ impl CutOff {
                 continue;
             }
             // No more writes than this can be on their way to etcd at once.
-            if given && period.expected < EXPECTED_MOST {
-                period.expected += 1;
-                period.changes.expect_record(record.seq, call.clone());
+            if given && partition.expected < EXPECTED_MOST {
+                partition.expected += 1;
+                partition.changes.expect_record(record.seq, call.clone());
             }
             if *source == Source::Forwarded {
-                period.changes.note_forwarded(call);
+                partition.changes.note_forwarded(call);
             }
-            period.pending.add(call);
+            partition.pending.add(call);
             calls.push(call.clone());
         }
         calls
     }
 
-    /// The state at the beginning of the oldest period of being cut off.
+    /// The state at the beginning of the oldest partition.
     pub fn base(&self) -> Option<&Master> {
-        self.periods.front().map(|period| &period.base)
+        self.partitions.front().map(|partition| &partition.base)
     }
 
-    /// All kept writes, in the order in which they were answered.
+    /// All partition writes, in the order in which they were answered.
     pub fn calls(&self) -> impl Iterator<Item = &Request> {
-        self.periods
+        self.partitions
             .iter()
-            .flat_map(|period| period.pending.calls())
+            .flat_map(|partition| partition.pending.calls())
     }
 
     /// How many writes are kept.
     pub fn len(&self) -> usize {
-        self.periods.iter().map(|period| period.pending.len()).sum()
+        self.partitions
+            .iter()
+            .map(|partition| partition.pending.len())
+            .sum()
     }
 
-    /// The oldest period of being cut off whose writes have not all reached a leader.
-    pub fn first_mut(&mut self) -> Option<&mut Period> {
-        self.periods.front_mut()
+    /// The oldest partition whose writes have not all reached a leader.
+    pub fn first_mut(&mut self) -> Option<&mut Partition> {
+        self.partitions.front_mut()
     }
 
-    /// Drops the oldest period of being cut off: its writes have reached the leader, or are lost and reported.
+    /// Drops the oldest partition: its writes have reached the leader, or are lost and reported.
     pub fn sent(&mut self) {
-        self.periods.pop_front();
+        self.partitions.pop_front();
     }
 
-    /// Drops the present period of being cut off: its writes are in the journal after all.
+    /// Drops the present partition: its writes are in the journal after all.
     pub fn resumed(&mut self) {
-        self.periods.pop_back();
+        self.partitions.pop_back();
     }
 }
 
@@ -246,12 +249,12 @@ mod tests {
         Change::Call(record(seq, call), Source::Here)
     }
 
-    fn calls_of(period: &Period) -> Vec<Request> {
-        period.pending.calls().cloned().collect()
+    fn calls_of(partition: &Partition) -> Vec<Request> {
+        partition.pending.calls().cloned().collect()
     }
 
     fn first(cut_off: &CutOff) -> Vec<Request> {
-        cut_off.periods.front().map(calls_of).unwrap_or_default()
+        cut_off.partitions.front().map(calls_of).unwrap_or_default()
     }
 
     fn base() -> Master {
@@ -272,14 +275,14 @@ mod tests {
         cut_off.add(&[change(5, set("/a", 1))], false);
         cut_off.begin(base());
         cut_off.add(&[change(6, set("/b", 2))], false);
-        // etcd has the second period's write after all.
+        // etcd has the second partition's write after all.
         cut_off.resumed();
         assert_eq!(first(&cut_off), [set("/a", 1)]);
         cut_off.resumed();
         assert!(cut_off.is_empty());
     }
 
-    /// The leader made the first period's write twice, because its first answer was lost.
+    /// The leader made the first partition's write twice, because its first answer was lost.
     #[test]
     fn a_write_that_is_sent_again_is_no_change_of_others_in_later_periods() {
         let mut cut_off = begun();
@@ -289,8 +292,8 @@ mod tests {
         cut_off.expect_in_all(&[set("/count", 1)]);
         cut_off.note(&[record(7, set("/count", 1))]);
         cut_off.note(&[record(8, set("/count", 1))]);
-        for period in &cut_off.periods {
-            let merged = merge::merge(&period.changes, &base(), period.pending.calls());
+        for partition in &cut_off.partitions {
+            let merged = merge::merge(&partition.changes, &base(), partition.pending.calls());
             assert!(merged.lost.is_empty(), "{:?}", merged.lost);
         }
         // The same call by another node is a change.
@@ -299,12 +302,12 @@ mod tests {
             [Value::from("/m"), "/count".into(), 1.into()],
         );
         cut_off.note(&[record(9, of_another)]);
-        let last = cut_off.periods.back().unwrap();
+        let last = cut_off.partitions.back().unwrap();
         let merged = merge::merge(&last.changes, &base(), last.pending.calls());
         assert_eq!(merged.lost.len(), 1);
     }
 
-    /// The first period's writes are on their way when the second begins.
+    /// The first partition's writes are on their way when the second begins.
     #[test]
     fn the_second_of_two_periods_continues_from_the_first() {
         let others = base();
@@ -314,9 +317,9 @@ mod tests {
         assert_eq!(second.params().get("count"), Some(&1.into()));
         cut_off.begin(second);
         cut_off.add(&[change(6, set("/count", 2))], false);
-        // The others get the first period's write.
+        // The others get the first partition's write.
         let merged = |cut_off: &CutOff, others: &Master| {
-            let first = cut_off.periods.front().unwrap();
+            let first = cut_off.partitions.front().unwrap();
             merge::merge(&first.changes, others, first.pending.calls())
         };
         assert_eq!(merged(&cut_off, &others).send, [set("/count", 1)]);
@@ -338,12 +341,15 @@ mod tests {
             cut_off.begin(base());
             cut_off.add(&[change(5, set("/a", value))], false);
         }
-        assert!(cut_off.periods.len() <= PERIODS_MOST);
-        let last = cut_off.periods.back().unwrap();
+        assert!(cut_off.partitions.len() <= PARTITIONS_MOST);
+        let last = cut_off.partitions.back().unwrap();
         assert_eq!(calls_of(last), [set("/a", 49)]);
-        // The last period's write is in the journal after all.
+        // The last partition's write is in the journal after all.
         cut_off.resumed();
         assert_eq!(first(&cut_off), []);
-        assert_eq!(calls_of(cut_off.periods.back().unwrap()), [set("/a", 48)]);
+        assert_eq!(
+            calls_of(cut_off.partitions.back().unwrap()),
+            [set("/a", 48)]
+        );
     }
 }

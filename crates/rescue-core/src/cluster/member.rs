@@ -18,7 +18,7 @@ use std::{
 };
 
 use crate::{
-    checkpoint::format::{Record, RecordContent as JournalEntry},
+    checkpoint::format::{Record, RecordContent},
     cluster::{
         cut_off::CutOff,
         displaced::DisplacedLately,
@@ -83,7 +83,7 @@ impl Journal {
     /// Applies `records` to the journal's state. They follow the last record that was applied.
     fn apply(&mut self, now: Instant, records: &[Record]) {
         for record in records {
-            if let JournalEntry::Call { call, label, .. } = &record.entry {
+            if let RecordContent::Call { call, label, .. } = &record.entry {
                 self.displaced.note(now, &self.state, call);
                 self.state.apply_telling(call, &mut ());
                 label.origin.note_in(&mut self.state, call);
@@ -171,7 +171,7 @@ impl Member {
             machine,
             published: LastPublished {
                 role: Role::Joining,
-                standing: Standing::Nobody { known },
+                standing: Standing::NoLeader { known },
                 has_master: false,
             },
             local,
@@ -399,7 +399,7 @@ impl Member {
         self.published.role == Role::Alone && self.settings().alone == WhenAlone::Serve
     }
 
-    /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends kept writes, and
+    /// Does what may be necessary after any input: runs or ends the master, probes the leader, sends partition writes, and
     /// so on.
     fn update(&mut self, now: Instant) {
         self.update_data_loss(now);

@@ -16,7 +16,7 @@ pub(crate) enum Mutant {
     ShowsAhead,
     /// The mirror of a computer that starts answers before etcd's journal has been read.
     AnswersUnread,
-    /// Nobody corrects what nodes have heard from a former leader, or from a computer that was cut off.
+    /// No computer corrects what nodes have heard from a former leader, or from a computer that was cut off.
     LeavesOldNews,
     /// A merge compares two states, so a value that others changed and changed back counts as unchanged.
     MergesByState,

@@ -22,7 +22,7 @@ pub enum Standing {
     /// The computer at `uri` leads in `term`. All calls are forwarded to it.
     Follows { uri: String, term: u64 },
     /// No computer leads. Writes wait. If `known`, the mirror has the robot's state and answers reads.
-    Nobody { known: bool },
+    NoLeader { known: bool },
 }
 
 impl Standing {
@@ -74,13 +74,12 @@ impl JournalPosition {
         }
     }
 
-    /// The number of the last record that a leader's answer may show. `agreed` is the last record that the journal has,
-    /// `last` the last one that the leader's mirror has. The answer to a write waits for the journal, and that to a read
-    /// does not.
-    pub fn shown_seq(is_read: bool, agreed: u64, last: u64) -> u64 {
+    /// The number of the last record that a leader's answer may show: for a write the last acknowledged one, for a read the
+    /// last one in the leader's mirror.
+    pub fn shown_seq(is_read: bool, acknowledged: u64, last: u64) -> u64 {
         match is_read && !Mutant::ShowsAhead.lives() {
             true => last,
-            false => agreed,
+            false => acknowledged,
         }
     }
 

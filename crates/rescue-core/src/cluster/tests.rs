@@ -234,7 +234,7 @@ fn schedules_that_broke_a_promise_in_the_past_do_so_no_more() {
 /// to be kept, did not know of requests that waited while etcd was away, and took a value for that of another write. In the
 /// last three, an older copy went on: a computer had the parameters in another order, a new journal did not continue the copy, and
 /// a process that had not read etcd before claimed.
-/// 13120837: a computer merged its writes of two periods of being cut off. Those of the second were lost, because those of
+/// 13120837: a computer merged its writes of two partitions. Those of the second were lost, because those of
 /// the first counted as changes of others.
 /// 13026844, 13027038 and 13042236: a leader whose watch had ended checked the journal, and was deposed meanwhile. It never
 /// followed the records that the check had read.

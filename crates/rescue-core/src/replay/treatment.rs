@@ -29,7 +29,7 @@ pub enum Treatment {
     /// Add the mirror's state to what the master holds.
     Inject,
     /// Copy the master's state into the mirror, which is empty.
-    TakeOver,
+    Adopt,
     /// Replace everything that the master holds by the mirror's state.
     Replace,
     /// Combine the master's state, the mirror and the pending writes with [`reconcile`](super::reconcile).
@@ -47,9 +47,9 @@ pub fn treatment(
     match (bears, known) {
         (TokenState::Nothing, _) if !mirror_is_empty => Treatment::Inject,
         (TokenState::Nothing, _) if master_is_empty => Treatment::Begin,
-        (TokenState::Nothing, _) => Treatment::TakeOver,
+        (TokenState::Nothing, _) => Treatment::Adopt,
         // A new session has no state that could replace the master's.
-        (TokenState::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::TakeOver,
+        (TokenState::Earlier, KnownMaster::Nothing) if mirror_is_empty => Treatment::Adopt,
         // A later incarnation has been served, so the mirror is newer than everything in this master.
         (TokenState::Earlier, _) => Treatment::Replace,
         // The checkpoint is older than this master, or another rosrescue has a copy of the checkpoint.
@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn each_master_is_treated_as_the_architecture_document_says() {
-        use Treatment::{Begin, Inject, Reconcile, Replace, TakeOver};
+        use Treatment::{Adopt, Begin, Inject, Reconcile, Replace};
         let (served, injected) = (KnownMaster::ServedIfPresent, KnownMaster::InjectedIfPresent);
         for (bears, known, mirror_is_empty, master_is_empty, expected) in [
             (
@@ -123,14 +123,14 @@ mod tests {
                 KnownMaster::Nothing,
                 true,
                 false,
-                TakeOver,
+                Adopt,
             ),
             (
                 TokenState::Nothing,
                 KnownMaster::Nothing,
                 true,
                 false,
-                TakeOver,
+                Adopt,
             ),
             (TokenState::Nothing, KnownMaster::Nothing, true, true, Begin),
             (

@@ -14,7 +14,7 @@ impl Member {
         self.report_news(News::Alone { serves });
         if !serves {
             self.give_up();
-            return self.publish_standing(Standing::Nobody { known: true });
+            return self.publish_standing(Standing::NoLeader { known: true });
         }
         // First, because what follows waits for the disk, and another computer may lead already.
         self.act(Action::NotifyOwnOnly(true));
@@ -24,7 +24,7 @@ impl Member {
             true => self.known_state(),
             false => &self.local.state,
         };
-        // The nodes continue from what they wrote in earlier periods of being cut off.
+        // The nodes continue from what they wrote in earlier partitions.
         let base = self.cut_off.on(base);
         if led {
             self.begin_cut_off(base);
@@ -38,7 +38,7 @@ impl Member {
             self.serve_alone();
         } else {
             // The standing changes first, so that no more calls are forwarded.
-            self.publish_standing(Standing::Nobody { known: true });
+            self.publish_standing(Standing::NoLeader { known: true });
             self.act(Action::CollectForwarded { base });
         }
     }

@@ -1,4 +1,5 @@
-//! Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
+//! Periodic work: this computer's entry among the members, snapshots, compaction of etcd, and how long the file of
+//! partition writes stays.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +13,7 @@ const FORGET: Duration = Duration::from_secs(300);
 /// Pause after a snapshot that could not be written.
 const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 
-/// Periodic work: this computer's entry among the members, snapshots, and the compaction of etcd.
+/// When each chore is due, and what the last one did.
 #[derive(Debug, Default)]
 pub(super) struct Chores {
     /// When to write this computer's entry among the members.
@@ -44,13 +45,13 @@ impl Chores {
         self.publish_at = Some(now);
     }
 
-    /// Keeps the file of kept writes as it is until the journal has record `seq`. If the leader lost its power before,
+    /// Keeps the file of partition writes as it is until the journal has record `seq`. If the leader lost its power before,
     /// the writes would be lost without a report.
     pub(super) fn keep_until(&mut self, seq: u64) {
         self.kept_until = Some(seq);
     }
 
-    /// Whether the file of kept writes must stay as it is.
+    /// Whether the file of partition writes must stay as it is.
     pub(super) fn keeps_file(&self) -> bool {
         self.kept_until.is_some()
     }

@@ -399,7 +399,7 @@ impl Member {
                 new.map(|new| journal.apply(now, &new)).is_ok()
             }
         };
-        // Before the state is shown, because kept writes that conflict with others' changes are not part of it. A journal
+        // Before the state is shown, because partition writes that conflict with others' changes are not part of it. A journal
         // without a state says nothing of what others have changed.
         if !journal.is_empty() {
             self.cut_off.note_difference(None, &journal.state);

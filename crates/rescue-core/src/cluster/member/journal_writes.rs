@@ -63,7 +63,7 @@ impl Member {
             return self.prepare();
         }
         self.outgoing.all_ready();
-        // If the changes never go to the journal, a later leader gets the kept writes instead.
+        // If the changes never go to the journal, a later leader gets the partition writes instead.
         match leads_on {
             false => self.outgoing.forget(),
             true if self.outgoing.has_outgrown() => self.act(Action::TakeAsState),

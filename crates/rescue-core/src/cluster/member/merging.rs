@@ -43,10 +43,10 @@ enum Step {
     Pause(Instant, Option<Ask>),
 }
 
-/// The state of sending the writes of the oldest period of being cut off to the leader.
+/// The state of sending the writes of the oldest partition to the leader.
 #[derive(Debug)]
 pub(super) struct Merging {
-    /// The name under which this computer sends its partition writes. It is the same for all periods of being cut off:
+    /// The name under which this computer sends its partition writes. It is the same for all partitions:
     /// what an earlier period has changed is older than the writes of a later one, and no conflict.
     id: Arc<str>,
     step: Step,
@@ -152,7 +152,7 @@ impl Member {
     /// what is left of it.
     pub(super) fn also_send(&mut self, kept: &[Request]) {
         if let Some(unsent) = &mut self.merging.unsent
-            && self.cut_off.is_last_period()
+            && self.cut_off.is_last_partition()
         {
             unsent.extend_from_slice(kept);
         }
@@ -214,7 +214,7 @@ impl Member {
         if calls.is_empty() {
             match self.merging.unread {
                 true => self.find_conflicts_again(now),
-                false => self.finish_period(now),
+                false => self.finish_partition(now),
             }
             return;
         }
@@ -307,8 +307,8 @@ impl Member {
         }
     }
 
-    /// Finishes the oldest period of being cut off: the leader has made, or judged as lost, all its writes.
-    pub(super) fn finish_period(&mut self, now: Instant) {
+    /// Finishes the oldest partition: the leader has made, or judged as lost, all its writes.
+    pub(super) fn finish_partition(&mut self, now: Instant) {
         let (sent, lost) = (self.merging.sent, self.merging.lost_count);
         self.report_news(News::Merged { sent, lost });
         self.merging = Merging {

@@ -130,7 +130,7 @@ impl Member {
         let binds = !self.keeps_writes();
         self.act(Action::StopRecording { binds });
         let known = self.knows();
-        self.publish_standing(Standing::Nobody { known });
+        self.publish_standing(Standing::NoLeader { known });
         self.end_master();
         self.act(Action::NotifyOwnOnly(false));
         self.act(Action::AnswerNothing);

@@ -70,7 +70,7 @@ impl Member {
                 let uri = uri.to_owned();
                 Standing::Follows { uri, term }
             }
-            _ => Standing::Nobody {
+            _ => Standing::NoLeader {
                 known: self.knows(),
             },
         };
@@ -88,7 +88,7 @@ impl Member {
             return;
         }
         let seq = self.journal.progress.seq;
-        // If `differs`, the mirror is at no position of the journal: it holds records or kept writes that the journal
+        // If `differs`, the mirror is at no position of the journal: it holds records or partition writes that the journal
         // lacks.
         let differs = self.local.seq > seq || !self.cut_off.is_empty();
         if self.journal.own_wins && differs && !self.records() {

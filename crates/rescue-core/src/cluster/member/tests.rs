@@ -205,7 +205,7 @@ fn after_a_restart_a_kept_write_that_conflicts_with_the_journal_is_not_shown() {
 #[test]
 fn the_end_of_a_merge_keeps_the_file_of_writes_that_the_journal_lacks() {
     let keeps_nothing = |member: &mut Member| {
-        member.finish_period(Instant::now());
+        member.finish_partition(Instant::now());
         let mut actions = member.queue.actions.drain(..);
         actions.any(|action| matches!(action, Action::DeletePartitionWrites))
     };

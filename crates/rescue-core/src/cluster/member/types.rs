@@ -361,7 +361,7 @@ pub enum Action {
     ReplacePartitionWrites(PartitionWrites),
     /// Keep these partition writes, too, until a leader has them.
     AddPartitionWrites(Vec<Request>),
-    /// Delete the kept writes, because none is left to send.
+    /// Delete the partition writes, because none is left to send.
     DeletePartitionWrites,
     /// Ask the leader at this address and of this term to make these writes. `None` stands for this computer.
     Merge {

@@ -16,7 +16,8 @@ const MULTICALL: &str = "system.multicall";
 /// A request to the leader to make some partition writes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ask {
-    /// The name under which all writes of one period of being cut off are sent.
+    /// The name under which this process of the computer sends all its partition writes. What it has changed under this name
+    /// is no conflict.
     pub id: Arc<str>,
     /// The writes conflict with no change up to this record of the journal.
     pub seq: u64,

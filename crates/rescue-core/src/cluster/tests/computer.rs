@@ -207,7 +207,7 @@ impl Computer {
             own_only: false,
             times_alone: 0,
             cut: (0, 0),
-            standing: Standing::Nobody { known: false },
+            standing: Standing::NoLeader { known: false },
             waiting: Vec::new(),
             answered: Vec::new(),
             told: JournalPosition::at_start(),
@@ -241,7 +241,7 @@ impl Computer {
         self.member = member(&self.name, index, self.life, plan, &self.disk);
         (self.master, self.own_only, self.watching) = (None, false, false);
         self.watch += 1;
-        self.standing = Standing::Nobody { known: true };
+        self.standing = Standing::NoLeader { known: true };
         self.waiting.clear();
         self.answered.clear();
     }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use crate::{
-    checkpoint::format::{self, Record, RecordContent as JournalEntry},
+    checkpoint::format::{self, Record, RecordContent},
     cluster::{
         journal::{self, Keys, Manifest, Progress, Put},
         machine::{Alive, EtcdAnswer, Leader, Op, RevisionGuard, Settings, View},
@@ -37,7 +37,7 @@ pub(super) struct Sent {
 pub(super) enum Held {
     Records(Vec<Record>),
     State(Box<Master>),
-    /// A large value of which parts are gone. Nobody can read it.
+    /// A large value of which parts are gone. No computer can read it.
     Damaged,
 }
 
@@ -146,8 +146,8 @@ impl Etcd {
     pub(super) fn holds(&self, call: &Request) -> bool {
         self.log.iter().rev().any(|entry| match &entry.held {
             Held::Records(records) => records.iter().any(|record| match &record.entry {
-                JournalEntry::Call { call: of, .. } => of.params() == call.params(),
-                JournalEntry::Session(_) => false,
+                RecordContent::Call { call: of, .. } => of.params() == call.params(),
+                RecordContent::Session(_) => false,
             }),
             Held::State(_) | Held::Damaged => false,
         })
@@ -408,7 +408,7 @@ impl Etcd {
                 let next = self.view.seq() + 1;
                 assert_eq!(records[0].seq, next, "the journal has no gap");
                 for record in records {
-                    if let JournalEntry::Call { call, .. } = &record.entry {
+                    if let RecordContent::Call { call, .. } = &record.entry {
                         self.state.apply_telling(call, &mut ());
                     }
                 }

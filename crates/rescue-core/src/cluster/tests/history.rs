@@ -6,7 +6,7 @@ use super::{
     etcd::{Etcd, Held, LogEntry},
     world::COMPUTERS,
 };
-use crate::{checkpoint::format::RecordContent as JournalEntry, cluster::machine::Commit};
+use crate::{checkpoint::format::RecordContent, cluster::machine::Commit};
 use ros1_master::{
     master::{Master, Method, Request},
     xmlrpc::Value,
@@ -230,7 +230,7 @@ impl History {
         let in_log = etcd.log.iter().any(|entry| match &entry.held {
             Held::State(state) => value_of(state, call.key) == Some(call.value),
             Held::Records(records) => records.iter().any(|record| match &record.entry {
-                JournalEntry::Call { call, .. } => same(call.params()),
+                RecordContent::Call { call, .. } => same(call.params()),
                 _ => false,
             }),
             Held::Damaged => false,
@@ -544,7 +544,7 @@ impl History {
             // A later write may have taken the place of this one when the writes were kept, and may be lost.
             // Until a restart, it may have counted as lost, and after it a comparison of states found no change.
             let revived = match (call.alone, call.merged.last()) {
-                // The others' changes may be older than the period of being cut off.
+                // The others' changes may be older than the partition.
                 (Some(cut), Some((moment, _))) => {
                     let since = etcd.added(cut).min(heard);
                     self.compared(computer, since, *moment)
@@ -730,7 +730,7 @@ impl Places {
                 }
             };
             for (part, record) in records.iter().enumerate() {
-                let JournalEntry::Call { call, .. } = &record.entry else {
+                let RecordContent::Call { call, .. } = &record.entry else {
                     continue;
                 };
                 let place = index * 1000 + part;

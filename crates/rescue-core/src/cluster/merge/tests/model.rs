@@ -1,4 +1,4 @@
-//! Merges the writes of random periods of being cut off. Leaders are replaced, forget changes, and lose answers.
+//! Merges the writes of random partitions. Leaders are replaced, forget changes, and lose answers.
 
 use super::super::{
     Changes, MergeVerdict, WritesToSend,

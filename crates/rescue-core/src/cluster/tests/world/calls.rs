@@ -299,7 +299,7 @@ impl World {
             } => true,
             Standing::Leads { answers, .. } => fresh && *answers == AnsweredCalls::Reads,
             Standing::Follows { .. } => fresh,
-            Standing::Nobody { known } => fresh && *known,
+            Standing::NoLeader { known } => fresh && *known,
         };
         assert!(
             may || !led,

@@ -1,4 +1,5 @@
-//! Summaries of replies for the log.
+//! For which methods the master has answered differently from the mirror: whether it must be read for that, and the log
+//! line.
 
 use std::collections::HashSet;
 

@@ -12,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::backoff::Backoff;
+use crate::health::backoff::Backoff;
 
 /// How long a topic or parameter must be unchanged before its notification. Idle threads of rosmaster look for work
 /// every 100 ms.
@@ -29,7 +29,7 @@ const LIFE: Duration = Duration::from_secs(300);
 
 /// The changed topics and parameters, each with the time of its next notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Repeats<K: Ord> {
+pub struct BesideMaster<K: Ord> {
     of: BTreeMap<K, Wait>,
 }
 
@@ -43,7 +43,7 @@ struct Wait {
     held_up: bool,
 }
 
-impl<K: Ord> Default for Repeats<K> {
+impl<K: Ord> Default for BesideMaster<K> {
     fn default() -> Self {
         Self {
             of: BTreeMap::new(),
@@ -51,7 +51,7 @@ impl<K: Ord> Default for Repeats<K> {
     }
 }
 
-impl<K: Ord + Clone> Repeats<K> {
+impl<K: Ord + Clone> BesideMaster<K> {
     /// Notes that `key` has changed.
     pub fn changed(&mut self, key: K, now: Instant) {
         let before = self.of.get(&key);
@@ -97,7 +97,7 @@ mod tests {
     #[test]
     fn no_notification_is_due_while_all_nodes_answer() {
         let start = Instant::now();
-        let mut repeats = Repeats::default();
+        let mut repeats = BesideMaster::default();
         repeats.changed("/t", start);
         let next = repeats.next().unwrap();
         assert_eq!(repeats.take_due(next, false), Vec::<&str>::new());
@@ -107,7 +107,7 @@ mod tests {
     #[test]
     fn a_notification_is_repeated_as_long_as_the_master_may_be_late() {
         let start = Instant::now();
-        let mut repeats = Repeats::default();
+        let mut repeats = BesideMaster::default();
         repeats.changed("/t", start);
         let mut told = Vec::new();
         while let Some(next) = repeats.next() {
@@ -124,7 +124,7 @@ mod tests {
     fn a_subject_that_keeps_changing_is_notified_nevertheless() {
         let start = Instant::now();
         let step = Duration::from_millis(100);
-        let mut repeats = Repeats::default();
+        let mut repeats = BesideMaster::default();
         let mut told = Vec::new();
         for i in 0..20 {
             let now = start + step * i;
