@@ -439,6 +439,8 @@ impl Ledger {
     pub fn leave(&self) -> Option<u64> {
         let mut inner = self.lock();
         let last = inner.shared.last();
+        // The file holds these records all the same.
+        inner.session.cluster_seq = inner.cluster_seq();
         inner.shared = Shared::Elsewhere;
         inner.order.forget_notifications();
         drop(inner);
@@ -455,6 +457,7 @@ impl Ledger {
     /// the state that the others hold. If this computer's state differs, the others get the whole state.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
+        inner.note_followed(seq);
         let times_led = self.acknowledged.times_led();
         let sharing = Sharing::after(seq);
         inner.shared = Shared::Here { times_led, sharing };
@@ -513,6 +516,10 @@ impl Ledger {
         if !inner.is_elsewhere() {
             return Err(Superseded);
         }
+        let (Some(first), Some(last)) = (records.first(), records.last()) else {
+            return Ok(());
+        };
+        inner.note_followed(first.seq.saturating_sub(1));
         let entries: Vec<RecordContent> =
             records.iter().map(|record| record.entry.clone()).collect();
         for entry in &entries {
@@ -523,21 +530,26 @@ impl Ledger {
             }
         }
         inner.append(entries);
+        // The file counts these by itself.
+        inner.session.cluster_seq = last.seq;
         drop(inner);
         self.save();
         Ok(())
     }
 
-    /// Replaces the state by that of the computer that has the master.
+    /// Replaces the state by that of the computer that has the master, after record `seq` of etcd's journal.
     ///
     /// # Errors
     ///
     /// If this computer has the master itself.
-    pub fn follow_state(&self, state: Master) -> Result<(), Superseded> {
+    pub fn follow_state(&self, seq: u64, state: Master) -> Result<(), Superseded> {
         let mut inner = self.lock();
         if !inner.is_elsewhere() {
             return Err(Superseded);
         }
+        inner.note_followed(seq);
+        // Until the next complete checkpoint, the file lacks this state.
+        inner.session_unwritten = true;
         inner.pending.clear();
         inner.activity = Default::default();
         inner.note_equal();
@@ -545,6 +557,15 @@ impl Ledger {
         drop(inner);
         self.work.notify_one();
         Ok(())
+    }
+
+    /// Notes that the mirror already has the state after record `seq` of etcd's journal.
+    pub(crate) fn note_followed(&self, seq: u64) {
+        let mut inner = self.lock();
+        inner.note_followed(seq);
+        inner.write_session();
+        drop(inner);
+        self.save();
     }
 
     /// The [gate], which tells whether calls pass to the master.

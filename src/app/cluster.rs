@@ -265,14 +265,15 @@ impl ClusterDriver {
             Action::StartRecording { seq, held, state } => {
                 if let Some(state) = state {
                     // This fails only if this computer already has the master.
-                    let _ = ledger.follow_state(state);
+                    let _ = ledger.follow_state(seq, state);
                 }
                 ledger.lead(seq, &held);
             }
             Action::Follow(records) => drop(ledger.follow(&records)),
-            Action::FollowState(state) => {
-                if ledger.with_mirror(|mirror| *mirror != state) {
-                    let _ = ledger.follow_state(state);
+            Action::FollowState { seq, state } => {
+                match ledger.with_mirror(|mirror| *mirror == state) {
+                    true => ledger.note_followed(seq),
+                    false => drop(ledger.follow_state(seq, state)),
                 }
             }
             Action::Acknowledge(seq) => ledger.acknowledged.reach(seq),
@@ -291,9 +292,12 @@ impl ClusterDriver {
             Action::StoreTerm {
                 term,
                 journal_number,
+                seq,
             } => {
                 ledger.update_session(|session| {
                     (session.term, session.cluster_journal) = (term, journal_number);
+                    // If this computer records calls, the ledger counts itself.
+                    session.cluster_seq = seq;
                 });
             }
             Action::BeginMaster(cause) => {

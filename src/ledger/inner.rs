@@ -243,8 +243,7 @@ impl Inner {
         };
         let session = Session {
             announced: Some(announced),
-            at: clock::wall_millis(),
-            ..self.session.clone()
+            ..self.session_record()
         };
         if !Mutant::AnnouncesNothing.lives() {
             self.append(vec![RecordContent::Session(session.into())]);
@@ -274,15 +273,29 @@ impl Inner {
 
     pub(super) fn write_session(&mut self) {
         if std::mem::take(&mut self.session_unwritten) {
+            let session = self.session_record();
+            self.append(vec![RecordContent::Session(session.into())]);
+        }
+    }
+
+    /// The session as the journal gets it now.
+    pub(super) fn session_record(&self) -> Session {
+        Session {
             // While a complete checkpoint is due, the file lacks changes that have no record.
-            self.session.cluster_seq = match self.whole.is_due() {
+            cluster_seq: match self.whole.is_due() {
                 true => 0,
                 false => self.cluster_seq(),
-            };
-            self.session.at = clock::wall_millis();
-            let entry = RecordContent::Session(self.session.clone().into());
-            self.append(vec![entry]);
+            },
+            at: clock::wall_millis(),
+            ..self.session.clone()
         }
+    }
+
+    /// Notes that the mirror holds etcd's journal up to record `seq`. The journal of this computer is told unless it counts
+    /// the same number.
+    pub(super) fn note_followed(&mut self, seq: u64) {
+        self.session_unwritten |= self.cluster_seq() != seq;
+        self.session.cluster_seq = seq;
     }
 
     pub(super) fn token(&self) -> Token {

@@ -221,7 +221,7 @@ mod tests {
         assert_eq!(acknowledged(&ledger, mark).await, Some(true));
         assert!(seqs(&ledger).is_empty());
         assert!(ledger.follow(&[record(1, set(2))]).is_err());
-        assert!(ledger.follow_state(Master::default()).is_err());
+        assert!(ledger.follow_state(1, Master::default()).is_err());
     }
 
     #[test]
@@ -239,7 +239,7 @@ mod tests {
             .unwrap();
         assert!(ledger.with_mirror(|mirror| *mirror == state_of([set(3)])));
         assert_ne!(ledger.version(), before);
-        ledger.follow_state(state_of([set(4)])).unwrap();
+        ledger.follow_state(3, state_of([set(4)])).unwrap();
         assert!(ledger.with_mirror(|mirror| *mirror == state_of([set(4)])));
         assert!(seqs(&ledger).is_empty());
     }
@@ -273,12 +273,44 @@ mod tests {
         answer(&ledger, &set(1));
         assert_eq!(cluster_seq(), 8);
         ledger.update_session(|session| session.term = 3);
-        assert_eq!(ledger.session().cluster_seq, 8);
+        let in_record = || ledger.lock().session_record().cluster_seq;
+        assert_eq!(in_record(), 8);
         // A state without a record is in the next checkpoint, but not in the file before it.
         ledger.adopt(state_of([set(2)]));
         answer(&ledger, &set(3));
-        assert_eq!(ledger.session().cluster_seq, 0);
+        assert_eq!(in_record(), 0);
         assert_eq!(cluster_seq(), 10);
+    }
+
+    /// A number that is too high looks like a loss of etcd's data at the next start, and one that is too low hides one.
+    #[test]
+    fn a_followers_checkpoint_tells_how_much_of_etcds_journal_it_holds() {
+        let ledger = ledger();
+        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        ledger.leave();
+        ledger
+            .follow(&[record(7, set(1)), record(8, set(2))])
+            .unwrap();
+        assert_eq!(cluster_seq(), 8);
+        // While it is cut off, it counts its own writes, of which the journal gets the last.
+        ledger.lead(8, &state_of([set(2)]));
+        for value in 3..53 {
+            answer(&ledger, &set(value));
+        }
+        assert_eq!(cluster_seq(), 58);
+        // As at an orderly stop.
+        ledger.leave();
+        assert_eq!(cluster_seq(), 58);
+        ledger.note_followed(9);
+        assert_eq!(cluster_seq(), 9);
+        assert!(!ledger.lock().session_unwritten, "the file still has 58");
+        ledger.follow(&[record(10, set(60))]).unwrap();
+        assert_eq!(cluster_seq(), 10);
+        // The file lacks a state that is adopted, until a complete checkpoint is written.
+        ledger.follow_state(20, state_of([set(61)])).unwrap();
+        assert_eq!(cluster_seq(), 20);
+        assert!(ledger.lock().session_unwritten);
+        assert_eq!(ledger.lock().session_record().cluster_seq, 0);
     }
 
     #[tokio::test]
@@ -326,7 +358,7 @@ mod tests {
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
         // The old calls stay unacknowledged when this computer leads again and uses their numbers for other calls.
-        ledger.follow_state(state_of([set(1)])).unwrap();
+        ledger.follow_state(1, state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));
         ledger.acknowledged.reach(2);

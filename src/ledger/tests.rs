@@ -503,7 +503,7 @@ async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     ledger.leave();
     let mut held = Master::default();
     held.apply(&publish);
-    ledger.follow_state(held.clone()).unwrap();
+    ledger.follow_state(7, held.clone()).unwrap();
     ledger.lead(7, &held);
     // A node repeats a write after the previous leader had recorded it and died before the answer.
     let (_, mark) = ledger.answer_from_mirror(Instant::now(), &publish).unwrap();

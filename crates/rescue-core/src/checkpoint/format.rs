@@ -56,12 +56,13 @@ pub struct Session {
     pub announced: Option<Announced>,
     /// The port that nodes use.
     pub port: u16,
-    /// With several computers: the last term in which this computer led. 0 if it never led.
+    /// With several computers: the term of the last leader whose journal this computer had read to its end, or of its own
+    /// last leadership. 0 if there was none.
     pub term: u64,
     /// With several computers: the number of etcd's journal of `term`. 0 if it is unknown.
     pub cluster_journal: u64,
     /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
-    /// that follows in this file has the next number. Too low if the true number is unknown.
+    /// that follows in this file has the next number. 0 if it is unknown.
     pub cluster_seq: u64,
     /// Wall clock time at which this was written, in milliseconds since 1970. It is a label, like [`Label::at`].
     pub at: u64,

@@ -272,7 +272,8 @@ impl Member {
             // Also what this computer showed as a leader, as long as it is unknown whether another computer leads.
             self.outgoing
                 .apply_after(self.journal.progress.seq, &mut state);
-            self.act(Action::FollowState(state));
+            let seq = self.journal.progress.seq;
+            self.act(Action::FollowState { seq, state });
         }
     }
 

@@ -55,9 +55,11 @@ impl Member {
         let journal_number = self.view().journal_number;
         let stored = (term, journal_number);
         if std::mem::replace(&mut self.before.term, stored) != stored {
+            let seq = self.held.seq;
             self.act(Action::StoreTerm {
                 term,
                 journal_number,
+                seq,
             });
         }
     }

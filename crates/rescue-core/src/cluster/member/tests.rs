@@ -123,7 +123,7 @@ impl Merges {
     fn shown_after(&mut self, input: Input) -> Vec<Value> {
         let actions = self.member.on(self.now, input);
         let states = actions.iter().filter_map(|action| match action {
-            Action::FollowState(state) => state.params().get("k").cloned(),
+            Action::FollowState { state, .. } => state.params().get("k").cloned(),
             _ => None,
         });
         states.collect()
@@ -243,7 +243,7 @@ fn a_record_that_reaches_the_journal_after_the_first_read_counts_more_than_the_c
     let mut followed = |input| {
         let mut actions = member.on(now, input).into_iter();
         actions.find_map(|action| match action {
-            Action::FollowState(state) => state.params().get("k").cloned(),
+            Action::FollowState { state, .. } => state.params().get("k").cloned(),
             _ => None,
         })
     };

@@ -34,7 +34,8 @@ pub struct LocalCheckpoint {
     pub state: Master,
     /// Whether the state belongs to a session that continues.
     pub restored: bool,
-    /// The last term in which this computer led.
+    /// The term of the last leader whose journal this computer had read to its end, or of its own last leadership. 0 if there
+    /// was none.
     pub term: u64,
     /// See [`View::journal_number`]; of the journal of that term.
     pub journal_number: u64,
@@ -327,8 +328,12 @@ pub enum Action {
     },
     /// Apply these records of another computer.
     Follow(Vec<Record>),
-    /// Replace the ledger's state by this state of another computer.
-    FollowState(Master),
+    /// Replace the ledger's state by this one: the journal's after record `seq`, with what this computer has answered and the
+    /// journal lacks.
+    FollowState {
+        seq: u64,
+        state: Master,
+    },
     /// Let the answers to the calls up to this record go out.
     Acknowledge(u64),
     /// Take the changes that the ledger has recorded but not yet handed out as a single one: its state. Ends with
@@ -343,10 +348,12 @@ pub enum Action {
     ShutDownDisplaced(Vec<Displaced>),
     /// Notify every node of the present state, because it may have heard an older one from another computer since.
     NotifyAll,
-    /// Note in the checkpoint that it is of this term, and of the journal with this number.
+    /// Note in the checkpoint that it is of this term, and of the journal with this number, which it holds up to record `seq`.
+    /// A computer that records calls counts the records itself.
     StoreTerm {
         term: u64,
         journal_number: u64,
+        seq: u64,
     },
     BeginMaster(Cause),
     /// Kill the master at once.

@@ -637,7 +637,7 @@ impl World {
                     }
                 }
             }
-            Action::FollowState(state) => self.computers[at].follow_state(state),
+            Action::FollowState { state, .. } => self.computers[at].follow_state(state),
             Action::Acknowledge(seq) => self.agree(at, seq),
             Action::TakeAsState => {
                 let ledger = &mut self.computers[at].ledger;
@@ -662,9 +662,14 @@ impl World {
             Action::StoreTerm {
                 term,
                 journal_number,
+                seq,
             } => {
-                let own = &mut self.computers[at].disk.own;
+                let computer = &mut self.computers[at];
+                let own = &mut computer.disk.own;
                 (own.term, own.journal_number) = (term, journal_number);
+                if computer.ledger.sharing.is_none() {
+                    own.seq = seq;
+                }
             }
             Action::BeginMaster(_) => {
                 self.masters += 1;
