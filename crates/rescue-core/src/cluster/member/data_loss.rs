@@ -212,6 +212,8 @@ impl Member {
         self.drive(now, machine::Input::Lost { view, left, until });
         self.machine.hold_claims(until);
         self.data_loss.without_end = None;
+        // The numbers of a new journal begin again, and so do the revisions of a new etcd.
+        (self.chores.replaced, self.namesake.led_in) = (0, 0);
         self.data_loss.times += 1;
         let epoch = self.data_loss.times;
         self.restart_merge(now);
