@@ -34,7 +34,7 @@ fn run(
         let mut machine = Machine::new(settings.clone());
         let mut view = client.view(&keys, LIMIT).await.unwrap();
         let mut watch = client.watch(keys.small(), view.revision, settings.ttl);
-        let mut actions = machine.on(Instant::now(), Input::Start(0));
+        let mut actions = machine.on(Instant::now(), Input::Start);
         loop {
             for action in std::mem::take(&mut actions) {
                 match action {

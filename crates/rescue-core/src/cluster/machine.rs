@@ -233,7 +233,7 @@ impl Machine {
     /// Handles `input` at `now`, and returns the actions to carry out, in order.
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         let mut actions = Vec::new();
-        if self.started.is_none() && !matches!(input, Input::Start(_)) {
+        if self.started.is_none() && input != Input::Start {
             if let Input::Lost { left, .. } = &input {
                 self.left = *left;
             }
@@ -248,10 +248,7 @@ impl Machine {
             self.heard_before_pause = self.heard_before_pause.or(self.heard);
         }
         match input {
-            Input::Start(seq) => {
-                self.started = Some(now);
-                self.follow_to(seq);
-            }
+            Input::Start => self.started = Some(now),
             Input::Answer { number, answer } => self.answered(now, number, answer, &mut actions),
             Input::View(view) => self.see(now, view, &mut actions),
             Input::Followed(seq) => self.followed(seq),

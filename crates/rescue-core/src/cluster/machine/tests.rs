@@ -61,7 +61,7 @@ fn sent(actions: &[Action]) -> (u64, Op) {
 /// A machine that follows `b` and whose mirror is up to date.
 fn following(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
-    let (number, op) = sent(&machine.on(now, Input::Start(0)));
+    let (number, op) = sent(&machine.on(now, Input::Start));
     assert_eq!(op, Op::Read);
     let answer = EtcdAnswer::Is(led("b", 5, 6));
     let actions = machine.on(now, Input::Answer { number, answer });
@@ -74,7 +74,7 @@ fn following(alone: WhenAlone) -> (Machine, Instant) {
 /// A machine that leads, and has sent nothing since `now`.
 fn leading(alone: WhenAlone) -> (Machine, Instant) {
     let (mut machine, now) = machine(alone);
-    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let (number, _) = sent(&machine.on(now, Input::Start));
     let nobody = EtcdAnswer::Is(View::default());
     let claimed = machine.on(
         now,
@@ -185,7 +185,7 @@ fn who_has_paused_for_a_time_to_live_reads_first_and_claims_later() {
 fn who_starts_and_finds_an_etcd_in_use_without_a_leader_claims_after_the_time_to_live() {
     let first_claim = |revision| {
         let (mut machine, now) = machine(WhenAlone::Serve);
-        let (number, _) = sent(&machine.on(now, Input::Start(0)));
+        let (number, _) = sent(&machine.on(now, Input::Start));
         let bare = View {
             revision,
             ..View::default()
@@ -201,7 +201,7 @@ fn who_starts_and_finds_an_etcd_in_use_without_a_leader_claims_after_the_time_to
 #[test]
 fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
     let (mut machine, now) = machine(WhenAlone::Serve);
-    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let (number, _) = sent(&machine.on(now, Input::Start));
     let mut before = led("a", 5, 6);
     before.leader.as_mut().unwrap().id = "a-0".to_owned();
     let answer = EtcdAnswer::Is(before);
@@ -212,7 +212,7 @@ fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
 #[test]
 fn a_computer_of_the_same_name_at_another_address_is_not_deposed_while_it_lives() {
     let (mut machine, now) = machine(WhenAlone::Serve);
-    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let (number, _) = sent(&machine.on(now, Input::Start));
     let namesake = |revision| {
         let mut view = led("a", 5, revision);
         let leader = view.leader.as_mut().unwrap();
@@ -491,7 +491,7 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
 /// are those of the previous session.
 fn claimed() -> (Machine, Instant) {
     let (mut machine, now) = machine(WhenAlone::Serve);
-    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let (number, _) = sent(&machine.on(now, Input::Start));
     let answer = EtcdAnswer::Is(led("b", 5, 6));
     machine.on(now, Input::Answer { number, answer });
     machine.on(now, Input::Followed(10));
@@ -574,7 +574,7 @@ fn what_was_not_decided_before_another_one_leads_is_decided_by_that_one() {
 #[test]
 fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
     let (mut machine, now) = machine(WhenAlone::Serve);
-    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let (number, _) = sent(&machine.on(now, Input::Start));
     // The keys of the previous session.
     let answer = EtcdAnswer::Is(led("b", 5, 6));
     machine.on(now, Input::Answer { number, answer });

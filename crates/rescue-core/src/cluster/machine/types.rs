@@ -198,8 +198,8 @@ pub enum EtcdAnswer {
 /// An event that the machine must know of.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Input {
-    /// The machine starts. The checkpoint contains the journal up to this record.
-    Start(u64),
+    /// The machine starts.
+    Start,
     /// The answer to request `number`.
     Answer { number: u64, answer: EtcdAnswer },
     /// The watch on etcd has delivered the keys `leader` and `alive`.

@@ -450,7 +450,7 @@ impl Member {
     /// Starts the machine, unless it has started already.
     pub(super) fn start(&mut self, now: Instant) {
         if self.queue.start_by.take().is_some() {
-            self.drive(now, machine::Input::Start(0));
+            self.drive(now, machine::Input::Start);
         }
     }
 
