@@ -206,26 +206,27 @@ impl Ledger {
             let is_pending =
                 |call: &&Request| room && unsure(call) && !inner.pending.contains(call);
             (writes, set_again) = writes.into_iter().partition(is_pending);
-            // A parameter that is set again has no record here, but it is the last write also for the other computers.
-            set_again.retain(|call| sets_parameter(call));
+            // With several computers, a parameter that is set again is the last write for the others, too.
+            let is_replicated = inner.is_replicated();
+            set_again.retain(|call| is_replicated && sets_parameter(call));
         }
-        let at = clock::wall_millis();
-        inner.share_only(&set_again, source, Label { at, origin });
-        if writes.is_empty() {
-            if !set_again.is_empty() {
-                self.shared.notify_one();
-            }
+        if writes.is_empty() && set_again.is_empty() {
             return Some((reply, inner.mark(), number));
         }
         // The new version outdates a running inspection, which could restore what this call removes.
-        inner.version += u64::from(!changes);
-        self.stats.writes_recorded.add(writes.len() as u64);
-        let entries = writes.iter().map(|&call| RecordContent::Call {
+        inner.version += u64::from(!changes && !writes.is_empty());
+        let at = clock::wall_millis();
+        let label = Label { at, origin };
+        let again = set_again.into_iter();
+        let again = again.map(|call| RecordContent::labelled(call.clone(), label));
+        let pending = writes.iter().map(|&call| RecordContent::Call {
             call: call.clone(),
             pending: true,
-            label: Label { at, origin },
+            label,
         });
-        let entries: Vec<_> = entries.collect();
+        // The pending writes have the last numbers.
+        let entries: Vec<_> = again.chain(pending).collect();
+        self.stats.writes_recorded.add(entries.len() as u64);
         let sources = vec![source; entries.len()];
         inner.append_from(entries, &sources);
         // The journal holds a call that was on its way to the master twice, which changes nothing.

@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Instant};
 
 use rescue_core::{
-    checkpoint::format::{Announced, Checkpoint, Label, PendingWrite, RecordContent, Session},
+    checkpoint::format::{Announced, Checkpoint, PendingWrite, RecordContent, Session},
     cluster::sharing::Source,
     health::port_of,
     order::Order,
@@ -370,19 +370,6 @@ impl Inner {
     /// Whether other computers get the writes of this one.
     pub(super) fn is_replicated(&self) -> bool {
         matches!(self.shared, Shared::Here { .. })
-    }
-
-    /// Passes `calls` from `source`, which change nothing, to the other computers only, if there are any.
-    pub(super) fn share_only(&mut self, calls: &[&Request], source: &Source, label: Label) {
-        if calls.is_empty() || !self.is_replicated() {
-            return;
-        }
-        let entries = calls.iter();
-        let entries = entries.map(|&call| RecordContent::labelled(call.clone(), label));
-        let entries: Vec<_> = entries.collect();
-        self.share(&entries, &vec![source; entries.len()]);
-        // Later calls have other numbers than the session's record tells.
-        self.session_unwritten = true;
     }
 
     /// Queues `entries` for the other computers. `sources` says for each of the first entries where it came from; the rest

@@ -284,7 +284,11 @@ async fn a_removal_counts_as_done_only_if_a_leader_may_have_run_it() {
         let (refusing, _) = leader_with(vec![refuses, found_nothing()]).await;
 
         let computer = Computer::new(silent);
-        computer.calls.ledger.follow_state(1, mirror.clone()).unwrap();
+        computer
+            .calls
+            .ledger
+            .follow_state(1, mirror.clone())
+            .unwrap();
         let takeover = async {
             calls.wait_for(|count| *count > 0).await.unwrap();
             computer.standing.send_replace(next);
