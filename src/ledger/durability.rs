@@ -240,10 +240,9 @@ impl Ledger {
         (inner.journal, inner.ahead) = (Some(journal), None);
     }
 
-    /// A checkpoint of the present state.
-    pub fn checkpoint(&self) -> Checkpoint {
-        let checkpoint = self.lock().checkpoint();
-        checkpoint()
+    /// The checkpoint of this moment, which the returned function makes. With a large state that takes long.
+    pub(crate) fn checkpoint(&self) -> impl FnOnce() -> Checkpoint + Send + use<> {
+        self.lock().checkpoint()
     }
 
     /// Whether the mirror has changed without a record since the last checkpoint.

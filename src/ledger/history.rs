@@ -44,7 +44,7 @@ impl Rescues {
         // The checkpoint is taken now: the health check will soon unregister dead nodes.
         let checkpoint = self.ledger.checkpoint();
         crate::task::spawn_blocking(move || {
-            let kept = history::keep_rescue(&path, number, checkpoint);
+            let kept = history::keep_rescue(&path, number, checkpoint());
             match kept.and_then(|kept| history::trim(&path, bytes_most).map(|()| kept)) {
                 Ok(kept) => {
                     tracing::debug!(path = %kept.display(), "kept the state of this rescue")

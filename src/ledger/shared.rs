@@ -268,7 +268,7 @@ mod tests {
         let ledger = ledger();
         ledger.leave();
         ledger.lead(7, &Master::default());
-        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        let cluster_seq = || ledger.checkpoint()().session.cluster_seq;
         assert_eq!(cluster_seq(), 7);
         answer(&ledger, &set(1));
         assert_eq!(cluster_seq(), 8);
@@ -286,7 +286,7 @@ mod tests {
     #[test]
     fn a_followers_checkpoint_tells_how_much_of_etcds_journal_it_holds() {
         let ledger = ledger();
-        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        let cluster_seq = || ledger.checkpoint()().session.cluster_seq;
         ledger.leave();
         ledger
             .follow(&[record(7, set(1)), record(8, set(2))])
@@ -332,7 +332,7 @@ mod tests {
         ledger.leave();
         ledger.follow(&[record(7, set(1))]).unwrap();
         ledger.lead(7, &state_of([set(1)]));
-        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        let cluster_seq = || ledger.checkpoint()().session.cluster_seq;
         let pending = ledger.pending();
         let again = answer(&ledger, &set(1));
         assert_eq!((seqs(&ledger), cluster_seq()), (vec![8], 8));

@@ -157,7 +157,7 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     answer(&call("deleteParam", &["/n", "/b"]));
     answer(&call("setParam", &["/n", "/"]));
     assert_eq!(pending(&ledger), [set(1), set(2)]);
-    let kept = ledger.checkpoint().pending.into_iter();
+    let kept = ledger.checkpoint()().pending.into_iter();
     assert_eq!(
         kept.map(|write| write.call).collect::<Vec<_>>(),
         [set(1), set(2)]
@@ -584,7 +584,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     }
     let checkpoint = format::Checkpoint {
         follows: false,
-        ..ledger.checkpoint()
+        ..ledger.checkpoint()()
     };
     let encoded = format::encode_checkpoint(&checkpoint, 1).unwrap();
     let read = format::decode(&encoded.bytes).unwrap().checkpoint.unwrap();
@@ -595,7 +595,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     // The displaced nodes are also in the next start's snapshot, until the master is examined.
     let next = self::ledger();
     next.with_activity(|_, activity| activity.restore_displaced(rebuilt.displaced));
-    assert_eq!(next.checkpoint().displaced, checkpoint.displaced);
+    assert_eq!(next.checkpoint()().displaced, checkpoint.displaced);
 }
 
 /// A ledger with a file, and the state and number of records that the next start would find in it.
