@@ -1,10 +1,14 @@
 //! Assembles the program: startup, running, and orderly stop.
 
-use std::{io, sync::Arc, time::Duration};
+use std::{any::Any, io, sync::Arc, time::Duration};
 
 use checkpoint_store::OpenError;
 use thiserror::Error;
-use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
+use tokio::{
+    net::TcpListener,
+    sync::Semaphore,
+    task::{JoinError, JoinSet},
+};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
@@ -137,6 +141,7 @@ pub async fn run(
         process = begun.run(stop, halt) => process?,
         () = announce(&context, say) => None,
         () = looped.notified() => return Err(RunError::Loop { master: context.upstream.address() }),
+        panic = panicked(&mut tasks) => std::panic::resume_unwind(panic),
     };
     connections.close();
     // Calls that still wait cannot be answered any more, so their connections are closed.
@@ -149,6 +154,16 @@ pub async fn run(
     // The time is limited, because systemd may not be reading.
     let _ = tokio::time::timeout(DRAIN, notified).await;
     Ok(())
+}
+
+/// Waits until one of `tasks` panics. Without that task rosrescue would go on half dead, and the next worker has all state.
+async fn panicked(tasks: &mut JoinSet<()>) -> Box<dyn Any + Send> {
+    while let Some(ended) = tasks.join_next().await {
+        if let Err(Ok(panic)) = ended.map_err(JoinError::try_into_panic) {
+            return panic;
+        }
+    }
+    std::future::pending().await
 }
 
 /// The rosmaster that this rosrescue starts, and whether it starts rosout, too.

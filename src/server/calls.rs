@@ -406,6 +406,8 @@ impl Calls {
                 State::Elsewhere => return Err(Unanswered::Elsewhere),
             }
             tokio::select! {
+                // On a busy computer both branches may be ready.
+                biased;
                 () = gate.changed() => {}
                 () = hold.wait_until_spent() => {
                     self.stats.calls_unanswered.count();
