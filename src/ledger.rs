@@ -609,7 +609,7 @@ impl Ledger {
 
     /// Notes that the checkpoint is older than the master, whose [`Token`] has this `number`. A master has run the
     /// checkpoint's pending writes, unless an earlier process announced that it gives the master the state before them.
-    pub fn catch_up(&self, number: u64) {
+    pub fn note_later_master(&self, number: u64) {
         let mut inner = self.lock();
         let announced = inner.session.announced.take();
         let ran = match announced.filter(|announced| number <= announced.incarnation) {

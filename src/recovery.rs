@@ -16,15 +16,15 @@ use std::{
 };
 
 use rescue_core::{
-    lifecycle::{Action, Cause, Input, Supervision, evidence::Sample},
-    replay::RUN_ID_AFTER,
+    lifecycle::{Action, Cause, Input, evidence::Sample},
+    replay::{KnownMaster, RUN_ID_AFTER},
 };
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use self::{
     course::{Course, Step},
-    examine::{Examination, ExamineError, Examiner, InAdvance, Manner},
+    examine::{Examination, ExamineError, Examiner},
     live_master::Reach,
     master_process::MasterProcess,
     reporting::{LastMessage, Outage},
@@ -106,7 +106,6 @@ pub(crate) struct Driver {
     probe_deadline: Option<tokio::time::Instant>,
     /// Total delay of timers that fired late because this process had to wait for the processor.
     timers_late: Duration,
-    prepared: InAdvance,
     outage: Outage,
     last_message: Option<LastMessage>,
 }
@@ -122,12 +121,8 @@ impl Driver {
         process: Option<MasterProcess>,
         rescues: Rescues,
     ) -> Self {
-        let supervision = match process {
-            Some(_) => Supervision::Ours,
-            None => Supervision::Theirs,
-        };
         Self {
-            course: Course::new(supervision, reach.probing),
+            course: Course::new(reach.supervision, reach.probing),
             outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
             gate: examiner.ledger.gate(),
             examiner,
@@ -145,7 +140,6 @@ impl Driver {
             work: None,
             probe_deadline: None,
             timers_late: Duration::ZERO,
-            prepared: InAdvance::default(),
             last_message: None,
         }
     }
@@ -254,7 +248,8 @@ impl Driver {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
                 () = wait::for_some(self.ended.as_mut()) => {
-                    if !self.gate.state().is_open() {
+                    // A master that was late has served, and the death of one that gets the state has a line of its own.
+                    if matches!(self.gate.state(), State::StandingIn | State::Unknown) {
                         let master = self.reach.upstream.address();
                         self.log_waiting(&format!("{master} closes the connection without a reason"), false);
                     }
@@ -295,7 +290,7 @@ impl Driver {
             Step::ReportDeathWhileInjected => alarm!(
                 warn,
                 AWAY,
-                "the master died before calls could pass to it; the next master gets the state"
+                "the master died while it was given the state; the next one gets it"
             ),
             Step::Act(action) => return self.act(action).await,
         }
@@ -307,7 +302,8 @@ impl Driver {
             Action::Connect => {
                 // The injection is prepared again if the previous one has gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
-                self.prepared.begin(|| live_master::prepare(ledger.clone()));
+                let prepared = &self.examiner.prepared;
+                prepared.begin(|| live_master::prepare(ledger.clone()));
                 let upstream = self.reach.upstream.clone();
                 let new = self.process.as_ref().and_then(MasterProcess::new_one);
                 self.work = Some(Box::pin(async move {
@@ -327,15 +323,12 @@ impl Driver {
                 let sentinel = self.sentinel.clone()?;
                 let examiner = self.examiner.clone();
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
-                let manner = Manner {
-                    known: examiner.known(new),
-                    prepared: self.prepared.clone(),
-                };
+                let known = examiner.known(new);
                 let reach = self.reach.clone();
                 let master = reach.upstream.address();
                 let span = tracing::debug_span!("recovery", %master, cause = self.outage.cause);
                 let examined = async move {
-                    let examined = examine(&examiner, &reach, &sentinel, manner).await;
+                    let examined = examine(&examiner, &reach, &sentinel, known).await;
                     Done::Examined(sentinel, examined)
                 };
                 self.work = Some(Box::pin(examined.instrument(span)));
@@ -540,16 +533,15 @@ impl Driver {
             ),
         }
         // The prepared injection is out of date.
-        self.prepared.forget();
+        self.examiner.prepared.forget();
     }
 
     fn open_gate(&mut self) {
         self.last_message = None;
-        self.prepared.forget();
+        self.examiner.prepared.forget();
         self.examiner.ledger.open_gate();
         self.set_run_id_later();
         if let Some(number) = self.restored.take() {
-            // This comes last, so that calls do not wait while the state is copied.
             self.rescues.keep_rescue(number, Instant::now());
         }
     }
@@ -596,10 +588,10 @@ async fn examine(
     examiner: &Examiner,
     reach: &Reach,
     sentinel: &Arc<Sentinel>,
-    manner: Manner,
+    known: KnownMaster,
 ) -> Result<Examined, ExamineError> {
     let mut master = reach.to_examine(sentinel).await?;
-    let examination = examiner.examine(&mut master, manner).await?;
+    let examination = examiner.examine(&mut master, known).await?;
     Ok(Examined {
         speaks: master.speaks(),
         verification: master.verification(examination.pid).await,

@@ -6,7 +6,6 @@ use std::{
     time::Duration,
 };
 
-use rescue_core::lifecycle::{Probing, Supervision};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_util::sync::CancellationToken;
 
@@ -16,7 +15,11 @@ use crate::{
     nodes::{Nodes, served::Served},
     process::{ProcessError, Rosmaster},
     recovery::{
-        Driver, course::Step, examine::Examiner, live_master::Reach, master_process::MasterProcess,
+        Driver,
+        course::Step,
+        examine::{Examiner, InAdvance},
+        live_master::Reach,
+        master_process::MasterProcess,
     },
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
@@ -39,11 +42,7 @@ pub(super) struct Context {
     pub(super) served: Served,
     pub(super) board: Arc<Board>,
     pub(super) stats: &'static Stats,
-    pub(super) supervision: Supervision,
-    pub(super) probing: Probing,
-    pub(super) probe_timeout: Duration,
-    /// Pause between two renewals of the sentinel.
-    pub(super) renewal: Duration,
+    pub(super) reach: Reach,
     /// Maximum disk space for the checkpoints kept from rescues, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
@@ -56,17 +55,11 @@ impl Context {
         Driver::new(
             Examiner {
                 ledger: self.ledger.clone(),
-                supervision: self.supervision,
+                prepared: InAdvance::default(),
                 run_id: Arc::default(),
                 stats: self.stats,
             },
-            Reach {
-                upstream: self.upstream.clone(),
-                supervision: self.supervision,
-                probing: self.probing,
-                probe_timeout: self.probe_timeout,
-                renewal: self.renewal,
-            },
+            self.reach.clone(),
             self.write_queue.clone(),
             self.nodes.clone(),
             self.board.clone(),

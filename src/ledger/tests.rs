@@ -221,7 +221,7 @@ fn a_start_knows_which_pending_writes_a_master_that_was_announced_lacks() {
         let (stats, sync) = (Box::leak(Box::default()), SyncPolicy::Interval);
         let pending = vec![write(3), write(5), write(8)];
         let ledger = Ledger::new(Master::default(), session, pending, None, sync, stats);
-        ledger.catch_up(number);
+        ledger.note_later_master(number);
         // A second process that dies learns the same.
         let session = ledger.session();
         assert_eq!((session.incarnation, session.announced), (number, None));

@@ -9,7 +9,7 @@ use std::{
 
 use rescue_core::{
     health::port_of,
-    lifecycle::{Input, Supervision},
+    lifecycle::Input,
     replay::{
         self, Authority, Deviation, Inspection, KnownMaster, Plan, ROSOUT, Token, TokenState,
         Treatment, withheld_run_id,
@@ -98,14 +98,6 @@ pub(crate) struct Examination {
     pub inspection: Duration,
     /// Time the injection took.
     pub injection: Duration,
-}
-
-/// The parameters of [`Examiner::examine`].
-#[derive(Debug)]
-pub(crate) struct Manner {
-    pub known: KnownMaster,
-    /// The injection into an empty master, if it is prepared in advance.
-    pub prepared: InAdvance,
 }
 
 /// The injection that is prepared in another thread while the master is away. Only the examination of an empty master
@@ -237,7 +229,8 @@ impl Change {
 #[derive(Clone)]
 pub(crate) struct Examiner {
     pub ledger: Arc<Ledger>,
-    pub supervision: Supervision,
+    /// The injection into an empty master, if it is prepared in advance.
+    pub prepared: InAdvance,
     /// The call that sets `/run_id` in the present master, if the master gets it later ([`withheld_run_id`]).
     pub run_id: Arc<Mutex<Option<Request>>>,
     pub stats: &'static Stats,
@@ -268,16 +261,16 @@ impl Examiner {
     pub(crate) async fn examine(
         &self,
         master: &mut impl Contact,
-        manner: Manner,
+        known: KnownMaster,
     ) -> Result<Examination, ExamineError> {
         let start = master.now();
-        let served = matches!(manner.known, KnownMaster::ServedIfPresent);
+        let served = matches!(known, KnownMaster::ServedIfPresent);
         let resumes = |first: &Inspection| {
             let token = self.ledger.token();
             served && first.bears() == TokenState::Present && self.ledger.resume(&token)
         };
-        let is_new = matches!(manner.known, KnownMaster::New { .. });
-        let mut first = match manner.known {
+        let is_new = matches!(known, KnownMaster::New { .. });
+        let mut first = match known {
             KnownMaster::New { pid } => Inspection::at_new(pid),
             _ => self.read_first(master).await?,
         };
@@ -303,8 +296,7 @@ impl Examiner {
             // Another program may have written to the master directly.
             self.ledger.doubt();
         } else {
-            let may_be_roscores = self.supervision == Supervision::Theirs
-                && master.may_be_of_roscore(examination.pid).await;
+            let may_be_roscores = master.may_be_of_roscore(examination.pid).await;
             self.inject(
                 master,
                 first,
@@ -368,7 +360,7 @@ impl Examiner {
         &self,
         master: &mut impl Contact,
         first: Inspection,
-        manner: Manner,
+        known: KnownMaster,
         may_be_roscores: bool,
         start: Instant,
         examination: &mut Examination,
@@ -376,11 +368,11 @@ impl Examiner {
         let (bears, empty) = (first.bears(), first.is_empty());
         tracing::debug!(?bears, empty, pid = first.pid(), "inspected");
         if let TokenState::Later(number) = bears {
-            self.ledger.catch_up(number);
+            self.ledger.note_later_master(number);
         }
         let fresh = bears == TokenState::Nothing && empty;
         let mut ready = match fresh {
-            true => manner.prepared.take().await,
+            true => self.prepared.take().await,
             false => None,
         };
         let found = match fresh {
@@ -407,7 +399,7 @@ impl Examiner {
         } = self.ledger.begin_injection();
         let pending = replay::without_ended(pending, &ended);
         let before = self.ledger.token();
-        let treatment = replay::treatment(bears, manner.known, mirror.is_empty(), found.is_empty());
+        let treatment = replay::treatment(bears, known, mirror.is_empty(), found.is_empty());
         let withheld = withheld_run_id(may_be_roscores, treatment, &mirror, &found);
         if let Some((remove, set)) = withheld {
             ready = None;
@@ -419,13 +411,11 @@ impl Examiner {
             Treatment::Begin => RecoveryOutcome::Begun,
             Treatment::Adopt => RecoveryOutcome::Adopted,
             Treatment::Inject | Treatment::Replace => RecoveryOutcome::Injected,
-            Treatment::Reconcile(_) if manner.known == KnownMaster::Nothing => {
-                RecoveryOutcome::Adopted
-            }
+            Treatment::Reconcile(_) if known == KnownMaster::Nothing => RecoveryOutcome::Adopted,
             Treatment::Reconcile(Authority::PendingWrites) => RecoveryOutcome::Reconciled,
             Treatment::Reconcile(Authority::Mirror) => RecoveryOutcome::Injected,
         };
-        let report = |difference: &[String]| match manner.known {
+        let report = |difference: &[String]| match known {
             KnownMaster::Nothing => log_newer_master(difference),
             _ => log_difference(difference),
         };

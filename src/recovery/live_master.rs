@@ -113,6 +113,8 @@ impl Reach {
         work: impl Future<Output = Result<T, E>>,
     ) -> Result<T, ExamineError> {
         tokio::select! {
+            // On a busy computer both branches may be ready.
+            biased;
             done = within(INJECTION_LIMIT, work) => done,
             limit = self.silence() => Err(ExamineError::Silent { limit }),
         }
@@ -217,7 +219,8 @@ impl Contact for LiveMaster {
     }
 
     async fn may_be_of_roscore(&mut self, pid: i32) -> bool {
-        may_be_of_roscore(pid, &self.sentinel).await
+        self.reach.supervision == Supervision::Theirs
+            && may_be_of_roscore(pid, &self.sentinel).await
     }
 
     fn python(&self) -> Python {

@@ -93,7 +93,7 @@ pub(in crate::app) async fn join(
     let position = watch::Sender::new(JournalPosition::default());
     let shown = Arc::new(Shown::new());
     let forwarded = Arc::<Forwarded>::default();
-    let peers = Arc::new(Peers::new(context.probe_timeout));
+    let peers = Arc::new(Peers::new(context.reach.probe_timeout));
     let members = MemberAddresses::default();
     let others = Others {
         standing: standing_rx,

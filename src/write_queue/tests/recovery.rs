@@ -19,7 +19,7 @@ use crate::{
     ledger::{durability::Mark, owed::Telling},
     recovery::{
         course::{Course, Step},
-        examine::{Contact, Examination, ExamineError, Examiner, InAdvance, Manner},
+        examine::{Contact, Examination, ExamineError, Examiner},
     },
 };
 
@@ -192,8 +192,7 @@ pub(super) struct Recovery {
 }
 
 impl Recovery {
-    pub(super) fn new(examiner: Examiner, is_restored: bool) -> Self {
-        let supervision = examiner.supervision;
+    pub(super) fn new(examiner: Examiner, supervision: Supervision, is_restored: bool) -> Self {
         let mut course = Course::new(supervision, PROBING);
         if is_restored {
             course.continues_session();
@@ -282,13 +281,10 @@ impl World {
             Action::Examine => {
                 let examiner = self.recovery.examiner.clone();
                 let is_unused = std::mem::take(&mut self.recovery.is_unused);
-                let manner = Manner {
-                    known: examiner.known(is_unused.then_some(1)),
-                    prepared: InAdvance::default(),
-                };
+                let known = examiner.known(is_unused.then_some(1));
                 let mut master = self.recovery.contact();
                 self.examine(SILENT_MOST, async move {
-                    Outcome::Examined(examiner.examine(&mut master, manner).await)
+                    Outcome::Examined(examiner.examine(&mut master, known).await)
                 });
             }
             Action::Probe => {

@@ -11,7 +11,7 @@ use rescue_core::checkpoint::session::{self, Rebuilt};
 use tempfile::TempDir;
 
 use super::*;
-use crate::write_queue::dispatcher::Answers;
+use crate::{recovery::examine::InAdvance, write_queue::dispatcher::Answers};
 
 type Writing = Pin<Box<dyn Future<Output = Option<Result<(), StoreError>>>>>;
 
@@ -99,7 +99,7 @@ impl Parts {
         let patience = Patience::new(Duration::from_micros(PATIENCE));
         let examiner = Examiner {
             ledger: ledger.clone(),
-            supervision,
+            prepared: InAdvance::default(),
             run_id: Arc::default(),
             stats,
         };
@@ -107,7 +107,7 @@ impl Parts {
             dispatcher: Dispatcher::new(ledger.clone(), Arc::new(()), stats, writes, patience),
             gate: ledger.gate(),
             ledger,
-            recovery: Recovery::new(examiner, is_restored),
+            recovery: Recovery::new(examiner, supervision, is_restored),
             is_restored,
         }
     }

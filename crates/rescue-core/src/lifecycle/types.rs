@@ -125,7 +125,7 @@ pub enum Action {
     /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or `Unreachable`.
     Connect,
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
-    /// `NotAMaster` or `Unreachable`.
+    /// `NotAMaster`, `Unreachable` or `ConnectionLost`.
     Examine,
     /// Shut the gate: let no call pass to the master.
     ShutGate(Cause),
@@ -135,7 +135,7 @@ pub enum Action {
     CatchUp,
     /// Open the gate: let calls pass to the master.
     OpenGate,
-    /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
+    /// Probe the master. Results: `ProbeAnswered`, `ProbeMissed`, or `ConnectionLost` if another master answers.
     Probe,
     /// Start a master. Results: `Spawned` or `SpawnFailed`.
     Spawn,
