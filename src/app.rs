@@ -29,6 +29,7 @@ mod assemble;
 mod cluster;
 mod context;
 mod life;
+mod master_duties;
 mod notify;
 mod startup;
 

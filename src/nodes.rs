@@ -364,7 +364,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
     for port in due {
         let nodes = nodes.clone();
         crate::task::spawn(async move {
-            let outcome = health_check::visit(&nodes, port, false).await;
+            let outcome = health_check::begin_visit(&nodes, port, false).await;
             match outcome.sign {
                 Reaction::Alive => log_visit(&outcome, "an unreachable node answers again"),
                 Reaction::Dead if !outcome.removed.is_empty() => log_visit(

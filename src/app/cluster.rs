@@ -40,7 +40,7 @@ use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
 pub(super) use self::join::{ClusterSetup, join};
 use self::{facts::ComputerFacts, partition_writes::PartitionWritesFile, trouble::Trouble};
-use super::{RunError, context::MasterDuties, life};
+use super::{RunError, life, master_duties::MasterDuties};
 use crate::{
     cluster::{
         etcd::{self, Etcd, KeyChange, Kv, Watch, WatchEnd},

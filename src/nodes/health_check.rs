@@ -112,7 +112,7 @@ async fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
         // The master cannot call addresses that rosrescue cannot call.
         let is_asked = !Token::is_ours(name) && MasterUri::parse(api).is_ok();
         if is_asked && visited.insert(port_of(api)) {
-            visits.spawn(boxed(visit(nodes, port_of(api).to_owned(), true)));
+            visits.spawn(boxed(begin_visit(nodes, port_of(api).to_owned(), true)));
         }
     }
     visits
@@ -136,17 +136,17 @@ async fn collect(mut visits: JoinSet<CheckResult>) -> HealthCheck {
 ///
 /// Nodes whose port refuses connections are unregistered only if `in_check` is true, or if the port has already failed
 /// a health check. A port that has only refused a notification keeps its nodes, as with a bare master.
-pub(crate) fn visit(
+pub(crate) fn begin_visit(
     nodes: &Arc<Nodes>,
     port: String,
     in_check: bool,
 ) -> impl Future<Output = CheckResult> + Send + 'static {
     let (nodes, waiting) = (nodes.clone(), Waiting::new(nodes));
     let span = tracing::debug_span!("visit", port);
-    async move { converse(&nodes, &port, in_check, waiting).await }.instrument(span)
+    async move { visit(&nodes, &port, in_check, waiting).await }.instrument(span)
 }
 
-async fn converse(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiting) -> CheckResult {
+async fn visit(nodes: &Arc<Nodes>, port: &str, in_check: bool, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
     let mut outcome = CheckResult {
         sign: Reaction::Silent,
