@@ -225,6 +225,18 @@ impl Change {
     }
 }
 
+/// What a report calls the treatment of a master of which this was known.
+fn outcome(treatment: Treatment, known: KnownMaster) -> RecoveryOutcome {
+    match treatment {
+        Treatment::Begin => RecoveryOutcome::Begun,
+        Treatment::Adopt => RecoveryOutcome::Adopted,
+        Treatment::Inject | Treatment::Replace => RecoveryOutcome::Injected,
+        Treatment::Reconcile(_) if known == KnownMaster::Nothing => RecoveryOutcome::Adopted,
+        Treatment::Reconcile(Authority::PendingWrites) => RecoveryOutcome::Reconciled,
+        Treatment::Reconcile(Authority::Mirror) => RecoveryOutcome::Injected,
+    }
+}
+
 /// Examines masters, and lets calls pass to one that holds the mirror's state.
 #[derive(Clone)]
 pub(crate) struct Examiner {
@@ -297,10 +309,10 @@ impl Examiner {
             self.ledger.doubt();
         } else {
             let may_be_roscores = master.may_be_of_roscore(examination.pid).await;
-            self.inject(
+            self.treat(
                 master,
                 first,
-                manner,
+                known,
                 may_be_roscores,
                 start,
                 &mut examination,
@@ -356,7 +368,9 @@ impl Examiner {
         Ok(true)
     }
 
-    async fn inject(
+    /// Reads the rest of a master that the first request has shown, and gives it the mirror's state, or the mirror its
+    /// state.
+    async fn treat(
         &self,
         master: &mut impl Contact,
         first: Inspection,
@@ -407,14 +421,7 @@ impl Examiner {
             self.ledger.seed(&remove);
             *self.lock_run_id() = Some(set);
         }
-        examination.outcome = match treatment {
-            Treatment::Begin => RecoveryOutcome::Begun,
-            Treatment::Adopt => RecoveryOutcome::Adopted,
-            Treatment::Inject | Treatment::Replace => RecoveryOutcome::Injected,
-            Treatment::Reconcile(_) if known == KnownMaster::Nothing => RecoveryOutcome::Adopted,
-            Treatment::Reconcile(Authority::PendingWrites) => RecoveryOutcome::Reconciled,
-            Treatment::Reconcile(Authority::Mirror) => RecoveryOutcome::Injected,
-        };
+        examination.outcome = outcome(treatment, known);
         let report = |difference: &[String]| match known {
             KnownMaster::Nothing => log_newer_master(difference),
             _ => log_difference(difference),

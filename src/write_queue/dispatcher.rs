@@ -551,12 +551,11 @@ impl Dispatcher {
         self.late_at = Some(late_at);
     }
 
-    /// Sends the next batch, if none is in flight and there is something to send.
-    fn send(&mut self, now: Instant, incarnation: u64) {
+    /// Takes back what earlier masters were given: the one with this `incarnation` never got it.
+    fn forget_earlier_masters(&mut self, incarnation: u64) {
         if let Exchange::InFlight(batch) = &self.exchange
             && batch.incarnation != incarnation
         {
-            // The new master never got these calls.
             self.ledger.withdraw();
             self.actions.push(Action::Disconnect);
             self.take_back_in_flight();
@@ -569,6 +568,11 @@ impl Dispatcher {
         if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
             self.inspections.reset();
         }
+    }
+
+    /// Sends the next batch, if none is in flight and there is something to send.
+    fn send(&mut self, now: Instant, incarnation: u64) {
+        self.forget_earlier_masters(incarnation);
         if self.ledger.is_doubted() {
             self.inspections.doubted();
         }
