@@ -101,7 +101,7 @@ fn prefix(checkpoint: &Path) -> Option<String> {
     ))
 }
 
-/// The report files, sorted by the dates in their names.
+/// The report files, sorted by the numbers in their names. The dates depend on the clock.
 fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(Vec::new());
@@ -115,7 +115,11 @@ fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
             files.push(entry.path());
         }
     }
-    files.sort();
+    files.sort_by_key(|file| {
+        let name = file.file_stem().unwrap_or_default().to_string_lossy();
+        let number = name.rsplit('-').next();
+        number.and_then(|number| number.parse().ok()).unwrap_or(0u64)
+    });
     Ok(files)
 }
 
@@ -218,9 +222,11 @@ mod tests {
         for number in 1..=25 {
             write(&checkpoint, &record("a", number)).unwrap();
         }
-        let mut early = record("a", 26);
-        early.report.detected_at = 0.0;
-        write(&checkpoint, &early).unwrap();
+        for number in [26, 27] {
+            let mut early = record("a", number);
+            early.report.detected_at = 0.0;
+            write(&checkpoint, &early).unwrap();
+        }
         let mut names: Vec<_> = fs::read_dir(folder.path())
             .unwrap()
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -228,6 +234,7 @@ mod tests {
         names.sort();
         assert_eq!(names.len(), KEPT + 1, "{names:?}");
         assert_eq!(names[1], "chkpt.yaml.report-1970-01-01T00-00-00Z-26.txt");
+        assert_eq!(names[2], "chkpt.yaml.report-1970-01-01T00-00-00Z-27.txt");
         assert!(names.contains(&"chkpt.yaml.report-2026-11-21T09-27-18Z-25.txt".to_owned()));
         let path = folder.path().join(&names[1]);
         let text = fs::read_to_string(&path).unwrap();
