@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use checkpoint_store::{OpenError, Store, folder, history};
+use checkpoint_store::{Loaded, OpenError, Store, folder, history};
 use rescue_core::checkpoint::{
     format::{PendingWrite, Session},
     session::{self, Decision, Rebuilt, SessionEvidence},
@@ -37,40 +37,7 @@ pub(super) struct Beginning {
 
 /// Reads the checkpoint and decides whether its session continues.
 pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
-    let own = config.clone();
-    let opened = wait::within(OPENING, move || {
-        let path = &own.checkpoint;
-        let found = Folder::inspect(path);
-        let mut opened = Store::open(path);
-        if let Ok((store, _)) = &mut opened {
-            store.keep_log(own.log_bytes());
-        }
-        found.report(opened.is_ok());
-        opened.map_err(|error| {
-            (
-                checkpoint_store::read(path).ok().flatten().map(Box::new),
-                error,
-            )
-        })
-    });
-    let (mut store, loaded) = match opened.await {
-        Some(Ok((store, loaded))) => (Some(store), loaded),
-        Some(Err((loaded, error @ OpenError::Io { .. }))) => {
-            // Continue without a checkpoint: a robot with a broken disk still needs its master.
-            tracing::error!(
-                %error,
-                "unprotected: the checkpoint cannot be used; nodes run as usual, but a crash of \
-                 rosrescue itself would lose the state. Choose another place with --checkpoint, or \
-                 repair this one"
-            );
-            (None, loaded.map(|loaded| *loaded))
-        }
-        Some(Err((_, error))) => return Err(RunError::Checkpoint(error)),
-        None => {
-            log_silent_disk(&config.checkpoint);
-            (None, None)
-        }
-    };
+    let (mut store, loaded) = open(config).await?;
     let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
     let mut story = "a new session begins".to_owned();
     let mut beginning = None;
@@ -161,6 +128,44 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         died,
         story,
     })
+}
+
+/// Opens the checkpoint and reads what it holds. Without a store, the state will not be recorded.
+async fn open(config: &Config) -> Result<(Option<Store>, Option<Loaded>), RunError> {
+    let own = config.clone();
+    let opened = wait::within(OPENING, move || {
+        let path = &own.checkpoint;
+        let found = Folder::inspect(path);
+        let mut opened = Store::open(path);
+        if let Ok((store, _)) = &mut opened {
+            store.keep_log(own.log_bytes());
+        }
+        found.report(opened.is_ok());
+        opened.map_err(|error| {
+            (
+                checkpoint_store::read(path).ok().flatten().map(Box::new),
+                error,
+            )
+        })
+    });
+    match opened.await {
+        Some(Ok((store, loaded))) => Ok((Some(store), loaded)),
+        Some(Err((loaded, error @ OpenError::Io { .. }))) => {
+            // Continue without a checkpoint: a robot with a broken disk still needs its master.
+            tracing::error!(
+                %error,
+                "unprotected: the checkpoint cannot be used; nodes run as usual, but a crash of \
+                 rosrescue itself would lose the state. Choose another place with --checkpoint, or \
+                 repair this one"
+            );
+            Ok((None, loaded.map(|loaded| *loaded)))
+        }
+        Some(Err((_, error))) => Err(RunError::Checkpoint(error)),
+        None => {
+            log_silent_disk(&config.checkpoint);
+            Ok((None, None))
+        }
+    }
 }
 
 fn log_silent_disk(checkpoint: &Path) {

@@ -118,7 +118,9 @@ fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     files.sort_by_key(|file| {
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
         let number = name.rsplit('-').next();
-        number.and_then(|number| number.parse().ok()).unwrap_or(0u64)
+        number
+            .and_then(|number| number.parse().ok())
+            .unwrap_or(0u64)
     });
     Ok(files)
 }

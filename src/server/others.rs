@@ -201,10 +201,13 @@ impl Others {
                                 let number = HeaderValue::from(number);
                                 reply.headers_mut().insert(peer::ANSWER_HEADER, number);
                             }
-                            let agreed = calls.ledger.agreement.last();
+                            let acknowledged = calls.ledger.acknowledged.last();
                             let last = calls.ledger.last_shared();
-                            let seq =
-                                JournalPosition::shown_seq(call.kind == Kind::Read, agreed, last);
+                            let seq = JournalPosition::shown_seq(
+                                call.kind == Kind::Read,
+                                acknowledged,
+                                last,
+                            );
                             let seq = HeaderValue::from(seq);
                             reply.headers_mut().insert(peer::SEQ_HEADER, seq);
                             return Ok(reply);
