@@ -102,8 +102,8 @@ pub struct Ledger {
     pub work: Notify,
     /// Wakes the task that sends this computer's writes to the other computers.
     pub shared: Notify,
-    /// Wakes the task that notifies nodes.
-    pub outbox_changed: Notify,
+    /// Wakes `nodes::watch`: something is unseen, the order has something to repeat, or a new node is to be identified.
+    pub wake_nodes: Notify,
     order_changed: watch::Sender<()>,
     /// Signals that the master has run all writes that the mirror has answered first.
     all_acknowledged: watch::Sender<()>,
@@ -135,7 +135,7 @@ impl Ledger {
             attempted: watch::channel(0).0,
             work: Notify::new(),
             shared: Notify::new(),
-            outbox_changed: Notify::new(),
+            wake_nodes: Notify::new(),
             order_changed: watch::channel(()).0,
             all_acknowledged: watch::channel(()).0,
             #[cfg(test)]
@@ -246,7 +246,7 @@ impl Ledger {
             recorded.is_ahead |= is_recorded && !answered.executed;
             // An inexact mirror is known to differ from the master, which holds values that cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
-            let outcome = inner.apply(now, answered.call, Notifier::Master, &self.outbox_changed);
+            let outcome = inner.apply(now, answered.call, Notifier::Master, &self.wake_nodes);
             origin.note_in(&mut inner.mirror, answered.call);
             let agrees = answered.agrees(&outcome, index < last_write);
             if !agrees && !inner.diverged.knows_words(&answered, &outcome) {
@@ -331,7 +331,7 @@ impl Ledger {
     /// Records and applies a call made by rosrescue before there is a master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
-        inner.apply(Instant::now(), call, Notifier::Master, &self.outbox_changed);
+        inner.apply(Instant::now(), call, Notifier::Master, &self.wake_nodes);
         let (at, origin) = (clock::wall_millis(), Origin::Rosrescue);
         let label = Label { at, origin };
         inner.append(vec![RecordContent::labelled(call.clone(), label)]);
@@ -736,7 +736,7 @@ impl Ledger {
         order.late_answered(now);
         note_possible_notifications(now, order, mirror, &late.tells);
         drop(inner);
-        self.outbox_changed.notify_one();
+        self.wake_nodes.notify_one();
     }
 
     /// Decides what the present master needs after it was late and has answered. Freezes the mirror
@@ -793,7 +793,7 @@ impl Ledger {
         let repeats = order.has_new_repeat();
         drop(inner);
         if repeats {
-            self.outbox_changed.notify_one();
+            self.wake_nodes.notify_one();
         }
         result
     }

@@ -200,7 +200,7 @@ impl Nodes {
             // The master may call this node before it notifies other nodes of recent changes, and wait for its answer.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
-            self.ledger.outbox_changed.notify_one();
+            self.ledger.wake_nodes.notify_one();
         }
     }
 
@@ -264,7 +264,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
         let tell_again_at = nodes.ledger.with_order(|order, _| order.next_repeat());
         let identify_at = new.map(|since| (since + IDENTIFY_AFTER).into());
         tokio::select! {
-            () = nodes.ledger.outbox_changed.notified() => empty_outbox(&nodes, &mut repeats),
+            () = nodes.ledger.wake_nodes.notified() => handle_unseen(&nodes, &mut repeats),
             () = wait::sleep_until(tell_again_at.map(Into::into)) => {
                 nodes.ledger.with_order(|order, _| order.queue_due_repeats(Instant::now()));
                 notifications::send_waiting(&nodes);
@@ -304,15 +304,15 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     }
 }
 
-fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut BesideMaster<NotifyingChange>) {
-    let outbox = nodes
+fn handle_unseen(nodes: &Arc<Nodes>, repeats: &mut BesideMaster<NotifyingChange>) {
+    let unseen = nodes
         .ledger
-        .with_activity(|_, activity| activity.take_outbox());
+        .with_activity(|_, activity| activity.take_unseen());
     notifications::send_waiting(nodes);
-    for displaced in outbox.displaced {
+    for displaced in unseen.displaced {
         notifications::shut_down(nodes, displaced);
     }
-    for change in outbox.changes {
+    for change in unseen.changes {
         repeats.changed(change, Instant::now());
     }
 }

@@ -45,9 +45,9 @@ pub struct Owed {
     pub displaced: Vec<Displaced>,
 }
 
-/// Notifications for rosrescue to send, collected since the last ones were taken.
+/// Changes and displaced nodes that `nodes::watch` has not handled yet.
 #[derive(Debug, Default)]
-pub struct OwedNotifications {
+pub struct Unseen {
     /// Nodes that must shut down because another node has their name.
     pub displaced: Vec<Displaced>,
     /// Changes that a master also sends notifications for, perhaps late.
@@ -111,9 +111,9 @@ pub struct Activity {
     lately: Vec<(Instant, Displaced)>,
     /// Nodes that lost their names to other nodes, from a checkpoint. They may not have been told to shut down.
     restored: Vec<Displaced>,
-    /// Whether changes that a master notifies nodes of are also collected in `outbox`.
+    /// Whether changes that a master notifies nodes of are also collected in `unseen`.
     notifying: bool,
-    outbox: OwedNotifications,
+    unseen: Unseen,
 }
 
 /// A notification that rosrescue must send because there is no master: the receiver's address, the topic or parameter,
@@ -215,17 +215,17 @@ impl Activity {
             at: now,
             is_notified: standing_in && !noticed.left_to_master,
         };
-        let outbox = &mut self.outbox;
-        let before = outbox.len();
+        let unseen = &mut self.unseen;
+        let before = unseen.len();
         for topic in noticed.topics {
-            if notifying && outbox.changes.len() < NOTICES {
-                outbox.changes.insert(NotifyingChange::Topic(topic.clone()));
+            if notifying && unseen.changes.len() < NOTICES {
+                unseen.changes.insert(NotifyingChange::Topic(topic.clone()));
             }
             self.topics.insert(topic, noted);
         }
         for (to, key) in noticed.params {
-            if notifying && outbox.changes.len() < NOTICES {
-                outbox
+            if notifying && unseen.changes.len() < NOTICES {
+                unseen
                     .changes
                     .insert(NotifyingChange::Param(to.clone(), key.clone()));
             }
@@ -238,12 +238,12 @@ impl Activity {
             self.lately.extend(lately.map(|it| (now, it)));
         }
         if standing_in {
-            outbox.displaced.extend(noticed.displaced);
+            unseen.displaced.extend(noticed.displaced);
         } else if self.displaced.len() < NOTICES {
             self.displaced
                 .extend(noticed.displaced.into_iter().map(|it| (now, it)));
         }
-        let changed = outbox.len() > before || (nobody_new && !self.unidentified.is_empty());
+        let changed = unseen.len() > before || (nobody_new && !self.unidentified.is_empty());
         forget(&mut self.topics, now);
         forget(&mut self.params, now);
         self.displaced.retain(|(at, _)| is_recent(*at, now));
@@ -374,13 +374,13 @@ impl Activity {
     /// Starts or stops collecting changes that a master notifies nodes of. Returns whether that changed anything.
     pub fn set_notifying(&mut self, notifying: bool) -> bool {
         if !notifying {
-            self.outbox.changes.clear();
+            self.unseen.changes.clear();
         }
         std::mem::replace(&mut self.notifying, notifying) != notifying
     }
 
-    pub fn take_outbox(&mut self) -> OwedNotifications {
-        std::mem::take(&mut self.outbox)
+    pub fn take_unseen(&mut self) -> Unseen {
+        std::mem::take(&mut self.unseen)
     }
 
     /// Keeps the nodes of a checkpoint that lost their names to other nodes (`displaced`) until [`Self::notice_all`].
@@ -424,7 +424,7 @@ impl Activity {
         let topics = topics.map(|(topic, _)| NotifyingChange::Topic(topic.clone()));
         let params = self.params.iter().filter(|(_, noted)| recent(noted));
         let params = params.map(|((api, key), _)| NotifyingChange::Param(api.clone(), key.clone()));
-        self.outbox.changes.extend(topics.chain(params));
+        self.unseen.changes.extend(topics.chain(params));
     }
 
     /// Notes that process `pid` answers at `api`, where `node` is registered. `registered` is the number of the node's
@@ -469,7 +469,7 @@ impl Activity {
     }
 }
 
-impl OwedNotifications {
+impl Unseen {
     fn len(&self) -> usize {
         self.displaced.len() + self.changes.len()
     }

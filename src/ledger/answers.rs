@@ -78,7 +78,7 @@ impl Ledger {
             now,
             write,
             Notifier::Rosrescue { changes: false },
-            &self.outbox_changed,
+            &self.wake_nodes,
         );
         // The master refuses calls with its own messages.
         let refused = match &reply {
@@ -165,12 +165,7 @@ impl Ledger {
         let number = inner.order.begin_answer(now, heard);
         let changes = inner.mirror.would_change(call);
         let before = call.ends_early().then(|| inner.mirror.clone());
-        let reply = inner.apply(
-            now,
-            call,
-            Notifier::Rosrescue { changes },
-            &self.outbox_changed,
-        );
+        let reply = inner.apply(now, call, Notifier::Rosrescue { changes }, &self.wake_nodes);
         origin.note_in(&mut inner.mirror, call);
         let mut writes: Vec<&Request> = match reply {
             // The answer cannot be encoded, so it does not show which writes were accepted. All count as accepted,

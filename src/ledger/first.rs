@@ -77,7 +77,7 @@ impl Ledger {
         }
         // The answer is begun before the call is applied, because the call may notify its own caller.
         let number = inner.order.begin_answer(now, heard);
-        let reply = inner.apply(now, call, Notifier::MasterLater, &self.outbox_changed);
+        let reply = inner.apply(now, call, Notifier::MasterLater, &self.wake_nodes);
         origin.note_in(&mut inner.mirror, call);
         let at = clock::wall_millis();
         self.stats.writes_recorded.count();
@@ -124,7 +124,7 @@ impl Ledger {
             }
         }
         if inner.order.has_new_repeat() {
-            self.outbox_changed.notify_one();
+            self.wake_nodes.notify_one();
         }
         if inner.pending.calls().is_empty() {
             self.all_acknowledged.send_replace(());

@@ -126,7 +126,7 @@ impl Inner {
         now: Instant,
         call: &Request,
         notifier: Notifier,
-        outbox_changed: &Notify,
+        wake_nodes: &Notify,
     ) -> Reply {
         let standing_in = match notifier {
             Notifier::Rosrescue { changes } => Some(changes),
@@ -148,7 +148,7 @@ impl Inner {
                         Some(false) => self.order.notify_of_state(port, subject),
                         _ => self.order.notify(now, port, subject, call),
                     }
-                    outbox_changed.notify_one();
+                    wake_nodes.notify_one();
                 }
             }
             None if notifier == Notifier::MasterLater => {}
@@ -157,13 +157,13 @@ impl Inner {
                     self.order.master_notifies(now, &subject, nodes);
                 }
                 if self.order.has_new_repeat() {
-                    outbox_changed.notify_one();
+                    wake_nodes.notify_one();
                 }
             }
         }
         let registered = |node: &str| self.mirror.api_of(node).is_some();
         if self.activity.applied(now, call, noticed, registered) {
-            outbox_changed.notify_one();
+            wake_nodes.notify_one();
         }
         reply
     }

@@ -72,7 +72,7 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
     assert!(!apply(&mut activity, false));
     activity.set_notifying(true);
     assert!(apply(&mut activity, false));
-    let changes = activity.take_outbox().changes;
+    let changes = activity.take_unseen().changes;
     assert_eq!(
         changes,
         IndexSet::from([NotifyingChange::Topic("/t".to_owned())])
@@ -200,7 +200,7 @@ fn a_key_is_kept_once_for_all_its_subscribers() {
     let (_, first) = &noticed[0];
     assert!(noticed.iter().all(|(_, key)| Arc::ptr_eq(key, first)));
     let is_shared = |change: &NotifyingChange| matches!(change, NotifyingChange::Param(_, key) if Arc::ptr_eq(key, first));
-    let changes = activity.take_outbox().changes;
+    let changes = activity.take_unseen().changes;
     assert!(changes.len() == NOTICES && changes.iter().all(is_shared));
 }
 
