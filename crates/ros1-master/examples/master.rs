@@ -3,7 +3,7 @@
 #![allow(clippy::disallowed_methods, clippy::disallowed_types)]
 
 use ros1_master::master::{Master, Request};
-use ros1_master::xmlrpc::{encode_call, encode_reply};
+use ros1_master::xmlrpc::{encode_node_call, encode_reply};
 use std::io::{self, BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Mutex, PoisonError, mpsc};
@@ -49,7 +49,7 @@ fn run(request: &Request, state: &State) -> ros1_master::xmlrpc::Reply {
             thread::spawn(move || calls.iter().for_each(|call| drop(notify(&to, call))));
             queue
         });
-        let _ = queue.try_send(encode_call(&notice.call()));
+        let _ = queue.try_send(encode_node_call(&notice.call()));
     }
     applied.reply
 }
