@@ -15,10 +15,9 @@ pub(crate) const MAX_REPLY_DEPTH: usize = 492;
 /// Bytes of binary data per line of base64; they make 76 characters.
 const BASE64_LINE: usize = 57;
 
-/// Encodes a call compactly.
+/// Encodes a call to a master compactly. For calls to nodes, use [`encode_node_call`].
 ///
-/// Uses only forms that CPython and the much stricter xmlrpcpp of roscpp both accept: untyped strings and
-/// `i4`, no self-closing elements except nil, no white space between tags. A carriage return is written as a
+/// Strings have no type element, and there is no white space between tags. A carriage return is written as a
 /// reference, because XML reads a bare one as a line feed. Characters that XML does not allow (a decoded
 /// document has none) are written unchanged, and the receiver refuses them.
 pub fn encode_call(call: &Call) -> Vec<u8> {
@@ -37,7 +36,7 @@ pub(crate) fn encode_call_of(method: &str, params: &[Value]) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Encodes a call of a node byte for byte as rosmaster does, that is like `dumps` of CPython's `xmlrpc.client`.
+/// Encodes a call to a node byte for byte as rosmaster does, that is like `dumps` of CPython's `xmlrpc.client`.
 ///
 /// Boards find the arguments by searching for texts such as `<value><string>/master</string></value>`: they have never
 /// met other ones (the STM32 port of ROS, mROS). CPython must be able to encode the arguments.

@@ -509,7 +509,7 @@ fn values_may_nest_as_deep_as_the_limit_and_no_deeper() {
 }
 
 #[test]
-fn a_call_is_encoded_compactly_in_forms_that_xmlrpcpp_can_read() {
+fn a_call_to_a_master_is_encoded_compactly() {
     let members = Struct::from([("k".to_owned(), Value::Struct(Struct::new()))]);
     let call = Call::new(
         "m",
