@@ -13,7 +13,7 @@ mod value;
 
 pub use decode::{MAX_DEPTH, decode_call, decode_call_for, decode_reply};
 pub use encode::{ListWriter, encode_call, encode_node_call, encode_reply, encode_result};
-pub(crate) use encode::{MAX_REPLY_DEPTH, TOO_DEEP, encode_call_of, refusal};
+pub(crate) use encode::{MAX_REPLY_DEPTH, encode_call_of, refusal};
 pub use error::DecodeError;
 pub use prolog::without_doctype;
 pub use python::Python;

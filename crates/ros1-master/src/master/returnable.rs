@@ -1,7 +1,7 @@
 //! Finds out which parameter values a master can return. A master also accepts values that Python's
 //! `xmlrpc.client.dumps` cannot encode, so it can never return them.
 
-use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
+use crate::xmlrpc::{MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply, refusal};
 
 /// The text of the fault that rosmaster answers when it cannot encode this reply. `None` if it can.
 pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
@@ -16,12 +16,11 @@ pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
 
 fn error_within(value: &Value, depth: usize) -> Option<&'static str> {
     let deeper = |value| error_within(value, depth + 1);
-    match value {
-        Value::Array(_) | Value::Struct(_) if depth >= MAX_REPLY_DEPTH => Some(xmlrpc::TOO_DEEP),
+    refusal(value, depth).or_else(|| match value {
         Value::Array(elements) => elements.iter().find_map(deeper),
         Value::Struct(members) => members.values().find_map(deeper),
-        value => xmlrpc::refusal(value, depth),
-    }
+        _ => None,
+    })
 }
 
 /// Whether a reply can contain this value where `levels` more levels of nesting are allowed.
@@ -91,14 +90,17 @@ fn keep_writable(tree: &Struct, path: &str, levels: usize, left_out: &mut Vec<St
 mod tests {
     use super::*;
 
-    fn nested(depth: usize) -> Value {
-        (0..depth).fold(Value::Int(1), |value, _| Value::Array(vec![value]))
+    fn nested(depth: usize, innermost: &Value) -> Value {
+        (0..depth).fold(innermost.clone(), |value, _| Value::Array(vec![value]))
     }
 
     #[test]
-    fn a_parameter_of_491_levels_can_be_returned_and_one_of_492_cannot() {
-        assert_eq!(param_error(&nested(491)), None);
-        assert!(param_error(&nested(492)).is_some());
+    fn a_value_in_491_lists_can_be_returned_and_one_in_492_cannot() {
+        let empty = Value::Array(Vec::new());
+        for innermost in [Value::Int(1), empty, Value::Struct(Struct::new())] {
+            assert_eq!(param_error(&nested(491, &innermost)), None);
+            assert!(param_error(&nested(492, &innermost)).is_some());
+        }
     }
 
     #[test]

@@ -362,4 +362,4 @@ pub(crate) fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
 }
 
 /// The fault for a reply with too many levels. rosmaster's own text depends on where it ran out of stack.
-pub(crate) const TOO_DEEP: &str = "<class 'RecursionError'>:maximum recursion depth exceeded";
+const TOO_DEEP: &str = "<class 'RecursionError'>:maximum recursion depth exceeded";
