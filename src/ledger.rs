@@ -596,7 +596,7 @@ impl Ledger {
         self.lock().mirror.set_python(python);
     }
 
-    /// Sets whether the present master behaves like version 1.14.3 and earlier.
+    /// Sets whether the present master is old: see [`Master::set_old`].
     pub fn set_old(&self, old: Option<bool>) {
         self.lock().mirror.set_old(old);
     }

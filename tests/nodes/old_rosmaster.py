@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A real rosmaster that refuses and notifies like 1.14.3 and before. Like waiting_rosmaster.py, it starts only when
+"""A real rosmaster that refuses and notifies like 1.14.3. Like waiting_rosmaster.py, it starts only when
 there is no file `away` in `ROS_HOME`."""
 
 import os

@@ -1,4 +1,4 @@
-//! A master that behaves like rosmaster 1.14.3 and earlier: it also notifies the node that has set a parameter itself.
+//! A master that behaves like rosmaster 1.14.3: it also notifies the node that has set a parameter itself.
 //! While there is no master, rosrescue does the same.
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, params};

@@ -32,7 +32,7 @@ pub struct Master {
     pub(crate) inexact: bool,
     /// The version of Python on which the modelled master runs.
     pub(crate) python: Python,
-    /// Whether the modelled master behaves like rosmaster 1.14.3 and earlier. `None` if unknown.
+    /// Whether the modelled master is old, as in [`Self::set_old`]. `None` if unknown.
     pub(crate) old: Option<bool>,
     pub(crate) pid: i32,
     pub(crate) uri: String,
@@ -157,8 +157,9 @@ impl Master {
         self.python
     }
 
-    /// Sets whether the modelled master behaves like rosmaster 1.14.3 and earlier. Such a master also notifies the node
-    /// that sets a parameter, and three of its methods refuse a call with the value 0. `None` if unknown.
+    /// Sets whether the modelled master is old: rosmaster 1.14.3 or earlier, but not 1.12.15 to 1.12.17. An old master
+    /// also notifies the node that sets a parameter, and three of its methods refuse a call with the value 0. `None` if
+    /// unknown.
     pub fn set_old(&mut self, old: Option<bool>) {
         self.old = old;
     }
@@ -168,7 +169,7 @@ impl Master {
         self.old
     }
 
-    /// A call whose answer shows whether a master behaves like rosmaster 1.14.3 and earlier. It changes nothing.
+    /// A call whose answer shows whether a master is old, as in [`Self::set_old`]. It changes nothing.
     pub fn ask_if_old() -> Request {
         Request::new(Method::LookupService, [names::CALLER_ID, ""])
     }

@@ -152,8 +152,9 @@ pub fn shutdown(node: &str) -> Call {
     )
 }
 
-/// The reason in the `shutdown` that rosmaster sends to a node whose name `node` was taken. rosmaster 1.14.3 and
-/// earlier (`old`) leave out the name.
+/// The reason in the `shutdown` that rosmaster sends to a node whose name `node` was taken. An old rosmaster (see
+/// [`Master::set_old`]) leaves out the name. So do 1.12.15 to 1.12.17, 1.14.4 to 1.14.6 and 1.15.0 to 1.15.7, which are
+/// not told apart from later ones here.
 pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     let reason = "new node registered with same name";
     match old {

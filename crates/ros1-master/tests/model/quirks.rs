@@ -268,10 +268,10 @@ fn a_node_without_any_registration_is_forgotten() {
     assert_eq!(master.unregister_calls("/nobody"), []);
 }
 
-/// rosmaster 1.14.3 and earlier answers 0 in place of an empty list or name, and also notifies the node that sets a
-/// parameter.
+/// An old rosmaster, such as 1.14.3, answers 0 in place of an empty list or name, and also notifies the node that sets
+/// a parameter.
 #[test]
-fn rosmaster_1_14_3_and_before_refuses_and_notifies_differently() {
+fn an_old_rosmaster_refuses_and_notifies_differently() {
     let value = |old, call: &Request| {
         let mut master = Master::default();
         master.set_old(Some(old));
