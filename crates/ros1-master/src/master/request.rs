@@ -5,10 +5,6 @@ use std::borrow::Cow;
 use super::{Kind, Method};
 use crate::xmlrpc::{self, Call, DecodeError, Python, Value};
 
-/// Deepest nesting of multicalls that is parsed. A decoded document cannot contain more, because each multicall takes
-/// three of its levels.
-const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
-
 /// A number of parameters that is too many for every method: one more than any method takes.
 const TOO_MANY: usize = 5;
 
@@ -143,9 +139,10 @@ impl Request {
         xmlrpc::encode_call_of(self.method.name(), &self.wire_params())
     }
 
-    fn parse(method: Method, params: Vec<Value>, depth: usize) -> Self {
+    /// Recurses once per nested multicall. [`xmlrpc::MAX_DEPTH`] limits that for decoded calls.
+    fn parse(method: Method, params: Vec<Value>) -> Self {
         let (params, entries) = match method {
-            Method::Multicall => (Vec::new(), entries(params, depth)),
+            Method::Multicall => (Vec::new(), entries(params)),
             _ => (params, Vec::new()),
         };
         Self {
@@ -276,12 +273,12 @@ impl Request {
 
 impl From<Call> for Request {
     fn from(call: Call) -> Self {
-        Self::parse(Method::named(&call.method), call.params, 0)
+        Self::parse(Method::named(&call.method), call.params)
     }
 }
 
 /// The entries of a multicall with these parameters, up to and including the first malformed one.
-fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
+fn entries(params: Vec<Value>) -> Vec<Entry> {
     let Ok([list]) = <[Value; 1]>::try_from(params) else {
         return vec![Entry::Malformed(Malformed::Arity)];
     };
@@ -291,7 +288,7 @@ fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
     };
     let mut entries = Vec::with_capacity(list.len());
     for element in list {
-        entries.push(Entry::parse(element, depth));
+        entries.push(Entry::parse(element));
         if let Some(Entry::Malformed(_)) = entries.last() {
             break;
         }
@@ -300,7 +297,7 @@ fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
 }
 
 impl Entry {
-    fn parse(element: Value, depth: usize) -> Self {
+    fn parse(element: Value) -> Self {
         let mut members = match element {
             Value::Struct(members) => members,
             other => return Self::Malformed(Malformed::NoStruct(other.python_type())),
@@ -317,12 +314,7 @@ impl Entry {
         let Some(params) = items(params) else {
             return Self::Refused("the params of an entry are not a list");
         };
-        match Method::named(&name) {
-            Method::Multicall if depth >= MAX_NESTED => {
-                Self::Refused("multicalls are nested too deep")
-            }
-            method => Self::Request(Request::parse(method, params, depth + 1)),
-        }
+        Self::Request(Request::parse(Method::named(&name), params))
     }
 }
 
@@ -494,14 +486,12 @@ mod tests {
     fn a_nested_multicall_is_parsed_completely_and_encoded_unchanged() {
         let nest =
             |levels| (0..levels).fold(call("setParam"), |inner, _| Request::multicall([inner]));
-        let received = |call: &Request| {
-            let params = call.wire_params().into_owned();
-            Request::from(Call::new(call.method().name(), params))
-        };
-        let deepest = nest(MAX_NESTED);
-        assert_eq!(received(&deepest), deepest);
-        let deeper = received(&nest(MAX_NESTED + 2));
-        assert_eq!((deeper.calls().len(), deeper.kind()), (0, Kind::Unknown));
+        let received = |call: &Request| Request::decode(&call.encode());
+        // Each multicall takes three levels of a document.
+        let deepest = xmlrpc::MAX_DEPTH / 3;
+        assert_eq!(received(&nest(deepest)), Ok(nest(deepest)));
+        let deeper = received(&nest(deepest + 1));
+        assert!(matches!(deeper, Err(DecodeError::TooDeep { .. })));
         let calls = nest(3);
         assert_eq!(calls.calls(), [&call("setParam")]);
     }
