@@ -32,7 +32,7 @@ pub use api::{Applied, Method, is_success};
 pub use kind::Kind;
 pub use multicall::{entry_reply, reply_entry};
 pub use names::CALLER_ID;
-pub use names::{name_for, param_name_for};
+pub use names::{is_plain_topic, name_for, param_name_for};
 pub use notice::{Notice, NoticeSink};
 pub use ordered_map::{Iter, OrderedMap};
 pub use registry::{Node, Registrations, Registry, port_of};
@@ -41,7 +41,7 @@ pub use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{
-    Displaced, MASTER, PARAM_UPDATE, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update,
-    publisher_update, question, shutdown,
+    Displaced, MASTER, PARAM_UPDATE, PUBLISHER_UPDATE, get_pid, param_update, publisher_update,
+    question, shutdown,
 };
 pub use write::{Effect, Write, WriteTarget};

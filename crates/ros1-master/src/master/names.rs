@@ -79,11 +79,19 @@ pub(crate) fn has_illegal_chars(name: &str) -> bool {
     name.contains([':', ' '])
 }
 
+/// Whether a node can register exactly this name of a topic or service. It must be global and canonical, and have no
+/// illegal characters.
+pub fn is_plain_topic(topic: &str) -> bool {
+    topic.len() > 1
+        && topic.starts_with('/')
+        && !has_illegal_chars(topic)
+        && canonicalize(topic) == topic
+}
+
 /// A name that the master resolves to `key` in a call of `caller_id`. Such a name exists for every key that this caller
 /// has ever registered.
 pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
-    let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
-    if plain && canonicalize(key) == key {
+    if is_plain_topic(key) {
         return Some(key.to_owned());
     }
     spell(key, caller_id, |name| {

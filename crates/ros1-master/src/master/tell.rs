@@ -3,7 +3,7 @@
 use std::{net::IpAddr, sync::Arc};
 
 use super::registry::SharedRegistration;
-use super::{CALLER_ID, Master, Method, Request, Write, names, returnable};
+use super::{CALLER_ID, Master, Method, Request, Write, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id of rosmaster's calls to nodes.
@@ -171,14 +171,6 @@ pub fn question(method: &str) -> Call {
 /// The call that asks a node or a master for its process id.
 pub fn get_pid() -> Call {
     question(Method::GetPid.name())
-}
-
-/// Whether a node can have registered exactly this topic name: it must be global and canonical.
-pub fn is_plain_topic(topic: &str) -> bool {
-    topic.len() > 1
-        && topic.starts_with('/')
-        && !names::has_illegal_chars(topic)
-        && names::canonicalize(topic) == topic
 }
 
 #[cfg(test)]
