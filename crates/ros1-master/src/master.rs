@@ -5,8 +5,8 @@
 //! * [`Write`]: a call that changes the state, with its arguments by name.
 //!
 //! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that clients can
-//! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that no ROS client
-//! causes have other texts than in rosmaster.
+//! see. [`Master::set_old`] and [`Master::set_python`] make it follow other versions. Only errors that come from an
+//! exception in rosmaster, such as a `deleteParam` below a number, have other texts.
 
 mod api;
 mod checks;

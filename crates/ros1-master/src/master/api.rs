@@ -186,7 +186,7 @@ pub struct Applied {
 
 impl Master {
     /// Answers `request` and changes the state as rosmaster does. `shutdown` is answered but changes nothing. Only
-    /// errors that no ROS client causes have other texts than in rosmaster.
+    /// errors that come from an exception in rosmaster, such as a `deleteParam` below a number, have other texts.
     ///
     /// ```
     /// use ros1_master::master::{Master, Method, Notice, Request, is_success};
