@@ -46,7 +46,8 @@ pub enum DecodeError {
     /// it wrongly.
     #[error("unsupported: {what} at byte {at}; forward the body unchanged")]
     Unsupported { at: usize, what: &'static str },
-    /// The XML declaration names another encoding than UTF-8, US-ASCII or ISO-8859-1.
+    /// The encoding is not UTF-8, UTF-16 with a byte order mark, US-ASCII or ISO-8859-1; or the XML declaration
+    /// contradicts the byte order mark; or the UTF-16 is broken.
     #[error("encoding {name:?} is not supported; forward the body unchanged")]
     Encoding { name: String },
     /// The bytes are not in the document's encoding.
