@@ -2,7 +2,7 @@
 
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{CWD, RenameFlags};
@@ -188,8 +188,6 @@ impl Storage for Disk {
         // stay.
         remove_if_there(path)?;
         let file = Self::private().append(true).create_new(true).open(path)?;
-        // Sets the mode again, because the umask may have removed permissions.
-        file.set_permissions(fs::Permissions::from_mode(0o600))?;
         lock::claim(&file);
         Ok(file)
     }
