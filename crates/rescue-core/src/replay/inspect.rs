@@ -26,6 +26,11 @@ pub enum NotAMaster {
         "the master holds a parameter that it cannot return ({text}): read its state again without parameters"
     )]
     ParamsUnreadable { text: String },
+    /// Another program changed the parameters while the master encoded its answer. Inspect again.
+    #[error(
+        "another program changed the parameters while the master returned them ({text}): read its state again"
+    )]
+    ParamsChanging { text: String },
     /// An answer does not have the form of a master's answer.
     #[error(
         "the answer to {method} does not have the form of a master's answer: check that the upstream address is that of a rosmaster"
@@ -107,7 +112,7 @@ impl Inspection {
     /// # Errors
     ///
     /// If this is not a master's reply. After [`NotAMaster::ParamsUnreadable`], send
-    /// [`Inspection::call_without_params`].
+    /// [`Inspection::call_without_params`]. After [`NotAMaster::ParamsChanging`], send the same call again.
     pub fn decode(reply: &Reply, token: &Token) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
         let [pid, number, session, state, types, params @ ..] = results else {
@@ -364,7 +369,9 @@ fn results(reply: &Reply) -> Result<&[Value], NotAMaster> {
         Reply::Value(value) => value.as_array().ok_or_else(|| form(Method::Multicall)),
         Reply::Fault { text, .. } => {
             let text = text.clone();
-            Err(if super::accepted::is_write_error(&text) {
+            Err(if text.contains(super::plan::CHANGED_MEANWHILE) {
+                NotAMaster::ParamsChanging { text }
+            } else if super::accepted::is_write_error(&text) {
                 NotAMaster::ParamsUnreadable { text }
             } else {
                 NotAMaster::Fault { text }

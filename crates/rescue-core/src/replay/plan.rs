@@ -12,9 +12,10 @@ use ros1_master::xmlrpc::{self, ListWriter, Reply, Struct, Value};
 
 /// Maximum number of mismatches in an error.
 const MISMATCHES_MAX: usize = 20;
-/// Part of the fault with which rosmaster answers a multicall if another program sets a parameter while the answer with
-/// all parameters is encoded. All calls have been executed by then.
-const CHANGED_MEANWHILE: &str = "changed size during iteration";
+/// Part of the fault with which rosmaster answers a multicall if another program sets or deletes a parameter while the
+/// answer with all parameters is encoded. CPython says that the dictionary "changed size during iteration", or that its
+/// "keys changed during iteration". All calls have been executed by then.
+pub(super) const CHANGED_MEANWHILE: &str = "during iteration";
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
 ///

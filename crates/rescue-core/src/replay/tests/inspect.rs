@@ -118,6 +118,31 @@ fn parameters_that_the_master_cannot_return_come_from_the_previous_state() {
 }
 
 #[test]
+fn parameters_that_change_while_they_are_read_are_not_taken_for_unreadable_ones() {
+    let refused = |text: &str| {
+        let text = text.to_owned();
+        let fault = Reply::Fault { code: 1, text };
+        Inspection::decode(&fault, &Token::new("m", 1)).unwrap_err()
+    };
+    for text in [
+        "<class 'RuntimeError'>:dictionary changed size during iteration",
+        "<class 'RuntimeError'>:dictionary keys changed during iteration",
+    ] {
+        let error = refused(text);
+        assert!(
+            matches!(error, NotAMaster::ParamsChanging { .. }),
+            "{error}"
+        );
+    }
+    // A parameter that is nested too deep, on Python 2.
+    let error = refused("<type 'exceptions.RuntimeError'>:maximum recursion depth exceeded");
+    assert!(
+        matches!(error, NotAMaster::ParamsUnreadable { .. }),
+        "{error}"
+    );
+}
+
+#[test]
 fn a_node_that_vanishes_during_an_inspection_is_left_out() {
     let mut master = busy();
     let token = Token::new("m", 1);
