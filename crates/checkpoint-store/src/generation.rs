@@ -91,10 +91,16 @@ impl<S: Storage> CompactionJob<S> {
 impl<S: Storage> CompactionPlan<S> {
     fn run(mut self, checkpoint: &Checkpoint) -> Compacted<S> {
         let settled = self.settle.take().map(SyncJob::run);
+        // If the present file could not be synced, some of its records may be durable in the previous generation only.
+        let is_settled = settled.as_ref().is_none_or(|done| done.error().is_none());
+        let result = match is_settled {
+            true => self.write(checkpoint),
+            false => Err(self.names.superseded()),
+        };
         Compacted {
             generation: self.generation,
             settled,
-            result: self.write(checkpoint),
+            result,
             _ticket: self.ticket,
         }
     }

@@ -263,3 +263,37 @@ fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
         starts_killed(image, 3, &context);
     }
 }
+
+/// The present file cannot be synced, so records may be durable in the previous generation only. The next generation must
+/// not replace it.
+#[test]
+fn a_present_file_that_cannot_be_synced_never_replaces_the_previous_generation() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    model.append(&mut store, 1);
+    let job = store
+        .begin_compaction(model.checkpoint(store.seq()))
+        .unwrap();
+    model.append(&mut store, 2);
+    model.sync(&mut store);
+    store.finish_compaction(job.run()).unwrap();
+    assert_eq!(model.synced, 3);
+    fs.arm(0, Fault::Once(EIO));
+    let job = store
+        .begin_compaction(model.checkpoint(store.seq()))
+        .unwrap();
+    assert!(store.finish_compaction(job.run()).is_err());
+    assert!(fs.disarm() && store.unprotected().is_some());
+    for (nth, image) in fs.after_power_loss(4_096).iter().enumerate() {
+        let context = format!("image {nth}");
+        let loaded = open(image).unwrap().1;
+        check(&model, loaded.as_ref(), 3, &context);
+    }
+    // The next generation has all records.
+    assert!(model.begin(&mut store));
+    for image in fs.after_power_loss(4_096) {
+        check(&model, open(&image).unwrap().1.as_ref(), 3, "afterwards");
+    }
+}
