@@ -129,7 +129,7 @@ pub(super) struct Listed {
 
 /// The checkpoint at `present` and those kept beside it, newest first.
 pub(super) fn list(present: &Path) -> Vec<Listed> {
-    let mut listed: Vec<_> = history::saved_checkpoints(present)
+    let mut listed: Vec<_> = history::newest_first(present)
         .unwrap_or_default()
         .into_iter()
         .map(|kept| Listed {
@@ -138,7 +138,6 @@ pub(super) fn list(present: &Path) -> Vec<Listed> {
             written: kept.written,
         })
         .collect();
-    listed.sort_by_key(|kept| std::cmp::Reverse(kept.written));
     if let Ok(metadata) = fs::metadata(present) {
         let first = Listed {
             name: "present".to_owned(),

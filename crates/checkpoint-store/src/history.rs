@@ -1,5 +1,6 @@
 //! The checkpoints kept beside the present one: those of the last sessions and of the last rescues.
 
+use std::cmp::Reverse;
 use std::fs;
 use std::io;
 use std::os::unix::fs::MetadataExt;
@@ -50,12 +51,8 @@ pub struct SavedCheckpoint {
 }
 
 /// Lists the checkpoints kept beside the one at `path`: those of earlier sessions, then those of rescues, each from new
-/// to old. Links in `path` must be resolved.
-///
-/// # Errors
-///
-/// If the folder cannot be read.
-pub fn saved_checkpoints(path: &Path) -> io::Result<Vec<SavedCheckpoint>> {
+/// to old.
+fn saved_checkpoints(path: &Path) -> io::Result<Vec<SavedCheckpoint>> {
     let names = names_of(path);
     let mut kept = Vec::new();
     for kind in [KeepReason::Session, KeepReason::Rescue] {
@@ -75,6 +72,26 @@ pub fn saved_checkpoints(path: &Path) -> io::Result<Vec<SavedCheckpoint>> {
         }
     }
     Ok(kept)
+}
+
+/// Lists the checkpoints kept beside the one at `path`, from new to old. Links in `path` must be resolved.
+///
+/// The clock may have been set back, so the numbers decide about the order of files of one kind: a file counts as no older
+/// than those of its kind with lower numbers.
+///
+/// # Errors
+///
+/// If the folder cannot be read.
+pub fn newest_first(path: &Path) -> io::Result<Vec<SavedCheckpoint>> {
+    let mut dated: Vec<(i64, SavedCheckpoint)> = Vec::new();
+    for kept in saved_checkpoints(path)?.into_iter().rev() {
+        let older = dated.last().filter(|(_, older)| older.kind == kept.kind);
+        let at = older.map_or(kept.written, |(at, _)| kept.written.max(*at));
+        dated.push((at, kept));
+    }
+    dated.reverse();
+    dated.sort_by_key(|(at, _)| Reverse(*at));
+    Ok(dated.into_iter().map(|(_, kept)| kept).collect())
 }
 
 /// The number of the last rescue that was kept beside the checkpoint at `path`. 0 if there is none.
@@ -155,6 +172,8 @@ fn names_of(path: &Path) -> Names {
 
 #[cfg(test)]
 mod tests {
+    use std::time::{Duration, SystemTime};
+
     use super::*;
     use rescue_core::checkpoint::format::PendingWrite;
     use ros1_master::{
@@ -201,6 +220,43 @@ mod tests {
         assert_eq!(listed(&path), sessions.chain(rescues).collect::<Vec<_>>());
         assert!(!with(&path, ".session-1.previous").exists());
         assert!(with(&path, ".broken-1").exists());
+    }
+
+    /// Robots start without a battery-backed clock.
+    #[test]
+    fn the_newest_file_of_a_kind_comes_first_even_if_the_clock_was_set_back() {
+        let (_folder, path) = scratch_path();
+        let files = [
+            ("session-1", 100),
+            ("rescue-1", 150),
+            ("session-2", 200),
+            ("rescue-2", 0),
+            ("session-3", 50),
+            ("rescue-3", 300),
+        ];
+        for (name, written) in files {
+            file(&path, name, 1);
+            let kept = fs::File::open(with(&path, &format!(".{name}"))).unwrap();
+            kept.set_modified(SystemTime::UNIX_EPOCH + Duration::from_secs(written))
+                .unwrap();
+        }
+        let found = newest_first(&path).unwrap();
+        let names = found
+            .iter()
+            .map(|kept| format!("{}-{}", kept.kind.name(), kept.number));
+        let expected = [
+            "rescue-3",
+            "session-3",
+            "session-2",
+            "rescue-2",
+            "rescue-1",
+            "session-1",
+        ];
+        assert_eq!(names.collect::<Vec<_>>(), expected);
+        assert_eq!(
+            found[1].written, 50,
+            "the time that people see is the file's"
+        );
     }
 
     #[test]
