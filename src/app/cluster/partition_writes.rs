@@ -86,7 +86,15 @@ impl PartitionWritesFile {
             }
         };
         let held = loaded.session().map_or(0, |session| session.cluster_seq);
-        let base = session::rebuild(loaded.checkpoint, Vec::new()).mirror;
+        let rebuilt = session::rebuild(loaded.checkpoint, Vec::new());
+        let trouble = rebuilt.trouble;
+        let trouble = trouble.map(|why| format!("the snapshot is not a valid master state: {why}"));
+        for sentence in loaded.damage.iter().chain(&trouble) {
+            tracing::error!(
+                "the writes made while this computer was cut off are damaged: {sentence}"
+            );
+        }
+        let base = rebuilt.mirror;
         let mut pending = WritesToSend::default();
         for record in loaded.records {
             if let RecordContent::Call { call, .. } = record.entry {
@@ -354,6 +362,37 @@ mod tests {
         let text = std::fs::read_to_string(folder.path().join(&names[0])).unwrap();
         assert!(text.contains("before"), "{text}");
         assert!(loaded(&checkpoint, true).await.is_none());
+    }
+
+    /// Without the state before the writes, the merge takes each of them for older than that of the others.
+    #[tokio::test]
+    async fn damage_is_logged_and_the_rest_is_sent() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut kept = begun(&checkpoint).await;
+        kept.add(vec![set("/a", 1)]).await;
+        drop(kept);
+        let path = file_path(&checkpoint);
+        let text = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, text.replacen("before", "behind", 1)).unwrap();
+
+        let log = tempfile::NamedTempFile::new().unwrap();
+        let writer = std::sync::Mutex::new(log.reopen().unwrap());
+        let subscriber = tracing_subscriber::fmt().with_writer(writer).finish();
+        let logging = tracing::subscriber::set_default(subscriber);
+        let left = loaded(&checkpoint, true).await.unwrap();
+        drop(logging);
+        assert!(left.base == Master::default());
+        assert_eq!(left.calls, [set("/a", 1)]);
+        let said = std::fs::read_to_string(log.path()).unwrap();
+        let parts = [
+            "ERROR",
+            "cut off are damaged: the snapshot of",
+            ".alone.broken-1",
+        ];
+        for part in parts {
+            assert!(said.contains(part), "{part}\n{said}");
+        }
     }
 
     /// A disk may be full for a moment while the computer is cut off for hours.
