@@ -329,12 +329,12 @@ async fn close(ledger: Arc<Ledger>) {
     match tokio::time::timeout(DISK_PATIENCE, closed).await {
         Ok(Some(Err(error))) => tracing::error!(
             %error,
-            "stopped, but could not write the closing checkpoint: the next start treats this as a crash; free space on the disk or repair it"
+            "stopped, but could not write the closing checkpoint; free space on the disk or repair it"
         ),
         Ok(Some(Ok(()))) => tracing::info!("stopped cleanly"),
         Ok(None) if !has_store => tracing::info!("stopped cleanly"),
         Ok(None) | Err(_) => tracing::error!(
-            "stopped without a closing checkpoint: the disk has not answered for {DISK_PATIENCE:?}. The next start treats this as a crash; repair the disk"
+            "stopped without a closing checkpoint: the disk has not answered for {DISK_PATIENCE:?}; repair the disk"
         ),
     }
 }
