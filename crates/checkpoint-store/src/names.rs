@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::load::FILE_BYTES_MAX;
-use super::{Storage, StoreError};
+use super::{BROKEN, Storage, StoreError};
 
 /// Number of files of one kind to keep. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
@@ -182,11 +182,24 @@ impl Names {
         for ending in self
             .endings(storage)?
             .iter()
-            .filter(|ending| ending.ends_with(".new"))
+            .filter(|ending| is_unfinished(ending))
         {
             storage.remove(&self.with(&format!(".{ending}")))?;
         }
         Ok(())
+    }
+}
+
+/// Whether rosrescue gives a file the name `PATH.ENDING` until it is complete. Any other `PATH.….new` belongs to another
+/// program.
+fn is_unfinished(ending: &str) -> bool {
+    let Some(complete) = ending.strip_suffix(".new") else {
+        return false;
+    };
+    match complete.split_once('-') {
+        None => ["previous", "report"].contains(&complete),
+        Some(("log", number)) => number.strip_suffix(".gz").and_then(number_in).is_some(),
+        Some((kind, number)) => [BROKEN, "rescue"].contains(&kind) && number_in(number).is_some(),
     }
 }
 

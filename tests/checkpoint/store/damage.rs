@@ -165,15 +165,39 @@ fn files_that_a_crash_left_unfinished_are_removed() {
     for name in [
         "c.yaml.new-7",
         "c.yaml.previous.new",
-        "c.yaml.new-x",
-        "d.yaml.new-1",
+        "c.yaml.broken-2.new",
+        "c.yaml.rescue-3.new",
+        "c.yaml.log-4.gz.new",
+        "c.yaml.report.new",
     ] {
         fs::write(folder.path().join(name), "# rosrescue").unwrap();
     }
     let (store, _) = Store::open(&path).unwrap();
     drop(store);
-    let left = ["c.yaml", "c.yaml.lock", "c.yaml.new-x", "d.yaml.new-1"];
-    assert_eq!(names(folder.path()), left);
+    assert_eq!(names(folder.path()), ["c.yaml", "c.yaml.lock"]);
+}
+
+#[test]
+fn files_of_other_programs_with_similar_names_stay() {
+    let (folder, path) = place();
+    drop(started(&path, 1));
+    let others = [
+        // Of another rosrescue, whose checkpoint is `c.yaml.2`.
+        "c.yaml.2.previous.new",
+        "c.yaml.log-x.gz.new",
+        "c.yaml.log.new",
+        "c.yaml.new-x",
+        "c.yaml.urdf.new",
+        "d.yaml.new-1",
+    ];
+    for name in others {
+        fs::write(folder.path().join(name), "# rosrescue").unwrap();
+    }
+    let (store, _) = Store::open(&path).unwrap();
+    drop(store);
+    let mut expected = [&["c.yaml", "c.yaml.lock"][..], &others].concat();
+    expected.sort_unstable();
+    assert_eq!(names(folder.path()), expected);
 }
 
 #[test]
