@@ -3,7 +3,7 @@
 use std::{
     io,
     panic::resume_unwind,
-    path::{Path, PathBuf},
+    path::Path,
     process::ExitStatus,
     thread,
     time::Duration,
@@ -47,13 +47,6 @@ pub(crate) use usage::usage;
 
 /// How long a process may take to end after SIGINT, and then again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
-
-/// Path of a file that belongs to `checkpoint`.
-pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
-    let mut name = checkpoint.as_os_str().to_owned();
-    name.push(suffix);
-    PathBuf::from(name)
-}
 
 /// Starts `command`, with this nice value if rosrescue runs with [`guardian::NICE`]. The program may be on a slow disk,
 /// so other tasks continue meanwhile. A stop of rosrescue does not interrupt the start, because the process id of the

@@ -12,9 +12,8 @@ use std::{
     time::Duration,
 };
 
-use checkpoint_store::regular_file;
+use checkpoint_store::{beside, regular_file};
 
-use super::beside;
 use crate::{limit::rarely, wait};
 
 /// How long the disk may delay a master. After that the master starts without the file.

@@ -9,9 +9,9 @@ use std::{
     thread,
 };
 
-use checkpoint_store::regular_file;
+use checkpoint_store::{beside, regular_file};
 
-use super::{Stat, beside, output};
+use super::{Stat, output};
 use crate::wait;
 
 /// Largest PID file, in bytes.

@@ -214,7 +214,7 @@ fn close(storage: &impl Storage, names: &Names, number: u64) -> io::Result<()> {
         encoder.write_all(&bytes)?;
         let packed = encoder.finish()?;
         // If a crash leaves this file, the next start removes it.
-        let fresh = super::names::with(&closed, ".new");
+        let fresh = super::names::beside(&closed, ".new");
         let file = storage.create(&fresh)?;
         append_all(storage, &file, &packed)
             .and_then(|()| storage.sync(&file))

@@ -7,7 +7,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::generation::append_all;
-use super::names::{previous, with};
+use super::names::{beside, previous};
 use super::{Disk, Names, Storage};
 use rescue_core::checkpoint::format::{self, Checkpoint};
 
@@ -120,7 +120,7 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
     let kept = names.numbered(KeepReason::Rescue.name(), number);
     let encoded = format::encode_checkpoint(&checkpoint, 1).map_err(io::Error::other)?;
     // If a crash leaves this file, the next start removes it.
-    let fresh = with(&kept, ".new");
+    let fresh = beside(&kept, ".new");
     let written = Disk
         .create(&fresh)
         .and_then(|file| append_all(&Disk, &file, &encoded.bytes))
@@ -188,7 +188,7 @@ mod tests {
     }
 
     fn file(path: &Path, name: &str, bytes: usize) {
-        fs::write(with(path, &format!(".{name}")), vec![b'x'; bytes]).unwrap();
+        fs::write(beside(path, &format!(".{name}")), vec![b'x'; bytes]).unwrap();
     }
 
     fn set(caller: &str, key: &str, value: i32) -> Request {
@@ -218,8 +218,8 @@ mod tests {
         let sessions = (3..=7).rev().map(|number| format!("session-{number}"));
         let rescues = (11..=30).rev().map(|number| format!("rescue-{number}"));
         assert_eq!(listed(&path), sessions.chain(rescues).collect::<Vec<_>>());
-        assert!(!with(&path, ".session-1.previous").exists());
-        assert!(with(&path, ".broken-1").exists());
+        assert!(!beside(&path, ".session-1.previous").exists());
+        assert!(beside(&path, ".broken-1").exists());
     }
 
     /// Robots start without a battery-backed clock.
@@ -236,7 +236,7 @@ mod tests {
         ];
         for (name, written) in files {
             file(&path, name, 1);
-            let kept = fs::File::open(with(&path, &format!(".{name}"))).unwrap();
+            let kept = fs::File::open(beside(&path, &format!(".{name}"))).unwrap();
             kept.set_modified(SystemTime::UNIX_EPOCH + Duration::from_secs(written))
                 .unwrap();
         }
@@ -284,7 +284,7 @@ mod tests {
         };
         for number in 1..=2 {
             let kept = keep_rescue(&path, number, checkpoint.clone()).unwrap();
-            assert_eq!(kept, with(&path, &format!(".rescue-{number}")));
+            assert_eq!(kept, beside(&path, &format!(".rescue-{number}")));
             let loaded = super::super::read(&kept).unwrap().unwrap();
             assert!(loaded.exact && loaded.damage.is_empty());
             assert_eq!(loaded.checkpoint, Some(checkpoint.clone()));

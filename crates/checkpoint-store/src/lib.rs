@@ -45,6 +45,7 @@ pub use load::Loaded;
 pub use lock::DiskLock;
 pub use lock::{LockHolder, holder_of};
 use names::Names;
+pub use names::beside;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{CheckJob, Checked, ForeignChange};
 

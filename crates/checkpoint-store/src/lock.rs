@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 
 use rustix::fs::FlockOperation;
 
+use super::names::beside;
 use super::storage::FileId;
 use crate::regular_file;
 
@@ -99,9 +100,7 @@ pub struct LockHolder {
 
 /// The rosrescue that uses this checkpoint. `None` if none does.
 pub fn holder_of(checkpoint: &Path) -> Option<LockHolder> {
-    let mut path = checkpoint.as_os_str().to_owned();
-    path.push(".lock");
-    let pid = || holder_in(Path::new(&path));
+    let pid = || holder_in(&beside(checkpoint, ".lock"));
     is_claimed(checkpoint).then(|| LockHolder { pid: pid() })
 }
 

@@ -22,7 +22,7 @@ pub(super) struct Names {
 
 impl Names {
     fn with(&self, suffix: &str) -> PathBuf {
-        with(&self.path, suffix)
+        beside(&self.path, suffix)
     }
 
     pub(super) fn lock(&self) -> PathBuf {
@@ -215,10 +215,11 @@ fn is_ours(storage: &impl Storage, path: &Path) -> bool {
 
 /// The name of the previous generation: the file that the one at `path` has replaced.
 pub(super) fn previous(path: &Path) -> PathBuf {
-    with(path, ".previous")
+    beside(path, ".previous")
 }
 
-pub(super) fn with(path: &Path, suffix: &str) -> PathBuf {
+/// The path of the file beside `path` whose name also has this `suffix`.
+pub fn beside(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);
     PathBuf::from(name)

@@ -9,6 +9,7 @@ use rustix::fs::{CWD, RenameFlags};
 use rustix::io::Errno;
 
 use super::lock::{self, DiskLock};
+use super::names::beside;
 use crate::regular_file;
 
 /// Identifies a file independently of its name.
@@ -210,9 +211,7 @@ impl Storage for Disk {
     }
 
     fn link(&self, from: &Path, to: &Path) -> io::Result<bool> {
-        let mut name = to.as_os_str().to_owned();
-        name.push(".new");
-        let aside = PathBuf::from(name);
+        let aside = beside(to, ".new");
         remove_if_there(&aside)?;
         let linked = fs::hard_link(from, &aside).is_ok();
         if !linked {

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use checkpoint_store::{Store, StoreError, SyncJob, Synced, regular_file};
+use checkpoint_store::{Store, StoreError, SyncJob, Synced, beside, regular_file};
 use rescue_core::{
     checkpoint::{
         format::{Checkpoint, RecordContent, Session},
@@ -48,9 +48,7 @@ pub(super) struct PartitionWritesFile {
 }
 
 fn file_path(checkpoint: &Path) -> PathBuf {
-    let mut name = checkpoint.as_os_str().to_owned();
-    name.push(".alone");
-    name.into()
+    beside(checkpoint, ".alone")
 }
 
 impl PartitionWritesFile {
