@@ -319,28 +319,13 @@ impl Comparison<'_> {
         match (a, b, members(a), members(b)) {
             // In each of the two states, this is a namespace or absent.
             (.., Some(a), Some(b)) => self.params(name, &a, &b),
-            _ if a.is_some_and(|a| b.is_some_and(|b| same(a, b))) => {}
+            _ if a.is_some_and(|a| b.is_some_and(|b| a.equals_in_any_order(b))) => {}
             _ => {
                 let [in_a, in_b] =
                     [a, b].map(|value| value.map(|value| shown(&self.hide.mask(name, value))));
                 self.add(What::Parameter, name, in_a, in_b);
             }
         }
-    }
-}
-
-/// Whether two values are equal, ignoring the order of struct members.
-fn same(a: &Value, b: &Value) -> bool {
-    match (a, b) {
-        (Value::Struct(a), Value::Struct(b)) => {
-            a.len() == b.len()
-                && a.iter()
-                    .all(|(key, a)| b.get(key).is_some_and(|b| same(a, b)))
-        }
-        (Value::Array(a), Value::Array(b)) => {
-            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| same(a, b))
-        }
-        _ => a == b,
     }
 }
 

@@ -146,6 +146,22 @@ impl PartialEq for Value {
 impl Eq for Value {}
 
 impl Value {
+    /// Whether two values are equal apart from the order of struct members. Arrays must have the same order.
+    pub fn equals_in_any_order(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Struct(a), Self::Struct(b)) => {
+                let in_b = |(key, a): (&String, &Self)| {
+                    b.get(key).is_some_and(|b| a.equals_in_any_order(b))
+                };
+                a.len() == b.len() && a.iter().all(in_b)
+            }
+            (Self::Array(a), Self::Array(b)) => {
+                a.len() == b.len() && a.iter().zip(b).all(|(a, b)| a.equals_in_any_order(b))
+            }
+            _ => self == other,
+        }
+    }
+
     /// Approximate memory use, in bytes.
     pub fn size(&self) -> usize {
         let mut size = 0;
