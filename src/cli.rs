@@ -11,7 +11,7 @@ mod service;
 mod tools;
 mod when;
 
-use std::ffi::OsString;
+use std::{ffi::OsString, fmt::Display};
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, error::ErrorKind};
 
@@ -50,10 +50,14 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Reads the command line, the environment and the configuration file. Ends the process with a message if they are
-    /// wrong. Returns also the words of the command line with the options of the file, for a worker, which does not read
-    /// the file again: an edit must not keep it from starting.
-    pub fn read(is_worker: bool) -> (Self, Vec<OsString>) {
+    /// Reads the command line, the environment and the configuration file. Returns also the words of the command line
+    /// with the options of the file, for a worker, which does not read the file again: an edit must not keep it from
+    /// starting.
+    ///
+    /// # Errors
+    ///
+    /// If something is wrong, or if help or version must be printed.
+    pub fn read(is_worker: bool) -> Result<(Self, Vec<OsString>), clap::Error> {
         let mut command = Self::command();
         let mut words: Vec<_> = std::env::args_os().collect();
         if words.get(1).is_some_and(|first| first == "help") {
@@ -67,25 +71,24 @@ impl Cli {
             // The variables of the options of `core` must not count as options given before another command.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
-        let refuse = |why| -> ! {
-            Self::command()
-                .error(ErrorKind::ValueValidation, why)
-                .exit()
-        };
         let file = match is_worker {
-            true => Ok(config_file::FromFile::default()),
-            false => config_file::insert(&command, &mut words),
+            true => config_file::FromFile::default(),
+            false => config_file::insert(&command, &mut words).map_err(Self::usage_error)?,
         };
-        let file = file.unwrap_or_else(|why| refuse(why));
-        let matches = command.clone().get_matches_from(&words);
-        let mut cli = Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+        let matches = command.clone().try_get_matches_from(&words)?;
+        let mut cli = Self::from_arg_matches(&matches)?;
         if let Some(Command::Tool(Tool::Check(args))) = &mut cli.command
             && let Some((_, checked)) = matches.subcommand()
         {
             args.settings =
-                config_file::settings(&command, checked, &file).unwrap_or_else(|why| refuse(why));
+                config_file::settings(&command, checked, &file).map_err(Self::usage_error)?;
         }
-        (cli, words)
+        Ok((cli, words))
+    }
+
+    /// A usage error with this text, like those of clap. The exit status is 2.
+    pub(crate) fn usage_error(why: impl Display) -> clap::Error {
+        Self::command().error(ErrorKind::ValueValidation, why)
     }
 }
 

@@ -24,7 +24,6 @@ use crate::{
     server::{hosts::own_names, listener},
     task::boxed,
 };
-use clap::{CommandFactory, error::ErrorKind};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tracing_appender::non_blocking::WorkerGuard;
@@ -40,19 +39,55 @@ const LOOKUP: Duration = Duration::from_secs(6);
 /// and through its guardian. A second signal within this time counts as the first one.
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
 
+/// Shortest run under systemd that ends with an error. systemd starts the next one after 50 ms, so that calls do not
+/// wait long after a crash, and never gives up: without this pause, a wrong option would fill the journal.
+const FAILED_RUN: Duration = Duration::from_secs(2);
+
 /// Runs the program.
 ///
 /// It is here and not in `main.rs`, so that the compiler generates the code of the whole program once.
 pub fn main() -> ExitCode {
+    let started = Instant::now();
     // This must come first: it removes variables from the environment, which is only safe with a
     // single thread.
-    let sockets = match Sockets::inherited() {
-        Ok(sockets) => sockets,
-        Err(error) => {
-            eprintln!("rosrescue: {error}");
-            return ExitCode::FAILURE;
+    let sockets = Sockets::inherited();
+    // There is an error if the socket unit is wrong.
+    let by_systemd = matches!(
+        &sockets,
+        Err(_)
+            | Ok(Some(Sockets {
+                guard: Guard::Systemd,
+                ..
+            }))
+    );
+    let ended = sockets.map_err(Box::from).and_then(execute);
+    ended.unwrap_or_else(|error| {
+        let status = report(&*error);
+        if by_systemd {
+            std::thread::sleep(FAILED_RUN.saturating_sub(started.elapsed()));
         }
-    };
+        status
+    })
+}
+
+/// Prints why rosrescue ends, and returns its exit status.
+fn report(error: &(dyn Error + 'static)) -> ExitCode {
+    match error.downcast_ref::<clap::Error>() {
+        Some(usage) => {
+            // It fails if the terminal is gone.
+            let _ = usage.print();
+            ExitCode::from(u8::try_from(usage.exit_code()).unwrap_or(2))
+        }
+        None => {
+            // The name and address of another computer may be in it.
+            eprintln!("rosrescue: {}", Printable::line(&error.to_string()));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Does what the command line asks for. `sockets` are those that this process has inherited.
+fn execute(sockets: Option<Sockets>) -> Result<ExitCode, Box<dyn Error>> {
     if sockets.is_some() {
         // The worker is started as /proc/self/exe, so without this its name would be `exe`.
         let _ = rustix::thread::set_name(c"rosrescue");
@@ -60,7 +95,7 @@ pub fn main() -> ExitCode {
     let is_worker = sockets
         .as_ref()
         .is_some_and(|sockets| matches!(sockets.guard, Guard::Guardian { .. }));
-    let (cli, words) = Cli::read(is_worker);
+    let (cli, words) = Cli::read(is_worker)?;
     let env = |name: &str| std::env::var(name).ok();
     let hostname = rustix::system::uname()
         .nodename()
@@ -68,7 +103,7 @@ pub fn main() -> ExitCode {
         .into_owned();
     let local = listener::local_address();
     let (config, common, verbose) = match &cli.command {
-        Some(Command::Tool(tool)) => return commands::run(tool),
+        Some(Command::Tool(tool)) => return Ok(commands::run(tool)),
         Some(Command::Proxy(args)) => (
             Config::proxy(args, &env, &hostname, local),
             &args.common,
@@ -88,32 +123,15 @@ pub fn main() -> ExitCode {
             )
         }
     };
-    let mut config = match config {
-        Ok(config) => config,
-        // Exit status 2, as for all usage errors.
-        Err(error) => Cli::command()
-            .error(ErrorKind::ValueValidation, error)
-            .exit(),
-    };
-    let _log = match start_log(&common.logging, verbose) {
-        Ok(log) => log,
-        Err(error) => Cli::command()
-            .error(ErrorKind::ValueValidation, error)
-            .exit(),
-    };
+    let mut config = config.map_err(Cli::usage_error)?;
+    let _log = start_log(&common.logging, verbose).map_err(Cli::usage_error)?;
     if let Some(sockets) = &sockets
         && matches!(sockets.guard, Guard::Systemd)
     {
         config.serve_at(sockets.addresses(), &env);
     }
-    match start(config, sockets, common.no_guardian, hostname, words) {
-        Ok(status) => ExitCode::from(u8::try_from(status).unwrap_or(1)),
-        Err(error) => {
-            // The name and address of another computer may be in it.
-            eprintln!("rosrescue: {}", Printable::line(&error.to_string()));
-            ExitCode::FAILURE
-        }
-    }
+    let status = start(config, sockets, common.no_guardian, hostname, words)?;
+    Ok(ExitCode::from(u8::try_from(status).unwrap_or(1)))
 }
 
 /// Serves `sockets`, or runs the guardian of a worker that serves them.

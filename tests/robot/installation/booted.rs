@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
+use std::time::Instant;
 
 use ros1_master::xmlrpc::{self, Reply, Value};
 
@@ -336,6 +337,28 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
         robot.run("systemctl is-enabled roscore; systemctl is-active roscore")
             == "enabled\nactive\n"
     });
+}
+
+/// A call that waits lets the socket unit start the service again, whatever `Restart=` says.
+#[test]
+fn a_wrong_option_costs_a_start_every_two_seconds_until_it_is_corrected() {
+    let robot = Booted::new();
+    robot.run(&format!(
+        "SUDO_USER=robot ROS_HOSTNAME=localhost {PROGRAM} install --yes"
+    ));
+    robot.wait_protected();
+    robot.write("/etc/default/rosrescue", "ROSRESCUE_HOLD=10s");
+    let start = Instant::now();
+    let restarted = robot.try_run("systemctl restart rosrescue.service");
+    assert!(restarted.is_err(), "{restarted:?}");
+    let call = robot.output("curl -sS --max-time 5 http://127.0.0.1:11311/");
+    assert!(!call.status.success(), "{call:?}");
+    let journal = robot.run("journalctl -u rosrescue.service");
+    let failed = journal.matches("Failed with result 'exit-code'").count();
+    let most = 1 + start.elapsed().as_secs() / 2;
+    assert!(failed as u64 <= most, "{failed} in {most}: {journal}");
+    robot.run("rm /etc/default/rosrescue");
+    robot.wait_protected();
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::net::TcpListener;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixDatagram;
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, PATIENCE, Rosmaster, Scratch, Setup, behind, eventually, free_port, status,
@@ -176,6 +177,23 @@ fn a_descriptor_that_is_not_a_listening_socket_is_refused() {
         assert_eq!(rescue.wait_output().code(), Some(1));
         let said = rescue.stderr().join("\n");
         assert!(said.contains("ListenStream="), "{said}");
+    }
+}
+
+/// systemd starts it again 50 ms later, and never gives up.
+#[test]
+fn a_start_that_fails_under_systemd_takes_two_seconds() {
+    let scratch = Scratch::new();
+    let wrong_option = ["proxy", "--master", "http://127.0.0.1:1", "--hold", "10s"];
+    let no_program = ["core", "--rosmaster", "/nowhere"];
+    for (arguments, status) in [(&wrong_option[..], 2), (&no_program, 1)] {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let setup = Setup::bare(&scratch, arguments);
+        let start = Instant::now();
+        let mut rescue = setup.wrapped(|own| activated(own, listener.into())).spawn();
+        assert_eq!(rescue.wait_output().code(), Some(status));
+        let took = start.elapsed();
+        assert!(took >= Duration::from_secs(2), "{arguments:?}: {took:?}");
     }
 }
 
