@@ -9,9 +9,7 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::{
-    Pid, Signal, getpriority_process, kill_process, setpriority_process, test_kill_process,
-};
+use rustix::process::{Pid, Signal, getpriority_process, kill_process, setpriority_process};
 use tokio::{
     process::{Child, Command},
     runtime::Handle,
@@ -101,9 +99,10 @@ pub(crate) fn signal_process(pid: u32, signal: Signal) {
     }
 }
 
-/// Whether a process with this process id exists.
+/// Whether the process `pid` exists and has not ended. A zombie has: its parent may never wait for it, as the first
+/// process of some containers.
 pub(crate) fn is_alive(pid: u32) -> bool {
-    raw_pid(pid).is_some_and(|pid| test_kill_process(pid).is_ok())
+    Stat::read(pid).is_some_and(|stat| !stat.is_zombie())
 }
 
 /// Whether the process `pid` runs a program with this name, according to its command line. A process id that was
@@ -173,6 +172,8 @@ pub(crate) fn describe(status: ExitStatus) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
 
     #[test]
@@ -182,5 +183,21 @@ mod tests {
         assert!(runs(std::process::id(), name));
         assert!(!runs(std::process::id(), "rosmaster"));
         assert!(is_alive(std::process::id()));
+    }
+
+    #[test]
+    fn a_process_that_has_ended_is_not_alive_although_its_parent_does_not_wait() {
+        let mut child = std::process::Command::new("sleep")
+            .arg("60")
+            .spawn()
+            .unwrap();
+        assert!(is_alive(child.id()));
+        child.kill().unwrap();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while is_alive(child.id()) {
+            assert!(Instant::now() < deadline, "it counts as alive");
+            thread::sleep(Duration::from_millis(1));
+        }
+        child.wait().unwrap();
     }
 }

@@ -62,6 +62,12 @@ impl Stat {
         (self.virtual_bytes, resident)
     }
 
+    /// Whether the process has ended, and its parent has not waited for it yet. The first thread may end before the
+    /// others.
+    pub(super) fn is_zombie(self) -> bool {
+        matches!(self.state, 'Z' | 'X') && self.threads <= 1
+    }
+
     /// Whether no thread of the process runs any more. The first thread may end before the others.
     pub(super) fn has_ended(self) -> bool {
         !self.is_alive() && self.threads <= 1
@@ -89,8 +95,11 @@ mod tests {
         assert!(!with(" S ", " Z ").is_alive());
         assert!(!with(" 8192 ", " 0 ").is_alive(), "it is ending");
         assert!(!with(" S ", " Z ").has_ended(), "other threads run");
+        assert!(!with(" S ", " Z ").is_zombie(), "other threads run");
+        assert!(!with(" 8192 ", " 0 ").is_zombie(), "its sockets are open");
         let alone = LINE.replace(" 20 0 9 ", " 20 0 1 ").replace(" S ", " Z ");
-        assert!(Stat::parse(&alone).unwrap().has_ended());
+        let ended = Stat::parse(&alone).unwrap();
+        assert!(ended.has_ended() && ended.is_zombie());
         for state in [" T ", " t "] {
             assert!(with(" S ", state).is_stopped());
             assert!(with(" S ", state).is_alive());
