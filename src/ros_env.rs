@@ -189,11 +189,15 @@ pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<Ip
         .to_string()
 }
 
-/// The folder `$ROS_HOME`, or `~/.ros`.
+/// The folder `$ROS_HOME`, or `~/.ros`. As in Python, `~` is `$HOME`, else the user's home folder in `/etc/passwd`:
+/// systemd sets no `HOME` for a system service without `User=`.
 pub fn ros_home(env: Lookup<'_>) -> PathBuf {
     match env("ROS_HOME").filter(|home| !home.is_empty()) {
         Some(home) => PathBuf::from(home),
-        None => PathBuf::from(env("HOME").unwrap_or_else(|| "/".to_owned())).join(".ros"),
+        None => {
+            let home = env("HOME").map(PathBuf::from).or_else(std::env::home_dir);
+            home.unwrap_or_else(|| PathBuf::from("/")).join(".ros")
+        }
     }
 }
 
@@ -379,5 +383,7 @@ mod tests {
             log_dir(&env(&[("ROS_HOME", "/h"), ("ROS_LOG_DIR", "/l")])),
             PathBuf::from("/l")
         );
+        let home = std::env::home_dir().unwrap();
+        assert_eq!(log_dir(&env(&[])), home.join(".ros/log"), "without HOME");
     }
 }
