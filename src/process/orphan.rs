@@ -51,18 +51,22 @@ impl Rosmaster {
     /// listens anywhere is the only one that may have the state. `writable` says whether the PID file can be written;
     /// otherwise it may name an earlier rosmaster. Blocks for long if it has to search all processes.
     pub(crate) fn claim_orphan(&self, port: Option<u16>, writable: bool) -> Option<Orphan> {
-        let last = match writable {
-            true => self.pid_file.last(),
-            false => Last::Unknown,
-        };
-        self.claim(last, port)
+        self.claim(self.last(writable), port)
     }
 
     /// Kills the rosmasters that an earlier rosrescue with this checkpoint left running. Blocks like
-    /// [`Self::claim_orphan`].
-    pub(crate) fn kill_orphans(&self) {
-        let all = self.orphans(self.pid_file.last());
+    /// [`Self::claim_orphan`], with the same `writable`.
+    pub(crate) fn kill_orphans(&self, writable: bool) {
+        let all = self.orphans(self.last(writable));
         self.kill(&all, "they may have an old state");
+    }
+
+    /// The content of the PID file, if it is that of the last rosmaster.
+    fn last(&self, writable: bool) -> Last {
+        match writable {
+            true => self.pid_file.last(),
+            false => Last::Unknown,
+        }
     }
 
     /// See [`Self::claim_orphan`]. `last` is what the PID file says.
@@ -257,10 +261,9 @@ mod tests {
         kept.wait().unwrap();
     }
 
-    #[test]
-    fn processes_are_searched_only_without_a_pid_file() {
-        let folder = tempfile::tempdir().unwrap();
-        let checkpoint = folder.path().join("checkpoint");
+    /// A rosmaster that is the program `sleep`, with a checkpoint in `folder`, and an orphan of it.
+    fn sleeping(folder: &Path) -> (Rosmaster, u32) {
+        let checkpoint = folder.join("checkpoint");
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner(&checkpoint));
         let config = SupervisedConfig {
             port: None,
@@ -269,7 +272,22 @@ mod tests {
             timeout: 0.0,
             rosout: false,
         };
-        let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
+        while !runs(orphan, "sleep") {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        (Rosmaster::find(&config, &checkpoint).unwrap(), orphan)
+    }
+
+    fn wait_killed(orphan: u32) {
+        while Stat::read(orphan).is_some_and(Stat::is_alive) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn processes_are_searched_only_without_a_pid_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let (rosmaster, orphan) = sleeping(folder.path());
         assert_eq!(rosmaster.claim(Last::Ended, Some(1)), None);
         assert!(Stat::read(orphan).is_some_and(Stat::is_alive), "not found");
 
@@ -284,9 +302,20 @@ mod tests {
         };
         assert_eq!(rosmaster.claim(last, Some(1)), Some(starting));
         assert_eq!(rosmaster.claim(Last::Unknown, Some(1)), None);
-        while Stat::read(orphan).is_some_and(Stat::is_alive) {
-            std::thread::sleep(Duration::from_millis(1));
-        }
+        wait_killed(orphan);
+    }
+
+    #[test]
+    fn a_pid_file_that_cannot_be_written_hides_no_orphan() {
+        let folder = tempfile::tempdir().unwrap();
+        let (rosmaster, orphan) = sleeping(folder.path());
+        let mut earlier = Command::new("true").spawn().unwrap();
+        rosmaster.pid_file.record(earlier.id(), 1);
+        earlier.wait().unwrap();
+        rosmaster.kill_orphans(true);
+        assert!(Stat::read(orphan).is_some_and(Stat::is_alive), "not found");
+        rosmaster.kill_orphans(false);
+        wait_killed(orphan);
     }
 
     #[test]

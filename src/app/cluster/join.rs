@@ -86,7 +86,8 @@ pub(in crate::app) async fn join(
     let context = &setup.context;
     context.ledger.leave();
     // A master left by an earlier process may have outdated state.
-    block_in_place(|| setup.rosmaster.kill_orphans());
+    let writable = context.ledger.seen_store().is_some();
+    block_in_place(|| setup.rosmaster.kill_orphans(writable));
     let known = setup.restored;
     let (standing, standing_rx) = watch::channel(Standing::NoLeader { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
