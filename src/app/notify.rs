@@ -132,11 +132,17 @@ const INITS: [&str; 4] = ["tini", "docker-init", "catatonit", "dumb-init"];
 fn is_restarted(pid: u32) -> bool {
     let parent = process::parent_of(pid);
     let name = parent.map(process::name_of).unwrap_or_default();
-    // systemd sets INVOCATION_ID for everything that it starts, but terminals inherit it, so the
-    // parent is checked too.
-    let by_systemd = std::env::var_os("INVOCATION_ID").is_some() && name == "systemd";
+    // An orphan's parent may be systemd, too.
+    let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
+    let by_systemd = name == "systemd" && is_in_service(&groups);
     let by_runtime = pid == 1 || parent == Some(1) && INITS.contains(&name.as_str());
     by_systemd || by_runtime
+}
+
+/// Whether a process with these control groups (`cgroups(7)`) belongs to a systemd service. Those of a terminal or a
+/// login end in `.scope`. `INVOCATION_ID` would not do: terminals inherit it, and systemd sets it only since version 232.
+fn is_in_service(groups: &str) -> bool {
+    groups.lines().any(|group| group.ends_with(".service"))
 }
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
@@ -217,5 +223,30 @@ async fn send(notify: impl FnOnce() -> io::Result<()> + Send + 'static) {
     let sent = crate::task::spawn_blocking(notify).await;
     if let Err(error) = sent.map_err(io::Error::other).flatten() {
         tracing::debug!(%error, "could not notify systemd");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_service_is_known_by_its_control_group() {
+        for service in [
+            "0::/system.slice/roscore.service\n",
+            "0::/user.slice/user-1000.slice/user@1000.service/app.slice/roscore.service\n",
+            // Ubuntu 16.04.
+            "4:memory:/\n2:cpu,cpuacct:/\n1:name=systemd:/system.slice/roscore.service\n",
+        ] {
+            assert!(is_in_service(service), "{service}");
+        }
+        for other in [
+            "",
+            "0::/\n",
+            "0::/user.slice/user-1000.slice/session-3.scope\n",
+            "0::/user.slice/user-1000.slice/user@1000.service/app.slice/vte-spawn-7.scope\n",
+        ] {
+            assert!(!is_in_service(other), "{other}");
+        }
     }
 }
