@@ -208,8 +208,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
         // In the background: a dead name server must not delay the start.
         crate::task::spawn(warn_of_another_master(served));
     }
-    let mut names = vec![hostname, config.advertised.host.clone()];
-    names.extend(std::env::var("ROS_HOSTNAME").ok());
+    let names = vec![hostname, config.advertised.host.clone()];
     app::run(config, sockets, own_names(names), stop, print_line).await?;
     Ok(())
 }
