@@ -5,6 +5,8 @@ use std::{fs, time::Duration};
 
 use rescue_core::lifecycle::evidence::Effort;
 
+use super::Stat;
+
 /// Maximum number of processes that are counted as one: the master and its descendants.
 const FAMILY_MOST: usize = 64;
 
@@ -49,31 +51,17 @@ struct Threads {
 impl Threads {
     /// Adds a thread, given its `stat` and `schedstat`.
     fn add(&mut self, stat: &str, sched: Option<&str>) {
-        // The command's name in parentheses comes first and may contain anything.
-        let mut fields = stat
-            .rsplit(')')
-            .next()
-            .unwrap_or_default()
-            .split_whitespace();
-        let state = fields.next().unwrap_or_default();
-        if matches!(state, "Z" | "X") {
+        let Some(stat) = Stat::parse(stat).filter(|stat| !matches!(stat.state, 'Z' | 'X')) else {
             return;
-        }
+        };
         self.count += 1;
-        self.stopped += usize::from(matches!(state, "T" | "t"));
-        self.effort.runnable |= state == "R";
-        self.effort.on_disk |= state == "D";
+        self.stopped += usize::from(stat.is_stopped());
+        self.effort.runnable |= stat.state == 'R';
+        self.effort.on_disk |= stat.state == 'D';
         let (ran, waited, turns) = sched.and_then(schedstat).unwrap_or_else(|| {
-            // A kernel without scheduler statistics only counts ticks of 10 ms.
-            let ticks = fields
-                .skip(10)
-                .take(2)
-                .filter_map(|it| it.parse::<u64>().ok());
-            (
-                Duration::from_millis(10 * ticks.sum::<u64>()),
-                Duration::ZERO,
-                0,
-            )
+            // A kernel without scheduler statistics only counts ticks.
+            let ran = Duration::from_secs_f64(stat.cpu_seconds());
+            (ran, Duration::ZERO, 0)
         });
         self.effort.ran += ran;
         self.effort.waited += waited;
@@ -159,7 +147,9 @@ mod tests {
 
     #[test]
     fn threads_count_together() {
-        let line = |state: &str| format!("7 (a) b) {state} 3 7 7 0 -1 0 1 2 3 4 50 25 7 8 20");
+        let line = |state: &str| {
+            format!("7 (a) b) {state} 3 7 7 0 -1 0 1 2 3 4 50 25 7 8 20 0 9 0 4711 8192 5")
+        };
         let mut threads = Threads::default();
         threads.add(&line("T"), Some("2000000 1000000 5"));
         assert!(threads.effort().unwrap().stopped);

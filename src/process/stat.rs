@@ -7,7 +7,8 @@ use std::fs;
 /// The state of a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Stat {
-    state: char,
+    /// As in `R` for running.
+    pub(super) state: char,
     pub(super) parent: u32,
     pub(crate) threads: u64,
     /// When it was started, in clock ticks since boot. Start time and id together identify the process.
