@@ -1,13 +1,6 @@
 //! Processes: starts, stops and describes them, also rosmaster and rosout. It reports what happens and decides nothing.
 
-use std::{
-    io,
-    panic::resume_unwind,
-    path::Path,
-    process::ExitStatus,
-    thread,
-    time::Duration,
-};
+use std::{io, panic::resume_unwind, path::Path, process::ExitStatus, thread, time::Duration};
 
 use rustix::process::{Pid, Signal, getpriority_process, kill_process, setpriority_process};
 use tokio::{
@@ -125,6 +118,21 @@ pub(crate) fn belongs_to(pid: u32, checkpoint: &Path) -> bool {
 /// Whether the process `pid` was started by any rosrescue.
 pub(crate) fn belongs_to_any_rosrescue(pid: u32) -> bool {
     orphan::has_owner(pid) || parent_of(pid).is_some_and(is_rosrescue)
+}
+
+/// The id of this boot of the computer.
+pub(crate) fn boot_id() -> String {
+    kernel_id("/proc/sys/kernel/random/boot_id")
+}
+
+/// A new random id.
+pub(crate) fn new_id() -> String {
+    kernel_id("/proc/sys/kernel/random/uuid")
+}
+
+/// Reads an id from the kernel, or returns a constant if there is none. Ids are only compared.
+fn kernel_id(path: &str) -> String {
+    std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }
 
 /// All processes that this one can see.

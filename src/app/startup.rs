@@ -13,7 +13,7 @@ use rescue_core::checkpoint::{
 use ros1_master::master::{Displaced, Master};
 
 use super::{RunError, life};
-use crate::{clock, config::Config, guardian::handover, wait};
+use crate::{clock, config::Config, guardian::handover, process, wait};
 
 /// How long the disk may take to open the checkpoint. Calls wait during this time.
 const OPENING: Duration = Duration::from_secs(20);
@@ -38,7 +38,7 @@ pub(super) struct Beginning {
 /// Reads the checkpoint and decides whether its session continues.
 pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let (mut store, loaded) = open(config).await?;
-    let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
+    let boot_id = process::boot_id();
     let mut story = "a new session begins".to_owned();
     let mut beginning = None;
     let mut master_uri = None;
@@ -108,7 +108,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let (mirror, mut session, pending, displaced) = beginning.unwrap_or_default();
     if !restored || session.mark.is_empty() {
         session.master_uri = master_uri;
-        session.id = kernel_id("/proc/sys/kernel/random/uuid");
+        session.id = process::new_id();
         (session.mark, session.incarnation) = token;
         if session.mark.is_empty() {
             session.mark.clone_from(&session.id);
@@ -235,9 +235,4 @@ impl<'a> Folder<'a> {
             );
         }
     }
-}
-
-/// Reads an id from the kernel, or returns a constant if there is none. Ids are only compared.
-pub(super) fn kernel_id(path: impl AsRef<Path>) -> String {
-    std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }

@@ -11,7 +11,7 @@ use std::{
 
 use checkpoint_store::{beside, regular_file};
 
-use super::{Stat, output};
+use super::{Stat, boot_id, output};
 use crate::wait;
 
 /// Largest PID file, in bytes.
@@ -61,6 +61,7 @@ impl PidFile {
     /// Like [`Self::write`], but waits for the disk.
     pub(super) fn record(&self, pid: u32, port: u16) {
         if let Some(stat) = Stat::read(pid) {
+            // Each boot reuses process ids and start times.
             let line = format!("{pid} {} {port} {}\n", stat.started, boot_id());
             let created = regular_file::create(&self.0);
             if let Err(error) = created.and_then(|mut file| file.write_all(line.as_bytes())) {
@@ -94,12 +95,6 @@ impl PidFile {
             false => Last::Ended,
         }
     }
-}
-
-/// The boot id, because each boot reuses process ids and start times.
-fn boot_id() -> String {
-    let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
-    id.trim_end().to_owned()
 }
 
 #[cfg(test)]

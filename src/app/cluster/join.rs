@@ -20,13 +20,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClusterDriver, facts::ComputerFacts, partition_writes::PartitionWritesFile};
 use crate::{
-    app::{context::Context, startup},
+    app::context::Context,
     cluster::{
         etcd::{Credentials, Etcd, EtcdError, Options, Tls},
         replica::Replica,
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
-    process::Rosmaster,
+    process::{self, Rosmaster},
     server::others::{Forwarded, MemberAddresses, Others, Shown},
     upstream::peer::Peers,
 };
@@ -66,11 +66,11 @@ pub(in crate::app) async fn join(
     })?;
     let settings = Settings {
         name: config.name.clone(),
-        id: startup::kernel_id("/proc/sys/kernel/random/uuid"),
+        id: process::new_id(),
         uri: config.advertised.to_string(),
         boot: match config.advertised.host.parse::<IpAddr>() {
             Ok(_) => String::new(),
-            Err(_) => startup::kernel_id("/proc/sys/kernel/random/boot_id"),
+            Err(_) => process::boot_id(),
         },
         version: env!("CARGO_PKG_VERSION").to_owned(),
         ttl: config.ttl,
