@@ -178,20 +178,21 @@ impl Findings {
                 None => self.warn(
                     variable,
                     format!("is not set here, but {at} sets {value} in every new shell"),
-                    format!("`sed -i {line}d {file}`, or `source {file}` here"),
+                    format!("`sed -i '{line}s/^/#/' {file}`, or `source {file}` here"),
                 ),
             }
         }
     }
 
-    /// How to correct the file that sets `variable` in every new shell, if there is one.
+    /// How to correct the file that sets `variable` in every new shell, if there is one. The line becomes a comment and is
+    /// not deleted, because other advice names other lines of the same file by their numbers.
     pub(super) fn lasting(&self, facts: &SetupFacts, variable: &str) -> String {
         let mut settings = facts.shell.iter();
         let Some(setting) = settings.find(|setting| setting.variable == variable) else {
             return String::new();
         };
         let (file, line) = (setting.file.display(), setting.line);
-        format!(". {file}:{line} sets the old value: `sed -i {line}d {file}`")
+        format!(". {file}:{line} sets the old value: `sed -i '{line}s/^/#/' {file}`")
     }
 }
 

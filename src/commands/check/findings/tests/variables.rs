@@ -1,10 +1,12 @@
 //! ROS's environment variables and the files of the shell.
 
+use std::{fs, process::Command};
+
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
         facts::SetupFacts,
-        shell::ShellSetting,
+        shell::{ShellSetting, settings},
     },
     findings_of, host, nowhere, one, todo,
 };
@@ -136,9 +138,37 @@ fn a_stale_file_of_the_shell_is_found() {
         facts.shell = vec![setting("ROS_IP", "10.0.0.9")];
     });
     assert!(
-        findings_of.ends_with("`sed -i 120d /home/r/.bashrc`"),
+        findings_of.ends_with("`sed -i '120s/^/#/' /home/r/.bashrc`"),
         "{findings_of}"
     );
+}
+
+#[test]
+fn all_advice_for_one_file_can_be_followed() {
+    let home = tempfile::tempdir().unwrap();
+    let file = home.path().join(".bashrc");
+    let lines = "export ROS_MASTER_URI=http://10.0.0.9:11311\nexport ROS_IP=10.0.0.9\n";
+    fs::write(&file, format!("{lines}source devel/setup.bash\n")).unwrap();
+    let found = findings_of(|facts| {
+        facts.env.master_uri = Some("http://10.0.0.9:11311".to_owned());
+        facts.master_host = Some(host("10.0.0.9", "10.0.0.9", false));
+        facts.env.ip = Some("10.0.0.9".to_owned());
+        facts.own = host("10.0.0.9", "10.0.0.9", false);
+        facts.shell = settings(home.path(), "/bin/bash");
+    });
+    let commands = found.iter().flat_map(|finding| finding.todo.split('`'));
+    let commands: Vec<_> = commands.filter(|it| it.starts_with("sed ")).collect();
+    assert_eq!(commands.len(), 2, "{found:?}");
+    for command in commands {
+        let status = Command::new("bash").args(["-c", command]).status();
+        assert!(status.unwrap().success(), "{command}");
+    }
+    let lines = lines.replace("export", "#export");
+    assert_eq!(
+        fs::read_to_string(&file).unwrap(),
+        format!("{lines}source devel/setup.bash\n")
+    );
+    assert_eq!(settings(home.path(), "/bin/bash"), []);
 }
 
 #[test]
