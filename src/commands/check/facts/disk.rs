@@ -14,12 +14,14 @@ pub(crate) struct CheckpointDisk {
     pub(crate) checkpoint: PathBuf,
     /// The checkpoint's folder, or its nearest parent that exists.
     pub(crate) folder: PathBuf,
+    /// Whether `folder` is the checkpoint's own folder.
+    pub(crate) is_folder_there: bool,
     /// Free bytes, and whether the file system is mounted read-only. An error says why both are unknown.
     pub(crate) space: Result<(u64, bool), String>,
     /// How many more files can be created. `None` if the file system has no limit.
     pub(crate) inodes: Option<u64>,
-    /// Why rosrescue cannot write into the folder. `None` if it can.
-    pub(crate) refused: Option<String>,
+    /// The folder or the checkpoint, if rosrescue cannot write it, and why.
+    pub(crate) refused: Option<(PathBuf, String)>,
     /// Type and source of the file system, such as `ext4` and `/dev/sda1`.
     pub(crate) mount: Option<(String, String)>,
     /// Another rosrescue that uses the checkpoint.
@@ -42,20 +44,23 @@ impl CheckpointDisk {
             let is_read_only = space.f_flag.contains(StatVfsMountFlags::RDONLY);
             (space.f_bavail.saturating_mul(space.f_frsize), is_read_only)
         });
-        let may_write = |path: &Path| rustix::fs::access(path, Access::WRITE_OK);
-        let is_missing = |error: &rustix::io::Errno| *error == rustix::io::Errno::NOENT;
-        let refused = rustix::fs::access(&folder, Access::WRITE_OK | Access::EXEC_OK).err();
-        let refused =
-            refused.or_else(|| may_write(&whole).err().filter(|error| !is_missing(error)));
+        let refused = |path: &Path, access| {
+            let error = rustix::fs::access(path, access).err()?;
+            let is_missing = error == rustix::io::Errno::NOENT;
+            (!is_missing).then(|| (path.to_owned(), io::Error::from(error).to_string()))
+        };
+        let refused = refused(&folder, Access::WRITE_OK | Access::EXEC_OK)
+            .or_else(|| refused(&whole, Access::WRITE_OK));
         Self {
             mount: mount_of(&folder),
             holder: checkpoint_store::holder_of(&whole),
             is_folder: whole.is_dir(),
+            is_folder_there: whole.parent().is_some_and(Path::is_dir),
             checkpoint: whole,
             folder,
             space,
             inodes,
-            refused: refused.map(|error| io::Error::from(error).to_string()),
+            refused,
         }
     }
 }
@@ -85,6 +90,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let disk = CheckpointDisk::inspect(folder.path().join("a/b/checkpoint"));
         assert_eq!(disk.folder, folder.path().canonicalize().unwrap());
+        assert!(!disk.is_folder_there);
+        assert!(CheckpointDisk::inspect(folder.path().join("checkpoint")).is_folder_there);
         assert!(disk.space.unwrap().0 > 0);
         assert!(disk.mount.is_some() && disk.holder.is_none() && disk.refused.is_none());
         assert!(CheckpointDisk::inspect(folder.path().to_owned()).is_folder);

@@ -62,11 +62,20 @@ impl Findings {
                 format!("`sudo mount -o remount,rw $(df --output=target {folder} | tail -n 1)`");
             return self.bad(SUBJECT, format!("{folder} is mounted read-only"), todo);
         }
-        if let Some(why) = &disk.refused {
+        if let Some((refused, why)) = &disk.refused {
+            let own = disk.checkpoint.parent().unwrap_or(&disk.folder).display();
+            let command = match disk.is_folder_there {
+                // The folder that refuses may belong to the system.
+                false => format!("sudo install -d -o $(id -un) {own}"),
+                // The files beside the checkpoint begin with its name.
+                true if *refused == disk.checkpoint => format!("sudo chown $(id -un) {path}*"),
+                true => format!("sudo chown $(id -un) {own}"),
+            };
             let todo = format!(
-                "`sudo chown $(id -un) {folder}` as the user of rosrescue, or choose another --checkpoint than {path}"
+                "`{command}` as the user of rosrescue, or choose another --checkpoint than {path}"
             );
-            return self.bad(SUBJECT, format!("{folder} cannot be written: {why}"), todo);
+            let what = format!("{} cannot be written: {why}", refused.display());
+            return self.bad(SUBJECT, what, todo);
         }
         if let Some(files) = disk.inodes.filter(|files| *files < FEW_INODES) {
             let what = format!("{folder}: {files} more files can be created (inodes, `df -i`)");

@@ -59,7 +59,8 @@ fn robot() -> SetupFacts {
         node_hosts: Vec::new(),
         disk: CheckpointDisk {
             checkpoint: PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml"),
-            folder: PathBuf::from("/home/r"),
+            folder: PathBuf::from("/home/r/.ros/log"),
+            is_folder_there: true,
             space: Ok((10 << 30, false)),
             inodes: Some(1 << 20),
             refused: None,

@@ -88,7 +88,7 @@ fn another_computer_of_the_robot() {
         facts.elsewhere = Some(rosrescue(None));
         facts.elsewhere_host = Some(host("base", "10.0.0.9", false));
         facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
-        facts.disk.refused = Some("denied".to_owned());
+        facts.disk.refused = Some(("/data".into(), "denied".to_owned()));
         facts.units.clear();
     };
     assert_eq!(findings_of(elsewhere), []);

@@ -7,7 +7,7 @@ use super::{
         Severity::{Note, Problem, Warning},
         facts::SetupFacts,
     },
-    findings_of, one,
+    findings_of, one, todo,
 };
 
 #[test]
@@ -38,14 +38,6 @@ fn where_the_checkpoint_goes() {
     one(Problem, "checkpoint", "I/O error", |facts| {
         facts.disk.space = Err("I/O error".to_owned());
     });
-    one(
-        Problem,
-        "checkpoint",
-        "cannot be written: Permission denied",
-        |facts| {
-            facts.disk.refused = Some("Permission denied".to_owned());
-        },
-    );
     one(Note, "checkpoint", "is in memory", |facts| {
         mount(facts, "tmpfs", "tmpfs")
     });
@@ -65,6 +57,29 @@ fn where_the_checkpoint_goes() {
             mount(facts, "ext4", "/dev/mmcblk0p2");
         },
     );
+}
+
+#[test]
+fn the_advice_for_a_path_without_permission_changes_no_folder_of_the_system() {
+    let checkpoint = "/home/r/.ros/log/latest-chkpt.yaml";
+    for (refused, is_folder_there, command) in [
+        ("/home/r/.ros/log", true, "chown $(id -un) /home/r/.ros/log"),
+        (
+            checkpoint,
+            true,
+            "chown $(id -un) /home/r/.ros/log/latest-chkpt.yaml*",
+        ),
+        ("/", false, "install -d -o $(id -un) /home/r/.ros/log"),
+    ] {
+        let refuse = |facts: &mut SetupFacts| {
+            facts.disk.refused = Some((refused.into(), "Permission denied".to_owned()));
+            facts.disk.is_folder_there = is_folder_there;
+        };
+        let words = format!("{refused} cannot be written: Permission denied");
+        one(Problem, "checkpoint", &words, refuse);
+        let todo = todo(refuse);
+        assert!(todo.starts_with(&format!("`sudo {command}` as")), "{todo}");
+    }
 }
 
 #[test]
