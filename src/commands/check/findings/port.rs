@@ -44,10 +44,17 @@ impl Findings {
                 );
                 if version != facts.version {
                     let own = facts.version;
+                    let restart = match pids(&taken.by) {
+                        Ok(pids) => format!("when the robot is at rest, `kill {pids}`, and start it again"),
+                        Err(hint) => hint.to_owned(),
+                    };
                     self.note(
                         "port",
                         format!("the running rosrescue is {version}, this program is {own}"),
-                        format!("when the robot is at rest, {}, and start it again", stop(&taken.by)),
+                        format!(
+                            "a service: `sudo systemctl kill --signal=KILL --kill-who=main rosrescue.service`. \
+                             Otherwise {restart}"
+                        ),
                     );
                 }
                 if let Some(why) = unprotected {
@@ -77,6 +84,17 @@ impl Findings {
                     ),
                 );
             }
+            Responder::Silent => self.bad(
+                "port",
+                format!("{number} is in use by a program that does not answer: {by}"),
+                match pids(&taken.by) {
+                    Ok(pids) => format!(
+                        "`kill -CONT {pids}` continues it if it is stopped. If that does not help, `kill -KILL \
+                         {pids}`, and start it again"
+                    ),
+                    Err(hint) => hint.to_owned(),
+                },
+            ),
             _ => self.bad(
                 "port",
                 format!("{number} is in use by a program that is not a master: {by}"),
@@ -92,12 +110,20 @@ impl Findings {
 
 /// How to stop the processes that have a port.
 fn stop(processes: &[Process]) -> String {
-    let pids: Vec<_> = processes
-        .iter()
-        .map(|process| process.pid.to_string())
-        .collect();
-    match pids.as_slice() {
-        [] => "`sudo rosrescue check` names the process".to_owned(),
-        pids => format!("stop it: `kill {}`", pids.join(" ")),
+    match pids(processes) {
+        Ok(pids) => format!("stop it: `kill {pids}`"),
+        Err(hint) => hint.to_owned(),
+    }
+}
+
+/// The ids of the processes that have a port, as arguments of `kill`, or else how to find out what has it. systemd, which
+/// also holds the port of a socket unit, is left out.
+fn pids(processes: &[Process]) -> Result<String, &'static str> {
+    let others = processes.iter().filter(|it| it.name != "systemd");
+    let pids: Vec<_> = others.map(|it| it.pid.to_string()).collect();
+    match pids.is_empty() {
+        false => Ok(pids.join(" ")),
+        true if processes.is_empty() => Err("`sudo rosrescue check` names the process"),
+        true => Err("`systemctl list-sockets` names the socket unit: stop that"),
     }
 }

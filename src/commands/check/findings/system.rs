@@ -32,7 +32,13 @@ impl Findings {
         const SUBJECT: &str = "checkpoint";
         let (path, folder) = (disk.checkpoint.display(), disk.folder.display());
         let runs = port.and_then(|port| port.taken.as_ref());
-        let runs = runs.is_some_and(|taken| matches!(taken.server, Responder::Rosrescue { .. }));
+        // One that does not answer is a finding about the port.
+        let runs = runs.is_some_and(|taken| {
+            matches!(
+                taken.server,
+                Responder::Rosrescue { .. } | Responder::Silent
+            )
+        });
         if let (Some(holder), false) = (disk.holder, runs) {
             let who = holder
                 .pid

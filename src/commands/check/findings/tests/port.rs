@@ -1,12 +1,14 @@
 //! Who has the port.
 
+use checkpoint_store::LockHolder;
+
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
-        facts::PortInUse,
+        facts::{PortInUse, SetupFacts},
         ros::Responder,
     },
-    one, port, process, rosrescue, taken,
+    one, port, process, rosrescue, taken, todo,
 };
 
 #[test]
@@ -62,4 +64,31 @@ fn who_has_the_port() {
             facts.masters = vec![process(9, "rosmaster", 12000)];
         },
     );
+}
+
+#[test]
+fn a_stopped_rosrescue_is_continued() {
+    let stopped = |facts: &mut SetupFacts| {
+        port(facts).taken = taken(Responder::Silent);
+        facts.disk.holder = Some(LockHolder { pid: Some(7) });
+    };
+    let words = "a program that does not answer: who (process 7, port 11311)";
+    one(Problem, "port", words, stopped);
+    let todo = todo(stopped);
+    assert!(todo.starts_with("`kill -CONT 7` continues"), "{todo}");
+}
+
+#[test]
+fn systemd_is_never_stopped() {
+    let [systemd, own] = [process(1, "systemd", 11311), process(8, "rosrescue", 11311)];
+    for (server, by, command) in [
+        (rosrescue(None), vec![systemd.clone(), own], "`kill 8`"),
+        (Responder::Other, vec![systemd], "`systemctl list-sockets`"),
+    ] {
+        let todo = todo(|facts| {
+            port(facts).taken = Some(PortInUse { by, server });
+            facts.version = "2.0.0";
+        });
+        assert!(todo.contains(command) && !todo.contains("kill 1"), "{todo}");
+    }
 }
