@@ -49,15 +49,12 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
     finish(args, findings)
 }
 
-/// What the rosrescue that runs already, if there is one, says about the robot's nodes.
-async fn robot(args: &CheckArgs) -> Vec<Finding> {
+/// What the rosrescue that runs already, if there is one, says about the robot.
+async fn robot(args: &CheckArgs) -> Option<Finding> {
     let uri = std::env::var("ROSRESCUE_URI").ok();
-    let Ok(mut running) = Running::find(&TargetArgs { uri }) else {
-        return Vec::new();
-    };
+    let mut running = Running::find(&TargetArgs { uri }).ok()?;
     running.address.port = args.port.unwrap_or(running.address.port);
-    let status = running.status().await;
-    status.map_or_else(|_| Vec::new(), |status| robot::findings(&status))
+    robot::find_trouble(&running).await
 }
 
 fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, CommandFailure> {

@@ -43,10 +43,7 @@ pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, Comman
         found.missing.retain(|link| before.missing.contains(link));
     }
     let mut findings = found.findings();
-    // A bare master has no status.
-    if let Ok(status) = running.status().await {
-        findings.extend(robot::findings(&status));
-    }
+    findings.extend(robot::find_trouble(&running).await);
     Ok(findings)
 }
 

@@ -1,47 +1,73 @@
-//! What a running rosrescue says about the robot's nodes.
+//! What a running rosrescue says about the robot.
 
 use super::{Finding, Severity};
 use crate::{
-    commands::counted,
-    status::summary::{Status, shortened},
+    commands::{CommandFailure, running::Running},
+    status::condition::Condition,
 };
 
-/// The nodes that are in trouble.
-pub(super) fn findings(status: &Status) -> Vec<Finding> {
-    let nodes = &status.nodes;
-    let finding = |what, todo: String| Finding {
-        severity: Severity::Problem,
-        subject: "nodes",
-        what,
-        todo,
-    };
-    let mut all = Vec::new();
-    if !nodes.dead_nodes.is_empty() {
-        let (count, names) = (nodes.dead_nodes.len(), nodes.with_times(&nodes.dead_nodes));
-        let what = format!(
-            "{} died without unregistering: {names}",
-            counted(count, "node")
-        );
-        let todo = "restart these nodes, or unregister them: `rosnode cleanup`";
-        all.push(finding(what, todo.to_owned()));
+const SUBJECT: &str = "robot";
+
+/// The condition of the robot, unless all is well.
+pub(super) async fn find_trouble(running: &Running) -> Option<Finding> {
+    match running.status().await {
+        Ok(status) => judge_condition(&status.condition),
+        Err(CommandFailure::Failed(why)) => Some(Finding {
+            severity: Severity::Warning,
+            subject: SUBJECT,
+            what: why,
+            todo: String::new(),
+        }),
+        // No rosrescue runs. A bare master has no status.
+        Err(_) => None,
     }
-    if !nodes.unregistered_nodes.is_empty() {
-        let names = nodes.unregistered_nodes.iter().map(ToString::to_string);
-        let names: Vec<_> = names.collect();
-        let what = format!(
-            "{} died, now unregistered: {}",
-            counted(names.len(), "node"),
-            shortened(&names)
+}
+
+fn judge_condition(condition: &Condition) -> Option<Finding> {
+    // Calls pass and are recorded, but there is something to do, such as for a guardian that has ended.
+    let works = condition.is_protected() && condition.name == condition.apart_from_nodes;
+    (!condition.is_good()).then(|| Finding {
+        severity: match works {
+            true => Severity::Warning,
+            false => Severity::Problem,
+        },
+        subject: SUBJECT,
+        what: format!("{}: {}", condition.title(), condition.text),
+        todo: condition.action.clone().unwrap_or_default(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::condition::ConditionName;
+
+    #[test]
+    fn what_the_status_says_is_a_finding() {
+        let finding = |name, apart_from_nodes, action: Option<&str>| {
+            judge_condition(&Condition {
+                name,
+                apart_from_nodes,
+                since: 0.0,
+                text: "Nodes work as usual.".to_owned(),
+                action: action.map(str::to_owned),
+            })
+        };
+        let good = ConditionName::Protected;
+        assert_eq!(finding(good, good, None), None);
+        let warning = finding(good, good, Some("restart it.")).unwrap();
+        assert_eq!(warning.severity, Severity::Warning);
+        let of = ConditionName::CrashLoop;
+        let problem = finding(of, of, Some("find the reason.")).unwrap();
+        assert_eq!(problem.severity, Severity::Problem);
+        assert_eq!(
+            (&*problem.what, &*problem.todo),
+            (
+                "master crash loop: Nodes work as usual.",
+                "find the reason."
+            )
         );
-        all.push(finding(what, "restart these nodes".to_owned()));
+        let dead = finding(ConditionName::NodesDead, good, None).unwrap();
+        assert_eq!(dead.severity, Severity::Problem);
     }
-    for node in &nodes.misaddressed_nodes {
-        let (name, api, from) = (&node.node, &node.api, node.from);
-        let what = format!(
-            "{name} has registered from {from} as {api}, so no other computer can reach it"
-        );
-        let todo = format!("on {from}: `export ROS_IP={from}`, and restart the node");
-        all.push(finding(what, todo));
-    }
-    all
 }

@@ -35,7 +35,6 @@ pub(super) enum Responder {
     Rosrescue {
         version: String,
         uri: String,
-        unprotected: Option<String>,
         /// The master behind that rosrescue. `None` if it runs as `core`.
         proxied: Option<MasterUri>,
         /// Clients that bypass rosrescue.
@@ -56,7 +55,6 @@ pub(super) enum Responder {
 struct Page {
     version: String,
     uri: String,
-    unprotected: Option<String>,
     mode: String,
     master: String,
     bypassing: Vec<String>,
@@ -74,7 +72,6 @@ impl Responder {
             return Self::Rosrescue {
                 version: page.version,
                 uri: page.uri,
-                unprotected: page.unprotected,
                 proxied: MasterUri::parse(&page.master)
                     .ok()
                     .filter(|_| page.mode == "proxy"),

@@ -64,7 +64,7 @@ fn nodes_that_died_come_before_everything_else() {
     assert!(bad.stdout.contains("Other nodes work as usual"), "{bad:?}");
     let live = Tool::rosrescue(&robot.scratch, port, &["check", "--live"]);
     assert_eq!(live.exit(), 1, "{live:?}");
-    assert!(live.stdout.starts_with("PROBLEM  nodes"), "{live:?}");
+    assert!(live.stdout.starts_with("PROBLEM  robot"), "{live:?}");
     assert!(live.stdout.contains(said), "{live:?}");
     let metrics = page(&robot.client(), "/metrics");
     for line in [

@@ -6,7 +6,6 @@ use super::{
         ros::Responder,
     },
     Findings, named,
-    todo::delete_logs,
 };
 
 impl Findings {
@@ -33,11 +32,7 @@ impl Findings {
             all => all.iter().map(named).collect::<Vec<_>>().join(", "),
         };
         match &taken.server {
-            Responder::Rosrescue {
-                version,
-                unprotected,
-                ..
-            } => {
+            Responder::Rosrescue { version, .. } => {
                 self.ok(
                     "port",
                     format!("{number}: rosrescue {version} runs here: {by}"),
@@ -54,18 +49,6 @@ impl Findings {
                         format!(
                             "a service: `sudo systemctl kill --signal=KILL --kill-who=main rosrescue.service`. \
                              Otherwise {restart}"
-                        ),
-                    );
-                }
-                if let Some(why) = unprotected {
-                    let folder = facts.disk.folder.display();
-                    self.bad(
-                        "checkpoint",
-                        format!("the running one is unprotected: {why}"),
-                        format!(
-                            "`df -h {folder}` shows if the disk is full; {}. Or start rosrescue with another \
-                             --checkpoint",
-                            delete_logs()
                         ),
                     );
                 }

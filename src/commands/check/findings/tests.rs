@@ -122,11 +122,10 @@ fn taken(server: Responder) -> Option<PortInUse> {
     })
 }
 
-fn rosrescue(unprotected: Option<&str>) -> Responder {
+fn rosrescue() -> Responder {
     Responder::Rosrescue {
         version: "1.0.0".to_owned(),
         uri: "http://robot:11311/".to_owned(),
-        unprotected: unprotected.map(str::to_owned),
         proxied: None,
         bypassing: Vec::new(),
     }

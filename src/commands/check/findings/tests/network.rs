@@ -19,7 +19,7 @@ fn a_robot_without_problems_has_no_findings() {
     assert!(from_facts(&robot()).len() >= 8);
     // There is no finding either while rosrescue runs, with its own master and its checkpoint in use.
     let found = findings_of(|facts| {
-        port(facts).taken = taken(rosrescue(None));
+        port(facts).taken = taken(rosrescue());
         facts.disk.holder = Some(LockHolder { pid: Some(7) });
         facts.node_hosts = vec![(host("robot", "10.0.0.7", true), vec!["/a".to_owned()])];
     });
@@ -85,7 +85,7 @@ fn another_computer_of_the_robot() {
     let elsewhere = |facts: &mut SetupFacts| {
         facts.env.master_uri = Some("http://base:11311/".to_owned());
         facts.master_host = Some(host("base", "10.0.0.9", false));
-        facts.elsewhere = Some(rosrescue(None));
+        facts.elsewhere = Some(rosrescue());
         facts.elsewhere_host = Some(host("base", "10.0.0.9", false));
         facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
         facts.disk.refused = Some(("/data".into(), "denied".to_owned()));

@@ -44,16 +44,8 @@ fn who_has_the_port() {
         "port",
         "the running rosrescue is 1.0.0, this program is 2.0.0",
         |facts| {
-            port(facts).taken = taken(rosrescue(None));
+            port(facts).taken = taken(rosrescue());
             facts.version = "2.0.0";
-        },
-    );
-    one(
-        Problem,
-        "checkpoint",
-        "unprotected: the disk is full",
-        |facts| {
-            port(facts).taken = taken(rosrescue(Some("the disk is full")));
         },
     );
     one(
@@ -82,7 +74,7 @@ fn a_stopped_rosrescue_is_continued() {
 fn systemd_is_never_stopped() {
     let [systemd, own] = [process(1, "systemd", 11311), process(8, "rosrescue", 11311)];
     for (server, by, command) in [
-        (rosrescue(None), vec![systemd.clone(), own], "`kill 8`"),
+        (rosrescue(), vec![systemd.clone(), own], "`kill 8`"),
         (Responder::Other, vec![systemd], "`systemctl list-sockets`"),
     ] {
         let todo = todo(|facts| {

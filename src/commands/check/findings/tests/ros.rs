@@ -69,7 +69,7 @@ fn the_master_of_a_proxy() {
         proxy(facts, Responder::Other)
     });
     one(Problem, "master", "is a rosrescue", |facts| {
-        proxy(facts, rosrescue(None))
+        proxy(facts, rosrescue())
     });
 }
 
