@@ -49,29 +49,42 @@ const PATHS: [&str; 4] = ["PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ROS_PACKAGE_
 
 pub(super) async fn run(args: &InstallArgs) -> Result<Exit, CommandFailure> {
     let paths = UnitPaths::new(&args.scope)?;
-    needs_root(&paths, &args.scope)?;
-    carry_out(&install(args, &paths).await?, &args.scope)
+    let program = std::env::current_exe().map_err(|error| {
+        CommandFailure::Failed(format!("cannot find this program's file: {error}"))
+    })?;
+    let with_root = as_system_program(&program).unwrap_or_else(again_with_sudo);
+    needs_root(&paths, &args.scope, &with_root)?;
+    carry_out(&install(args, &paths, &program).await?, &args.scope)
 }
 
 pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, CommandFailure> {
     let paths = UnitPaths::new(&args.scope)?;
-    needs_root(&paths, &args.scope)?;
+    needs_root(&paths, &args.scope, &again_with_sudo())?;
     carry_out(&uninstall(&paths), &args.scope)
 }
 
-/// Refuses a service of the computer without root, before any other obstacle is reported.
-fn needs_root(paths: &UnitPaths, args: &ScopeArgs) -> Result<(), CommandFailure> {
+/// Refuses a service of the computer without root, before any other obstacle is reported. `with_root` is what to run
+/// instead.
+fn needs_root(paths: &UnitPaths, args: &ScopeArgs, with_root: &str) -> Result<(), CommandFailure> {
     if paths.user || args.dry_run || rustix::process::geteuid().is_root() {
         return Ok(());
     }
-    let words: Vec<_> = std::env::args().skip(1).collect();
     Err(CommandFailure::Usage(format!(
-        "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
-        words.join(" ")
+        "a service of this computer needs root: run {with_root}, or use --user for a service of your own"
     )))
 }
 
-async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges, CommandFailure> {
+/// The command that runs this command line as root.
+fn again_with_sudo() -> String {
+    let words: Vec<_> = std::env::args().skip(1).collect();
+    format!("`sudo rosrescue {}`", words.join(" "))
+}
+
+async fn install(
+    args: &InstallArgs,
+    paths: &UnitPaths,
+    program: &Path,
+) -> Result<SystemChanges, CommandFailure> {
     let caller = caller_environment();
     let core = vec!["core".to_owned()];
     let command = if args.service.is_empty() {
@@ -99,10 +112,6 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         settings.extend(given(&PATHS));
     }
     let run_as = account(args, paths, &caller)?;
-    let program = std::env::current_exe();
-    let program = program.map_err(|error| {
-        CommandFailure::Failed(format!("cannot find this program's file: {error}"))
-    })?;
 
     let mut plan = SystemChanges::default();
     if let Some(user) = &run_as
@@ -113,8 +122,12 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
             "shown for {user}. Without sudo, name the user that runs the service, as in --run-as robot"
         ));
     }
-    plan.obstacles
-        .extend(misplaced(&program).filter(|_| !paths.user));
+    if let Some(commands) = as_system_program(program).filter(|_| !paths.user) {
+        plan.obstacles.push(format!(
+            "{} is not in a system folder: run {commands}",
+            program.display()
+        ));
+    }
     if let Some(obstacle) = other_master(&settings, &service.advertised).await {
         match args.other_master {
             true => plan.notes.push(obstacle),
@@ -130,7 +143,7 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
     let old = dropin.unwrap_or_default();
     let all_disabled = [&disabled[..], &units::disabled(&old)].concat();
     let robot = UnitSettings {
-        program: &program,
+        program,
         command,
         run_as: run_as.as_deref(),
         settings: &settings,
@@ -138,7 +151,7 @@ async fn install(args: &InstallArgs, paths: &UnitPaths) -> Result<SystemChanges,
         before: &before,
         disabled: &all_disabled,
     };
-    let [new_unit, new_socket_unit] = match paths.is_packaged(&program) {
+    let [new_unit, new_socket_unit] = match paths.is_packaged(program) {
         true => [None, None],
         false => units::units(paths.user).map(Some),
     };
@@ -361,15 +374,16 @@ fn move_note(from: &Path, to: &Path, run_as: Option<&str>) -> String {
     )
 }
 
-/// Why root's service must not run the program at this path: its owner could replace it.
-fn misplaced(program: &Path) -> Option<String> {
+/// The commands that first copy the program to a system folder, unless it is in one. Root's service must not run it from
+/// elsewhere, because its owner could replace it, and sudo does not find it there.
+fn as_system_program(program: &Path) -> Option<String> {
     let folders = ["/usr", "/opt", "/bin"];
     let is_safe = folders.iter().any(|folder| program.starts_with(folder));
-    let program = program.display();
     (!is_safe).then(|| {
         format!(
-            "{program} is not in a system folder: run `sudo install -m 755 {program} /usr/local/bin/`, then \
-             `sudo rosrescue install`"
+            "`sudo install -m 755 {} /usr/local/bin/`, then {}",
+            program.display(),
+            again_with_sudo()
         )
     })
 }

@@ -62,13 +62,13 @@ pub(super) fn carry_out(plan: &SystemChanges, args: &ScopeArgs) -> Result<Exit, 
         }
     }
     for change in &plan.changes {
-        change.apply()?;
+        change.apply(args.user)?;
     }
     Ok(Exit::Good)
 }
 
 impl Change {
-    fn apply(&self) -> Result<(), CommandFailure> {
+    fn apply(&self, user: bool) -> Result<(), CommandFailure> {
         match self {
             Self::Write { path, text } => {
                 let folder = path.parent().unwrap_or(path);
@@ -92,11 +92,17 @@ impl Change {
             }
             Self::Run { command } => {
                 let said = command.join(" ");
+                let (journal, undo) = match user {
+                    true => (
+                        "journalctl --user -u rosrescue",
+                        "rosrescue uninstall --user",
+                    ),
+                    false => ("journalctl -u rosrescue", "sudo rosrescue uninstall"),
+                };
                 match run_command(command, Stdio::inherit()) {
                     Ok(status) if status.success() => Ok(()),
                     Ok(status) => Err(CommandFailure::Failed(format!(
-                        "`{said}` failed ({status}): see above, or `journalctl -u rosrescue`. `rosrescue uninstall` \
-                         undoes what was done"
+                        "`{said}` failed ({status}): see above, or `{journal}`. `{undo}` undoes what was done"
                     ))),
                     Err(error) => Err(CommandFailure::Failed(format!("`{said}`: {error}"))),
                 }
@@ -139,4 +145,24 @@ pub(super) fn run_command(words: &[String], errors: Stdio) -> io::Result<system:
     let mut command = system::Command::new(program);
     let command = command.args(arguments).stdin(Stdio::null());
     command.stdout(Stdio::null()).stderr(errors).status()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_command_is_undone_where_it_was_done() {
+        let change = Change::Run {
+            command: vec!["false".to_owned()],
+        };
+        for (user, undo) in [
+            (true, "`rosrescue uninstall --user` undoes"),
+            (false, "`sudo rosrescue uninstall` undoes"),
+        ] {
+            let failed = change.apply(user).unwrap_err().to_string();
+            assert!(failed.contains(undo), "{failed}");
+            assert_eq!(failed.contains("journalctl --user"), user, "{failed}");
+        }
+    }
 }
