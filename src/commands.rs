@@ -143,17 +143,15 @@ fn note(sentence: &str) {
     eprint_line(&format!("rosrescue: {sentence}"));
 }
 
-/// Prints a line to standard error. No command prints there in another way.
-#[expect(clippy::print_stderr, reason = "only printable text")]
+/// Prints a line to standard error. No command prints there in another way. A closed terminal or pipe is not an error:
+/// `drill` still has to clean up.
 fn eprint_line(line: &str) {
-    eprintln!("{}", Printable::line(line));
+    let _ = writeln!(io::stderr(), "{}", Printable::line(line));
 }
 
 /// Asks a question at the terminal. Returns whether the answer is yes.
-#[expect(clippy::print_stderr, reason = "only printable text")]
 fn agrees(question: &str) -> io::Result<bool> {
-    eprint!("{} [y/N] ", Printable::line(question));
-    io::stderr().flush()?;
+    write!(io::stderr(), "{} [y/N] ", Printable::line(question))?;
     let mut answer = String::new();
     io::stdin().read_line(&mut answer)?;
     Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))

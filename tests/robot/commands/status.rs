@@ -6,8 +6,8 @@ use std::process::Command;
 use std::thread;
 
 use crate::support::{
-    FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, State, Tool, eventually, free_port,
-    page, params, port_of,
+    FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, State, Tool, command, eventually,
+    free_port, page, params, port_of,
 };
 
 /// rosrescue shows pages only under the names of its own computer, because of pages in browsers. A command is none.
@@ -241,4 +241,14 @@ fn it_says_that_nodes_wait_for_a_first_master() {
         let ran = Tool::rosrescue(&scratch, rescue.port(), &["status"]);
         ran.exit() == 1 && ran.stdout.contains("Calls wait") && ran.stdout.contains("\nto do ")
     });
+}
+
+/// As with `rosrescue … 2>&1 | head -n 1`, or when the terminal was closed.
+#[test]
+fn a_command_whose_stderr_is_closed_keeps_its_exit_status() {
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let scratch = Scratch::new();
+    let mut status = command(&scratch, free_port(), &["status"]);
+    assert_eq!(status.stderr(writer).status().unwrap().code(), Some(3));
 }
