@@ -7,6 +7,7 @@ mod check;
 mod completions;
 mod diff;
 mod drill;
+mod end_signals;
 mod files;
 mod handover;
 mod history;

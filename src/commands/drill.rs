@@ -17,7 +17,6 @@ use std::{
 use checkpoint_store::history;
 use ros1_master::xmlrpc::Value;
 use tokio::{
-    signal::unix::{SignalKind, signal},
     task::JoinHandle,
     time::{sleep, timeout},
 };
@@ -31,7 +30,10 @@ use self::{
     topics::{Topic, Usefulness},
     verdict::{DrillVerdict, names},
 };
-use super::{CommandFailure, Exit, agrees, counted, eprint_line, print, running::Running};
+use super::{
+    CommandFailure, Exit, agrees, counted, end_signals::EndSignals, eprint_line, print,
+    running::Running,
+};
 use crate::{
     cli::{DrillArgs, Victim},
     process,
@@ -71,15 +73,11 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, CommandFailure> {
         topics: Vec::new(),
         calls: None,
     };
-    let signals = [SignalKind::interrupt(), SignalKind::terminate()].map(signal);
-    let [Ok(mut interrupt), Ok(mut terminate)] = signals else {
-        return Err(CommandFailure::Failed("cannot receive signals".to_owned()));
-    };
+    let mut ends = EndSignals::new()?;
     let stop = CancellationToken::new();
     let ended = tokio::select! {
         verdict = drill.run(&status, &stop) => verdict,
-        _ = interrupt.recv() => Err(interrupted()),
-        _ = terminate.recv() => Err(interrupted()),
+        () = ends.received() => Err(interrupted()),
     };
     // Each caller first finishes its present call, so nothing is registered after this.
     stop.cancel();

@@ -9,12 +9,14 @@ use std::{
 use ros1_master::master::Counts;
 use serde::Serialize;
 use tokio::{
-    signal::unix::{Signal, SignalKind, signal},
+    signal::unix::{SignalKind, signal},
     time::{Instant, MissedTickBehavior, interval},
 };
 
 use super::{
-    CommandFailure, Exit, note, print_line,
+    CommandFailure, Exit,
+    end_signals::EndSignals,
+    note, print_line,
     running::Running,
     terminal::{self, Terminal},
 };
@@ -254,34 +256,6 @@ impl Lines for Top {
 
 display_lines!(Top);
 
-/// The signals that end the command.
-struct Ends(Vec<Signal>);
-
-impl Ends {
-    fn new() -> Result<Self, CommandFailure> {
-        let kinds = [
-            SignalKind::interrupt(),
-            SignalKind::terminate(),
-            SignalKind::hangup(),
-        ];
-        let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>();
-        signals
-            .map(Self)
-            .map_err(|error| CommandFailure::Failed(format!("no signals: {error}")))
-    }
-
-    async fn come(&mut self) {
-        std::future::poll_fn(|context| {
-            let come = |signal: &mut Signal| signal.poll_recv(context).is_ready();
-            match self.0.iter_mut().any(come) {
-                true => std::task::Poll::Ready(()),
-                false => std::task::Poll::Pending,
-            }
-        })
-        .await;
-    }
-}
-
 pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
     // The first status is read before the terminal is taken over, so that an error is printed normally.
@@ -289,7 +263,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     if let Err(failure) = status {
         return Err(failure);
     }
-    let mut ends = Ends::new()?;
+    let mut ends = EndSignals::new()?;
     let mut resized = signal(SignalKind::window_change())
         .map_err(|error| CommandFailure::Failed(format!("no signals: {error}")))?;
     let terminal = match args.json {
@@ -337,7 +311,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
         loop {
             tokio::select! {
                 _ = seconds.tick() => break,
-                () = ends.come() => return Ok(Exit::Good),
+                () = ends.received() => return Ok(Exit::Good),
                 _ = resized.recv() => if let Some(terminal) = &terminal {
                     terminal.draw(&shown);
                 },

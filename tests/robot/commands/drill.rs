@@ -290,7 +290,7 @@ fn an_interrupted_drill_leaves_nothing_behind() {
     let robot = Robot::start(Mode::Core);
     let _talker = robot.node(Library::Roscpp, "talker", &["50", "quiet"]);
     let before = robot.settled_state();
-    for which in [Signal::INT, Signal::TERM] {
+    for which in [Signal::INT, Signal::TERM, Signal::HUP] {
         let options = ["--no-kill", "--seconds", "600", "--topic", "chatter"];
         let mut drill = drill(&robot.scratch, robot.port(), &options);
         drill.wait_line("that it watches", |line| line.starts_with("watching for"));
