@@ -91,6 +91,9 @@ pub struct StatusArgs {
 /// Options of `rosrescue check`.
 #[derive(Args, Clone, Debug)]
 pub struct CheckArgs {
+    /// The running rosrescue.
+    #[command(flatten)]
+    pub target: TargetArgs,
     /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
     #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]

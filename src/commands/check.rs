@@ -21,7 +21,7 @@ use serde::Serialize;
 use self::facts::SetupFacts;
 use super::{CommandFailure, Exit, counted, eprint_line, print, running::Running};
 use crate::{
-    cli::{CheckArgs, OptionValue, TargetArgs},
+    cli::{CheckArgs, OptionValue},
     printable::{Lines, Page, display_lines, line},
     ros_env::MasterUri,
 };
@@ -43,18 +43,29 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
         never = slow => match never {},
     };
     let mut findings = findings::from_facts(&facts);
-    findings.extend(robot(args).await);
+    findings.extend(robot(args).await?);
     findings.extend(planting::find_unsafe_folder(&facts.disk.checkpoint));
     findings.extend(sources(&args.settings));
     finish(args, findings)
 }
 
 /// What the rosrescue that runs already, if there is one, says about the robot.
-async fn robot(args: &CheckArgs) -> Option<Finding> {
-    let uri = std::env::var("ROSRESCUE_URI").ok();
-    let mut running = Running::find(&TargetArgs { uri }).ok()?;
-    running.address.port = args.port.unwrap_or(running.address.port);
-    robot::find_trouble(&running).await
+async fn robot(args: &CheckArgs) -> Result<Option<Finding>, CommandFailure> {
+    match find_running(args) {
+        Ok(running) => Ok(robot::find_trouble(&running).await),
+        // A wrong ROS_MASTER_URI is a finding of its own.
+        Err(_) if args.target.uri.is_none() => Ok(None),
+        Err(failure) => Err(failure),
+    }
+}
+
+/// The rosrescue that `--uri` or the port stands for.
+fn find_running(args: &CheckArgs) -> Result<Running, CommandFailure> {
+    let mut running = Running::find(&args.target)?;
+    if let (None, Some(port)) = (&args.target.uri, args.port) {
+        running.address.port = port;
+    }
+    Ok(running)
 }
 
 fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, CommandFailure> {

@@ -13,10 +13,10 @@ use ros1_master::{
 };
 use tokio::{sync::Semaphore, task::JoinSet, time::sleep};
 
-use super::{Finding, Severity, robot};
+use super::{Finding, Severity, find_running, robot};
 use crate::{
-    cli::{CheckArgs, TargetArgs},
-    commands::{CommandFailure, counted, live::Live, running::Running},
+    cli::CheckArgs,
+    commands::{CommandFailure, counted, live::Live},
     nodes::client::{self, Reaction},
     status::summary::shortened,
 };
@@ -31,9 +31,7 @@ const LOOK_AGAIN: Duration = Duration::from_secs(1);
 
 /// Asks the nodes of the running robot.
 pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, CommandFailure> {
-    let uri = std::env::var("ROSRESCUE_URI").ok();
-    let mut running = Running::find(&TargetArgs { uri })?;
-    running.address.port = args.port.unwrap_or(running.address.port);
+    let running = find_running(args)?;
     let mut live = Live::connect(&running).await?;
     let mut found = read_connections(&mut live).await?;
     if !found.missing.is_empty() || !found.silent.is_empty() {
@@ -199,7 +197,8 @@ impl Found {
         {
             let what = format!("{subscriber} is not connected to {topic} of {publisher}");
             let todo = format!(
-                "restart {subscriber}; if that does not help, `rosnode info {publisher} {subscriber}` shows the types"
+                "restart {subscriber}; if that does not help, and the log of {publisher} has `md5sum` or `types do \
+                 not match`, their message types differ"
             );
             all.push(finding(Severity::Problem, what, todo));
         }

@@ -68,9 +68,14 @@ fn a_link_that_was_broken_is_found_and_named() {
         checked.contains("1 node without an answer: /talker_py"),
         "{checked}"
     );
-    let nobody = ["check", "--live", "--port", &free_port().to_string()];
-    assert_eq!(
-        Tool::rosrescue(&robot.scratch, robot.port(), &nobody).exit(),
-        3
-    );
+    let port = free_port();
+    let nobody = ["--port", &port.to_string()];
+    assert_eq!(check(&nobody).exit(), 3);
+    let uri = format!("http://localhost:{}", robot.port());
+    assert_eq!(check(&[&nobody[..], &["--uri", &uri]].concat()).exit(), 0);
+    // What the error advises is possible.
+    let uri = format!("http://localhost:{port}");
+    let nobody = check(&["--uri", &uri]);
+    assert_eq!(nobody.exit(), 3);
+    assert!(nobody.stderr.contains("--uri"), "{nobody:?}");
 }
