@@ -17,6 +17,7 @@ use rescue_core::checkpoint::{
     session,
 };
 use ros1_master::master::{Master, Request};
+use rustix::{fs::Access, io::Errno};
 
 use super::{
     CommandFailure, eprint_line, note,
@@ -90,6 +91,18 @@ async fn checkpoint_of_running() -> Option<PathBuf> {
     Some(running.status().await.ok()?.checkpoint.into())
 }
 
+/// Refuses a checkpoint in use that this user may not read. Otherwise what is kept beside it would seem not to exist.
+pub(super) fn require_access(present: &Path) -> Result<(), CommandFailure> {
+    match rustix::fs::access(present, Access::READ_OK) {
+        Err(Errno::ACCESS) => Err(CommandFailure::Usage(format!(
+            "cannot read `{}`: {}. Run this as the user of rosrescue, or with sudo",
+            present.display(),
+            io::Error::from(Errno::ACCESS)
+        ))),
+        _ => Ok(()),
+    }
+}
+
 /// The checkpoint that `file` stands for: a path, or a name or number from the history.
 pub(super) async fn find(
     file: &Path,
@@ -104,6 +117,7 @@ pub(super) async fn find(
         }
     }
     let present = present(checkpoint).await;
+    require_access(&present)?;
     let listed = list(&present);
     let wanted = file.to_string_lossy();
     let named = |(number, kept): (usize, &Listed)| {

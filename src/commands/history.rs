@@ -18,6 +18,7 @@ use crate::{
 
 pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {
     let present = files::present(&args.checkpoint).await;
+    files::require_access(&present)?;
     let reports = report_file::read(&present);
     let rows = files::list(&present)
         .into_iter()

@@ -18,6 +18,7 @@ pub(super) async fn run(args: &ReportArgs) -> Result<Exit, CommandFailure> {
         }
         None => {
             let present = files::present(&args.checkpoint).await;
+            files::require_access(&present)?;
             let kept = report_file::read(&present).into_iter();
             let reports: Vec<_> = kept.map(|kept| kept.report).collect();
             (format!("beside {}", present.display()), reports)

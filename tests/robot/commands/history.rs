@@ -1,7 +1,9 @@
 //! The kept checkpoints, and `history`.
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::process::Command;
 
 use ros1_master::xmlrpc::Value;
 
@@ -92,13 +94,37 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     assert!(text.contains("restored in a rescue"), "{text}");
     assert_eq!(text.lines().count(), 2 * history(&robot).len());
     // Only the owner may read them.
-    use std::os::unix::fs::PermissionsExt;
     for row in history(&robot) {
         let mode = fs::metadata(row["path"].as_str().unwrap())
             .unwrap()
             .permissions()
             .mode();
         assert_eq!(mode & 0o777, 0o600, "{row}");
+    }
+}
+
+/// A service may run as another user. Needs root.
+#[test]
+fn a_user_without_permission_is_not_told_that_there_is_nothing() {
+    let shared = tempfile::tempdir_in("/tmp").unwrap();
+    let (program, closed) = (
+        shared.path().join("rosrescue"),
+        shared.path().join("closed"),
+    );
+    fs::copy(env!("CARGO_BIN_EXE_rosrescue"), &program).unwrap();
+    fs::create_dir(&closed).unwrap();
+    for (folder, mode) in [(shared.path(), 0o755), (closed.as_path(), 0o700)] {
+        fs::set_permissions(folder, fs::Permissions::from_mode(mode)).unwrap();
+    }
+    for words in [&["history"][..], &["report"], &["inspect", "rescue-1"]] {
+        let mut other = Command::new("setpriv");
+        other.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+        other.arg(&program).args(words).arg("--checkpoint");
+        other.arg(closed.join("latest-chkpt.yaml")).current_dir("/");
+        let output = other.output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(said.contains("Permission denied"), "{said}");
     }
 }
 
