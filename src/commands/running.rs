@@ -88,8 +88,13 @@ impl Running {
                 env!("CARGO_PKG_VERSION")
             )));
         }
+        // Either program may have a field or a name that the other one does not know.
         serde_json::from_slice(&json).map_err(|error| {
-            CommandFailure::Failed(format!("cannot read the status of {at}: {error}"))
+            CommandFailure::Failed(format!(
+                "cannot read the status of the rosrescue at {at}: {error}. It is version {version}, this program is {}: \
+                 use its own command, or restart it",
+                env!("CARGO_PKG_VERSION")
+            ))
         })
     }
 
@@ -171,4 +176,42 @@ pub(super) async fn is_here(address: &MasterUri) -> bool {
     };
     let here = timeout(ANSWER_LIMIT, connect).await;
     matches!(here, Ok(Ok(true)))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        io::{BufRead, BufReader, Write},
+        net::TcpListener,
+    };
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_status_of_another_version_names_both_versions() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port: listener.local_addr().unwrap().port(),
+        };
+        let older = std::thread::spawn(move || {
+            let mut stream = BufReader::new(listener.accept().unwrap().0);
+            let lines = BufRead::lines(&mut stream).map(Result::unwrap);
+            lines.take_while(|line| !line.is_empty()).for_each(drop);
+            let page = r#"{"schema":1,"version":"0.1.9"}"#;
+            let length = page.len();
+            write!(
+                stream.get_mut(),
+                "HTTP/1.1 200 OK\r\nContent-Length: {length}\r\n\r\n{page}"
+            )
+            .unwrap();
+        });
+        let failed = Running { address }.status().await.unwrap_err();
+        older.join().unwrap();
+        let words = format!(
+            "It is version 0.1.9, this program is {}",
+            env!("CARGO_PKG_VERSION")
+        );
+        assert!(failed.to_string().contains(&words), "{failed}");
+    }
 }
