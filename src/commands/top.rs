@@ -67,9 +67,9 @@ struct Top {
     rescues: u64,
     last_rescues: Vec<Report>,
     late_answers: LateAnswers,
-    /// Number of lines of the terminal.
+    /// Columns and rows of the terminal.
     #[serde(skip)]
-    height: usize,
+    size: (usize, usize),
 }
 
 /// Numbers of calls so far. Two samples give the calls per second.
@@ -90,8 +90,8 @@ impl Sample {
     }
 }
 
-/// Builds the picture of `status`, which was read at `now`.
-fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> Top {
+/// Builds the picture of `status`, which was read at `now`, for a terminal with `size` columns and rows.
+fn top(status: Status, before: Option<&Sample>, now: Instant, size: (usize, usize)) -> Top {
     let calls = status.counter("calls");
     let seconds = before.map(|before| now.duration_since(before.at).as_secs_f64().max(0.1));
     let rate = |calls: u64| seconds.map_or(0.0, |seconds| calls as f64 / seconds);
@@ -152,12 +152,17 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
         rescues: status.rescues,
         last_rescues: status.last_rescues,
         late_answers: status.late_answers,
-        height,
+        size,
     }
 }
 
 impl Lines for Top {
     fn lines(&self, f: &mut Page) -> fmt::Result {
+        let (width, height) = self.size;
+        let wrap = |head: &mut Page, text: &str| {
+            let mut lines = wrapped(text, width).into_iter();
+            lines.try_for_each(|part| line!(head, "{part}"))
+        };
         let mut head = Page::default();
         let Condition {
             since,
@@ -177,9 +182,9 @@ impl Lines for Top {
             self.condition.title(),
             clock::span(self.at - since)
         )?;
-        line!(head, "{text}")?;
+        wrap(&mut head, text)?;
         if let Some(action) = action {
-            line!(head, "To do: {action}")?;
+            wrap(&mut head, &format!("To do: {action}"))?;
         }
         line!(
             head,
@@ -236,7 +241,7 @@ impl Lines for Top {
             "MEAN ms",
             "LONGEST ms"
         )?;
-        for row in self.callers.iter().take(self.height.saturating_sub(taken)) {
+        for row in self.callers.iter().take(height.saturating_sub(taken)) {
             let ms = |ms: Option<f64>| ms.map_or_else(String::new, |ms| format!("{ms:.1}"));
             let caller: String = row.caller.chars().take(31).collect();
             write!(
@@ -255,6 +260,20 @@ impl Lines for Top {
 }
 
 display_lines!(Top);
+
+/// `text` in lines of at most `width` characters, broken at spaces. A longer word has a line of its own.
+fn wrapped(text: &str, width: usize) -> Vec<String> {
+    let mut lines = Vec::<String>::new();
+    for word in text.split(' ') {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= width => {
+                *line += &format!(" {word}");
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
 
 pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
     let running = Running::find(&args.target)?;
@@ -282,11 +301,11 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
         let failed = match status {
             Ok(status) => {
                 let sample = Sample::new(&status, now);
-                let height = match terminal {
-                    Some(_) => terminal::size().1,
-                    None => usize::MAX,
+                let size = match terminal {
+                    Some(_) => terminal::size(),
+                    None => (usize::MAX, usize::MAX),
                 };
-                let top = top(status, before.as_ref(), now, height);
+                let top = top(status, before.as_ref(), now, size);
                 before = Some(sample);
                 shown = match args.json {
                     true => super::json(&top, false)?,
@@ -308,9 +327,14 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
         if args.count.is_some_and(|count| rounds >= count) {
             return failed.map_or(Ok(Exit::Good), Err);
         }
-        loop {
+        let next = async {
+            seconds.tick().await;
+            running.status().await
+        };
+        tokio::pin!(next);
+        status = loop {
             tokio::select! {
-                _ = seconds.tick() => break,
+                status = &mut next => break status,
                 () = ends.received() => return Ok(Exit::Good),
                 _ = resized.recv() => if let Some(terminal) = &terminal {
                     terminal.draw(&shown);
@@ -321,7 +345,20 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
                     None => keys = None,
                 },
             }
-        }
-        status = running.status().await;
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_advice_is_wrapped() {
+        let text = "To do: restart the nodes /a, /b and /camera.";
+        let lines = ["To do: restart the", "nodes /a, /b and", "/camera."];
+        assert_eq!(wrapped(text, 18), lines);
+        assert_eq!(wrapped(text, usize::MAX), [text]);
+        assert_eq!(wrapped("http://nobody.invalid:11311/ a", 5).len(), 2);
     }
 }

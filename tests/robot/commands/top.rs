@@ -1,9 +1,10 @@
 //! `rosrescue top`: a live picture on a terminal, and plain text elsewhere.
 
 use std::process::Command;
+use std::time::Duration;
 
 use crate::support::{
-    Mode, NODES, Process, Robot, Tool, behind, command, eventually, free_port, params,
+    Mode, NODES, Process, Robot, Tool, behind, command, eventually, free_port, params, stop, within,
 };
 
 /// The output of `rosrescue top` on a terminal of `size` after `key` or a signal's number: the last line of the
@@ -112,7 +113,13 @@ fn it_waits_for_a_rosrescue_that_goes_away() {
     let before = top.stdout().len();
     robot.rescue.start_again();
     eventually("it goes on", || top.stdout().len() > before);
-    assert_eq!(top.terminate().code(), Some(0));
+    // The next look begins at once, and takes 5 s.
+    stop(robot.rescue.pid());
+    top.wait_line("that rosrescue does not answer", |line| {
+        line.contains("no rosrescue answers at ")
+    });
+    let ended = within(Duration::from_secs(3), "the end", || top.terminate());
+    assert_eq!(ended.code(), Some(0));
     let nobody = Tool::rosrescue(&robot.scratch, free_port(), &["top"]);
     assert_eq!(nobody.exit(), 3, "{nobody:?}");
 }
