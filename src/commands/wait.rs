@@ -7,7 +7,7 @@ use ros1_master::{
     xmlrpc::{Reply, Value},
 };
 use serde::Serialize;
-use tokio::time::{Instant, sleep_until};
+use tokio::time::{Instant, sleep_until, timeout_at};
 
 use super::{
     CommandFailure, Exit, note, print,
@@ -21,6 +21,9 @@ use crate::{
 
 /// Pause between two checks of the conditions.
 const PAUSE: Duration = Duration::from_millis(250);
+/// Time for the last check, which may end after `--timeout`. rosrescue answers in milliseconds, unless the computer is
+/// busy.
+const LAST_CHECK: Duration = Duration::from_secs(1);
 
 /// The result of waiting.
 #[derive(Debug, Serialize)]
@@ -59,15 +62,28 @@ pub(super) async fn run(args: &WaitArgs) -> Result<Exit, CommandFailure> {
         .flatten()
         .and_then(|limit| start.checked_add(limit));
     let mut said = false;
+    let mut found = (
+        describe_all(&args.wanted),
+        Some(format!("no answer from {}", running.address)),
+    );
     loop {
-        let (missing, why) = missing(&running, &args.wanted).await?;
+        let check = missing(&running, &args.wanted);
+        let checked = match deadline {
+            Some(deadline) => timeout_at(deadline.max(Instant::now() + LAST_CHECK), check).await,
+            None => Ok(check.await),
+        };
+        // A check that does not end in time changes nothing.
+        if let Ok(checked) = checked {
+            found = checked?;
+        }
+        let (missing, why) = &found;
         let late = deadline.is_some_and(|deadline| Instant::now() >= deadline);
         if missing.is_empty() || late {
             let waited = Waited {
                 uri: running.address.to_string(),
                 met: missing.is_empty(),
-                missing,
-                why,
+                missing: missing.clone(),
+                why: why.clone(),
                 seconds: start.elapsed().as_secs_f64(),
             };
             print(&waited, &args.output)?;
@@ -88,16 +104,19 @@ pub(super) async fn run(args: &WaitArgs) -> Result<Exit, CommandFailure> {
     }
 }
 
+fn describe_all(wanted: &[For]) -> Vec<String> {
+    wanted.iter().map(ToString::to_string).collect()
+}
+
 /// The conditions in `wanted` that are not met, and why.
 async fn missing(
     running: &Running,
     wanted: &[For],
 ) -> Result<(Vec<String>, Option<String>), CommandFailure> {
-    let all = || wanted.iter().map(ToString::to_string).collect();
     let status = match running.status().await {
         Ok(status) => status,
         Err(nobody @ (CommandFailure::Nobody { .. } | CommandFailure::Silent { .. })) => {
-            return Ok((all(), Some(nobody.to_string())));
+            return Ok((describe_all(wanted), Some(nobody.to_string())));
         }
         Err(failure) => return Err(failure),
     };

@@ -1,9 +1,10 @@
 //! `rosrescue wait`: start scripts continue once its condition holds.
 
-use std::time::Instant;
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
 
 use crate::support::{
-    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, Tool, command, free_port,
+    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, Tool, command, free_port, within,
 };
 
 #[test]
@@ -59,6 +60,19 @@ fn it_ends_in_time_and_says_what_is_missing() {
         );
         assert_eq!(ran.exit(), 2, "{ran:?}");
     }
+}
+
+/// A program that accepts connections and never answers, as a stopped rosrescue does.
+#[test]
+fn it_ends_in_time_if_rosrescue_does_not_answer() {
+    let (scratch, listener) = (Scratch::new(), TcpListener::bind("127.0.0.1:0").unwrap());
+    let port = listener.local_addr().unwrap().port();
+    let arguments = ["wait", "--for", "master", "/talker", "--timeout", "0.5"];
+    let ran = within(Duration::from_secs(3), "the wait", || {
+        Tool::rosrescue(&scratch, port, &arguments)
+    });
+    assert_eq!(ran.exit(), 1, "{ran:?}");
+    assert!(ran.stdout.contains("no answer from"), "{ran:?}");
 }
 
 /// While the mirror stands in, calls are answered although there is no master.
