@@ -135,8 +135,8 @@ pub struct DrillArgs {
     /// What to kill, with SIGKILL
     #[arg(long, env = "ROSRESCUE_DRILL_KILL", value_enum, default_value_t = Victim::Master)]
     pub kill: Victim,
-    /// How many times to kill. From the sixth time on the drill waits, because six deaths within a minute are a
-    /// crash loop
+    /// How many times to kill. The drill waits before a sixth death within a minute, because that would be a crash
+    /// loop
     #[arg(
         long,
         env = "ROSRESCUE_DRILL_TIMES",

@@ -25,6 +25,7 @@ const HANG: Duration = Duration::from_secs(4);
 /// Maximum number of deaths within a minute that are not a crash loop.
 const DEATHS: usize = 5;
 const DEATHS_WITHIN: Duration = Duration::from_secs(61);
+
 impl Drill<'_> {
     /// Kills as often as `--times` asks, and waits for each recovery.
     pub(super) async fn kill(&self) -> Result<Vec<Kill>, CommandFailure> {
@@ -33,11 +34,16 @@ impl Drill<'_> {
         } else {
             self.args.kill
         };
-        let (mut kills, mut times) = (Vec::new(), Vec::<Instant>::new());
+        let status = self.target.running.status().await?;
+        let rescues = status.last_rescues.iter();
+        let mut times = times_of_deaths(
+            rescues.map(|report| report.detected_at),
+            status.started + status.uptime,
+        );
+        let mut kills = Vec::new();
         for number in 1..=self.args.times {
-            let fifth = times.iter().rev().nth(DEATHS - 1);
-            let pause = fifth.map(|then| DEATHS_WITHIN.saturating_sub(then.elapsed()));
-            if let Some(pause) = pause.filter(|pause| !pause.is_zero()) {
+            let pause = pause_after(&times);
+            if !pause.is_zero() {
                 eprint_line(&format!(
                     "waiting {} s, because more deaths now would be a crash loop",
                     pause.as_secs()
@@ -107,5 +113,36 @@ impl Drill<'_> {
             }
             sleep(LOOK).await;
         }
+    }
+}
+
+/// The times of deaths that rosrescue has seen, such as those of an earlier drill. `deaths` and `now` are seconds since
+/// 1970.
+fn times_of_deaths(deaths: impl Iterator<Item = f64>, now: f64) -> Vec<Instant> {
+    let ago = deaths.filter_map(|death| Duration::try_from_secs_f64(now - death).ok());
+    ago.filter_map(|ago| Instant::now().checked_sub(ago))
+        .collect()
+}
+
+/// How long to wait after `deaths`, oldest first, so that one more is not a crash loop.
+fn pause_after(deaths: &[Instant]) -> Duration {
+    let fifth = deaths.iter().rev().nth(DEATHS - 1);
+    fifth.map_or(Duration::ZERO, |then| {
+        DEATHS_WITHIN.saturating_sub(then.elapsed())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn deaths_before_the_drill_count_towards_a_crash_loop() {
+        let pause = |deaths: &[f64]| pause_after(&times_of_deaths(deaths.iter().copied(), 100.0));
+        assert_eq!(pause(&[90.0, 92.0, 94.0, 96.0]), Duration::ZERO);
+        let fifth = pause(&[10.0, 90.0, 92.0, 94.0, 96.0, 98.0]).as_secs_f64();
+        assert!((50.0..=51.0).contains(&fifth), "{fifth}");
+        // The clock was set back.
+        assert_eq!(pause(&[200.0; 6]), Duration::ZERO);
     }
 }
