@@ -62,10 +62,10 @@ pub(crate) enum CommandFailure {
     /// No program answers at the address. Exit status 3.
     #[error("no rosrescue at {uri}: {why}. Start `rosrescue core`, or give its address with --uri")]
     Nobody { uri: String, why: String },
-    /// A process listens at the port but does not answer as rosrescue does. Exit status 3.
+    /// Nothing answers in time, or a process listens at the port but does not answer as rosrescue does. Exit status 3.
     #[error(
-        "no rosrescue answers at {uri}: {why}. Something has the port: a rosrescue that is stopped or overloaded, \
-         or another program; `rosrescue check` names it"
+        "no rosrescue answers at {uri}: {why}. Its computer is out of reach, or something has the port: a rosrescue \
+         that is stopped or overloaded, or another program; `rosrescue check` names it"
     )]
     Silent { uri: String, why: String },
     /// The command started and could not finish. Exit status 1.

@@ -7,16 +7,14 @@ use ros1_master::{
     master::{Master, Request},
     xmlrpc::{Reply, Value},
 };
-use tokio::{net::TcpStream, time::timeout};
+use tokio::time::{Instant, timeout};
 
-use super::{CommandFailure, running::Running};
-use crate::{
-    resolver,
-    upstream::{Connection, inspect},
+use super::{
+    CommandFailure,
+    running::{self, Running},
 };
+use crate::upstream::{Connection, inspect};
 
-/// Longest time to connect.
-const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 /// Longest time for an answer. rosmaster needs half a minute for `getParam('/')` with a million parameters.
 const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 /// Largest answer, in bytes.
@@ -31,27 +29,14 @@ pub(super) struct Live {
 impl Live {
     pub(super) async fn connect(running: &Running) -> Result<Self, CommandFailure> {
         let address = &running.address;
-        let uri = address.to_string();
-        let nobody = |why: String| CommandFailure::Nobody {
-            uri: uri.clone(),
-            why,
-        };
-        let connect = async {
-            let addresses = resolver::addresses(&address.host, address.port).await?;
-            let stream = TcpStream::connect(&*addresses).await?;
-            Connection::over(stream, address, MAX_REPLY).await
-        };
-        let connection = match timeout(CONNECT_LIMIT, connect).await {
-            Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,
-            // The backlog of a stopped rosrescue is full, so it accepts no connection.
-            Err(_) => {
-                return Err(CommandFailure::Silent {
-                    uri,
-                    why: format!("no connection in {} s", CONNECT_LIMIT.as_secs()),
-                });
-            }
-        };
-        Ok(Self { connection, uri })
+        let stream = running
+            .connect(Instant::now() + running::ANSWER_LIMIT)
+            .await?;
+        let connection = Connection::over(stream, address, MAX_REPLY).await;
+        Ok(Self {
+            connection: connection.map_err(|error| running.nobody(error.to_string()))?,
+            uri: address.to_string(),
+        })
     }
 
     /// Reads the master's state. Parameter subscriptions cannot be read. They are taken from `previous` for nodes whose
@@ -112,33 +97,5 @@ fn refusal(result: &Value) -> Option<String> {
         Some([Value::Int(1), ..]) => None,
         Some([_, message, ..]) => Some(message.as_str().unwrap_or("no reason given").to_owned()),
         _ => Some("its answer is not that of a master".to_owned()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::net::{SocketAddr, TcpStream};
-
-    use socket2::{Domain, Socket, Type};
-
-    use super::*;
-    use crate::ros_env::MasterUri;
-
-    #[tokio::test]
-    async fn a_port_that_accepts_no_connection_is_taken() {
-        let listener = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
-        let any: SocketAddr = ([127, 0, 0, 1], 0).into();
-        listener.bind(&any.into()).unwrap();
-        listener.listen(0).unwrap();
-        let address = listener.local_addr().unwrap().as_socket().unwrap();
-        // Connects until the backlog is full.
-        let connect = || TcpStream::connect_timeout(&address, Duration::from_millis(500)).ok();
-        let _waiting: Vec<_> = std::iter::from_fn(connect).collect();
-        let address = MasterUri {
-            host: "127.0.0.1".to_owned(),
-            port: address.port(),
-        };
-        let connected = Live::connect(&Running { address }).await;
-        assert!(matches!(connected, Err(CommandFailure::Silent { .. })));
     }
 }

@@ -1,6 +1,6 @@
 //! Finds and asks the running rosrescue.
 
-use std::{io, net::SocketAddr, time::Duration};
+use std::{net::SocketAddr, time::Duration};
 
 use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
@@ -14,7 +14,7 @@ use ros1_master::xmlrpc::{self, Call, Reply, Value};
 use serde::Deserialize;
 use tokio::{
     net::TcpStream,
-    time::{Instant, timeout, timeout_at},
+    time::{Instant, timeout_at},
 };
 
 use super::CommandFailure;
@@ -112,10 +112,23 @@ impl Running {
             .map_err(|error| self.nobody(format!("it gives no answer to calls: {error}")))
     }
 
-    fn nobody(&self, why: String) -> CommandFailure {
+    pub(super) fn nobody(&self, why: String) -> CommandFailure {
         CommandFailure::Nobody {
             uri: self.address.to_string(),
             why,
+        }
+    }
+
+    /// Connects to it.
+    pub(super) async fn connect(&self, deadline: Instant) -> Result<TcpStream, CommandFailure> {
+        let connect = async {
+            let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
+            TcpStream::connect(&*addresses).await
+        };
+        match timeout_at(deadline, connect).await {
+            Ok(connected) => connected.map_err(|error| self.nobody(error.to_string())),
+            // The backlog of a stopped rosrescue may be full.
+            Err(_) => Err(self.silent("no connection in time".to_owned())),
         }
     }
 
@@ -128,18 +141,11 @@ impl Running {
         limit: Duration,
     ) -> Result<(StatusCode, Bytes), CommandFailure> {
         let deadline = Instant::now() + limit;
-        let connect = async {
-            let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
-            let stream = TcpStream::connect(&*addresses).await?;
-            let there = stream.peer_addr()?;
-            // Without the zone of an IPv6 address.
-            let there = SocketAddr::new(there.ip(), there.port()).to_string();
-            io::Result::Ok((stream, there))
-        };
-        let (stream, there) = match timeout_at(deadline, connect).await {
-            Ok(connected) => connected.map_err(|error| self.nobody(error.to_string()))?,
-            Err(_) => return Err(self.nobody(format!("no connection in {} s", limit.as_secs()))),
-        };
+        let stream = self.connect(deadline).await?;
+        let there = stream.peer_addr();
+        let there = there.map_err(|error| self.nobody(error.to_string()))?;
+        // Without the zone of an IPv6 address.
+        let there = SocketAddr::new(there.ip(), there.port()).to_string();
         let request = request.header(HOST, there).body(Full::new(body));
         match timeout_at(deadline, try_exchange(stream, request)).await {
             Ok(answer) => answer.map_err(|error| self.silent(error.to_string())),
@@ -168,14 +174,16 @@ async fn try_exchange(
 
 /// Whether `address` leads to this computer.
 pub(super) async fn is_here(address: &MasterUri) -> bool {
-    let connect = async {
-        let addresses = resolver::addresses(&address.host, address.port).await?;
-        let stream = TcpStream::connect(&*addresses).await?;
-        let (here, there) = (stream.local_addr()?.ip(), stream.peer_addr()?.ip());
-        io::Result::Ok(there.is_loopback() || here == there)
+    let running = Running {
+        address: address.clone(),
     };
-    let here = timeout(ANSWER_LIMIT, connect).await;
-    matches!(here, Ok(Ok(true)))
+    let Ok(stream) = running.connect(Instant::now() + ANSWER_LIMIT).await else {
+        return false;
+    };
+    match (stream.local_addr(), stream.peer_addr()) {
+        (Ok(here), Ok(there)) => there.ip().is_loopback() || here.ip() == there.ip(),
+        _ => false,
+    }
 }
 
 #[cfg(test)]
@@ -185,7 +193,28 @@ mod tests {
         net::TcpListener,
     };
 
+    use socket2::{Domain, Socket, Type};
+
     use super::*;
+
+    #[tokio::test]
+    async fn a_port_that_accepts_no_connection_is_taken() {
+        let listener = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        let any: SocketAddr = ([127, 0, 0, 1], 0).into();
+        listener.bind(&any.into()).unwrap();
+        listener.listen(0).unwrap();
+        let address = listener.local_addr().unwrap().as_socket().unwrap();
+        // Connects until the backlog is full.
+        let limit = Duration::from_millis(500);
+        let connect = || std::net::TcpStream::connect_timeout(&address, limit).ok();
+        let _waiting: Vec<_> = std::iter::from_fn(connect).collect();
+        let address = MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port: address.port(),
+        };
+        let connected = Running { address }.connect(Instant::now() + limit).await;
+        assert!(matches!(connected, Err(CommandFailure::Silent { .. })));
+    }
 
     #[tokio::test]
     async fn a_status_of_another_version_names_both_versions() {
