@@ -1,6 +1,6 @@
-//! The command line. Each option of `core` and `proxy` has an environment variable. Options of the other commands that
-//! confirm a change, such as `--yes`, have none: a variable left over from an earlier command must not confirm
-//! anything. Nor have those that choose a time or a name in the log: the command would show another state than asked.
+//! The command line. Each option of `core` and `proxy` has an environment variable. Of the other commands, only options
+//! that say where rosrescue and its checkpoint are or which values to hide have one, and those that `check` shares with
+//! `core` and `proxy`. A variable left over from an earlier command must not choose or confirm anything.
 
 pub(crate) mod cluster_args;
 pub(crate) mod config_file;
@@ -116,35 +116,25 @@ mod tests {
     }
 
     #[test]
-    fn only_options_have_environment_variables_and_flags_of_tools_have_none() {
+    fn only_options_that_every_command_takes_alike_have_environment_variables() {
         let cli = Cli::command();
         for command in std::iter::once(&cli).chain(cli.get_subcommands()) {
             for option in command.get_arguments().filter(|a| {
                 !a.is_positional() && !["help", "version"].contains(&a.get_id().as_str())
             }) {
-                let name = option.get_id();
+                let (command, name) = (command.get_name(), option.get_id().as_str());
                 assert!(option.get_help().is_some(), "{name} has no help");
-                let serves = ["rosrescue", "core", "proxy"].contains(&command.get_name());
-                if !serves && !option.get_action().takes_values() {
-                    assert_eq!(option.get_env(), None, "{name}: consent by environment");
-                    continue;
+                let serves = ["rosrescue", "core", "proxy"].contains(&command);
+                let is_shared = ["uri", "checkpoint", "hide_values"].contains(&name)
+                    || command == "check" && option.get_action().takes_values();
+                let variable = option.get_env().map(|name| name.to_string_lossy());
+                match variable {
+                    Some(variable) => {
+                        assert!(serves || is_shared, "{command} --{name} has {variable}");
+                        assert!(variable.starts_with("ROSRESCUE_"), "{name}");
+                    }
+                    None => assert!(!serves, "{name} has no variable"),
                 }
-                // They choose what one run reads, shows or writes.
-                let of_one_run = [
-                    "at", "folder", "from", "to", "since", "until", "lines", "param", "topic",
-                    "service", "node", "uri",
-                ];
-                if of_one_run.contains(&name.as_str()) && option.get_env().is_none() {
-                    assert!(!serves, "{name}");
-                    continue;
-                }
-                let variable = option
-                    .get_env()
-                    .unwrap_or_else(|| panic!("{name} has no variable"));
-                assert!(
-                    variable.to_string_lossy().starts_with("ROSRESCUE_"),
-                    "{name}"
-                );
             }
         }
     }

@@ -203,7 +203,7 @@ pub struct ParamsArgs {
     #[command(flatten)]
     pub state: StateArgs,
     /// Leave out parameters whose full name matches this regular expression. Case does not matter [default: none]
-    #[arg(long, env = "ROSRESCUE_PARAMS_HIDE_VALUES", value_name = "REGEX")]
+    #[arg(long, value_name = "REGEX")]
     pub hide_values: Option<Hide>,
     #[command(flatten)]
     pub read: ReadArgs,

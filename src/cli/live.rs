@@ -13,7 +13,7 @@ pub struct TopArgs {
     #[command(flatten)]
     pub target: TargetArgs,
     /// Stop after this many updates, one per second [default: until q, Ctrl-C or a signal]
-    #[arg(long, env = "ROSRESCUE_TOP_COUNT", value_name = "COUNT")]
+    #[arg(long, value_name = "COUNT")]
     #[arg(value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
     /// Print one JSON object per line, once a second
@@ -28,16 +28,10 @@ pub struct HandoverArgs {
     #[command(flatten)]
     pub target: TargetArgs,
     /// Computer that should lead: its whole name, its host name, or its IPv4 address [default: any follower]
-    #[arg(long, env = "ROSRESCUE_HANDOVER_TO", value_name = "NAME", value_parser = name)]
+    #[arg(long, value_name = "NAME", value_parser = name)]
     pub to: Option<String>,
     /// Longest time to wait for the new leader, in seconds
-    #[arg(
-        long,
-        env = "ROSRESCUE_HANDOVER_TIMEOUT",
-        value_name = "SECONDS",
-        default_value = "30"
-    )]
-    #[arg(value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", default_value = "30", value_parser = seconds)]
     pub timeout: f64,
     /// How to print the result.
     #[command(flatten)]
@@ -53,17 +47,11 @@ pub struct WaitArgs {
     /// What to wait for: `answered`, `master`, `protected`, or the /NAME of a node. `answered`: rosrescue answers
     /// calls. `master`: a master answers calls. `protected`: rosrescue also records every change. Several
     /// conditions must all be met
-    #[arg(long = "for", env = "ROSRESCUE_WAIT_FOR", value_name = "WHAT")]
+    #[arg(long = "for", value_name = "WHAT")]
     #[arg(value_delimiter = ',', num_args = 1.., default_value = "answered")]
     pub wanted: Vec<For>,
     /// Longest time to wait, in seconds; 0 for no limit
-    #[arg(
-        long,
-        env = "ROSRESCUE_WAIT_TIMEOUT",
-        value_name = "SECONDS",
-        default_value = "60"
-    )]
-    #[arg(value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", default_value = "60", value_parser = seconds)]
     pub timeout: f64,
     /// How to print the result.
     #[command(flatten)]

@@ -21,12 +21,7 @@ pub struct InstallArgs {
     #[command(flatten)]
     pub scope: ScopeArgs,
     /// User that runs the service [default: the user who called sudo]
-    #[arg(
-        long,
-        env = "ROSRESCUE_RUN_AS",
-        value_name = "USER",
-        conflicts_with = "user"
-    )]
+    #[arg(long, value_name = "USER", conflicts_with = "user")]
     pub run_as: Option<String>,
     /// Install although ROS_MASTER_URI does not lead to this service
     #[arg(long)]

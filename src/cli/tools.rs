@@ -133,16 +133,11 @@ pub struct DrillArgs {
     #[command(flatten)]
     pub target: TargetArgs,
     /// What to kill, with SIGKILL
-    #[arg(long, env = "ROSRESCUE_DRILL_KILL", value_enum, default_value_t = Victim::Master)]
+    #[arg(long, value_enum, default_value_t = Victim::Master)]
     pub kill: Victim,
     /// How many times to kill. The drill waits before a sixth death within a minute, because that would be a crash
     /// loop
-    #[arg(
-        long,
-        env = "ROSRESCUE_DRILL_TIMES",
-        value_name = "COUNT",
-        default_value_t = 3
-    )]
+    #[arg(long, value_name = "COUNT", default_value_t = 3)]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub times: u32,
     /// Make the master hang with SIGSTOP instead of killing it
@@ -152,31 +147,16 @@ pub struct DrillArgs {
     #[arg(long, conflicts_with_all = ["kill", "times"])]
     pub no_kill: bool,
     /// How long --no-kill watches, in seconds
-    #[arg(
-        long,
-        env = "ROSRESCUE_DRILL_SECONDS",
-        value_name = "SECONDS",
-        default_value_t = 10
-    )]
+    #[arg(long, value_name = "SECONDS", default_value_t = 10)]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=86_400))]
     pub seconds: u32,
     /// Longest time for a rescue before the drill fails, in seconds
-    #[arg(
-        long,
-        env = "ROSRESCUE_DRILL_LIMIT",
-        value_name = "SECONDS",
-        default_value_t = 30
-    )]
+    #[arg(long, value_name = "SECONDS", default_value_t = 30)]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=3600))]
     pub limit: u32,
     /// Topic to watch as a subscriber; may be repeated [default: up to five topics that robots drive
     /// by, or those with most messages]
-    #[arg(
-        long,
-        env = "ROSRESCUE_DRILL_TOPIC",
-        value_name = "NAME",
-        value_delimiter = ','
-    )]
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
     pub topic: Vec<String>,
     /// Do not ask before killing
     #[arg(short, long)]
