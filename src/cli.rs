@@ -168,6 +168,13 @@ mod tests {
         }
     }
 
+    /// `ROSRESCUE_CHECKPOINT` counts as given, too.
+    #[test]
+    fn a_report_of_another_computer_is_shown_whatever_the_checkpoint_here() {
+        let words = "rosrescue report --uri http://other:11311 --checkpoint /here.yaml";
+        Cli::try_parse_from(words.split(' ')).unwrap();
+    }
+
     #[test]
     fn bare_rosrescue_is_core() {
         let cli = Cli::parse_from(["rosrescue", "-p", "12000"]);

@@ -146,7 +146,7 @@ pub struct ReportArgs {
     pub number: Option<u64>,
     /// Ask the rosrescue at this address, http://HOST:PORT, instead of reading files. It has the last 20 reports
     /// of its session
-    #[arg(long, value_name = "URI", conflicts_with = "checkpoint")]
+    #[arg(long, value_name = "URI")]
     pub uri: Option<String>,
     #[command(flatten)]
     pub checkpoint: CheckpointArgs,
