@@ -27,6 +27,7 @@ use crate::{
     cli::{CheckpointArgs, ReadArgs, TargetArgs, When},
     clock, config,
     ros_env::DEFAULT_MASTER_PORT,
+    status::summary::size,
 };
 
 /// Size of a file that takes about a second to read, in bytes.
@@ -321,13 +322,4 @@ pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Command
         note(sentence);
     }
     Ok(opened)
-}
-
-/// A number of bytes for people, such as `1.5 MiB`.
-pub(super) fn size(bytes: u64) -> String {
-    match bytes {
-        0..1_024 => format!("{bytes} B"),
-        1_024..1_048_576 => format!("{:.1} KiB", bytes as f64 / 1024.0),
-        _ => format!("{:.1} MiB", bytes as f64 / 1_048_576.0),
-    }
 }

@@ -4,16 +4,13 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::{
-    CommandFailure, Exit,
-    files::{self, size},
-    print,
-};
+use super::{CommandFailure, Exit, files, print};
 use crate::{
     cli::HistoryArgs,
     clock,
     printable::{Lines, Page, display_lines, line},
     recovery::report_file::{self, ReportRecord},
+    status::summary::size,
 };
 
 pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, CommandFailure> {

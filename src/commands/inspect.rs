@@ -11,13 +11,14 @@ use serde::Serialize;
 
 use super::{
     CommandFailure, Exit, counted,
-    files::{self, Opened, size},
+    files::{self, Opened},
     print,
 };
 use crate::{
     cli::InspectArgs,
     clock,
     printable::{Lines, Page, display_lines, line},
+    status::summary::size,
 };
 
 pub(super) async fn run(args: &InspectArgs) -> Result<Exit, CommandFailure> {
