@@ -207,15 +207,7 @@ impl Lines for Top {
             "nodes {nodes}, publishers {publishers}, subscribers {subscribers}, services {services}, \
              parameters {params}"
         )?;
-        for (what, names) in [
-            ("no answer from", &self.nodes.unreachable),
-            ("dead but registered:", &self.nodes.dead_nodes),
-            ("not checked:", &self.nodes.unchecked_nodes),
-        ] {
-            if !names.is_empty() {
-                line!(head, "{what} {}", self.nodes.with_times(names))?;
-            }
-        }
+        wrap(&mut head, &format!("nodes: {}", self.nodes.line()))?;
         if let Some(cluster) = &self.cluster {
             line!(head, "computers: {}", cluster.line())?;
         }

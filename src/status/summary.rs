@@ -127,12 +127,25 @@ pub(crate) struct NodeHealth {
 
 impl NodesStatus {
     /// The names of `names`, each with the time since when its health has been the same.
-    pub(crate) fn with_times(&self, names: &[String]) -> String {
+    fn with_times(&self, names: &[String]) -> String {
         let with_time = |name: &String| match self.node_health.get(name) {
             Some(of) => format!("{name} since {}", clock::wall_text(of.since)),
             None => name.clone(),
         };
         shortened(&names.iter().map(with_time).collect::<Vec<_>>())
+    }
+
+    /// How many nodes are alive, and which are not.
+    pub(crate) fn line(&self) -> String {
+        let lists = [
+            (&self.dead_nodes, "dead but registered"),
+            (&self.unreachable, "not answering"),
+            (&self.unchecked_nodes, "not checked"),
+        ];
+        let ill = lists.into_iter().filter(|(names, _)| !names.is_empty());
+        let ill = ill
+            .map(|(names, what)| format!("; {} {what}: {}", names.len(), self.with_times(names)));
+        format!("{} alive{}", self.alive_nodes, ill.collect::<String>())
     }
 }
 
@@ -220,20 +233,6 @@ impl Status {
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)
     }
 
-    fn nodes_line(&self, f: &mut Page) -> fmt::Result {
-        let nodes = &self.nodes;
-        let lists = [
-            (&nodes.dead_nodes, "dead but registered"),
-            (&nodes.unreachable, "not answering"),
-            (&nodes.unchecked_nodes, "not checked"),
-        ];
-        write!(f, "nodes       {} alive", nodes.alive_nodes)?;
-        for (names, what) in lists.into_iter().filter(|(names, _)| !names.is_empty()) {
-            write!(f, "; {} {what}: {}", names.len(), nodes.with_times(names))?;
-        }
-        line!(f)
-    }
-
     fn master_line(&self, f: &mut Page) -> fmt::Result {
         write!(f, "master      {}", self.master)?;
         match self.master_pid {
@@ -295,7 +294,7 @@ impl Lines for Status {
             cluster.lines(until, f)?;
         }
         line!(f, "state       {}", self.state)?;
-        self.nodes_line(f)?;
+        line!(f, "nodes       {}", self.nodes.line())?;
         line!(
             f,
             "calls       {}, {:.1} per second; {} answered by rosrescue, {} timed out",
