@@ -26,7 +26,7 @@ use self::{
 };
 use super::{
     CommandFailure, Exit,
-    check::units::{self as others, UnitKind},
+    check::units::{self as others, ADD_WAIT, UnitKind},
 };
 use crate::{
     cli::{InstallArgs, ScopeArgs, UninstallArgs},
@@ -290,8 +290,7 @@ impl SystemChanges {
                 }
                 UnitKind::Roslaunch => {
                     self.notes.push(format!(
-                        "{name} runs roslaunch. It will start after rosrescue. Add `--wait` to its roslaunch, so \
-                         that it never starts a master (robot_upstart: `rosrun robot_upstart install --wait …`)"
+                        "{name} runs roslaunch, and will start after rosrescue: {ADD_WAIT}"
                     ));
                     before.push(name);
                 }

@@ -12,6 +12,9 @@ const FOLDERS: [&str; 4] = [
     "/usr/lib/systemd/system",
     "/lib/systemd/system",
 ];
+/// What to do about a unit that runs roslaunch. That of robot_upstart starts a script.
+pub(in crate::commands) const ADD_WAIT: &str = "add --wait to its roslaunch, so that it never starts a master \
+                                                (robot_upstart: `rosrun robot_upstart install --wait …`)";
 /// Largest unit or script that is read, in bytes.
 const MOST: u64 = 1 << 20;
 

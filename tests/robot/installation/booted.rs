@@ -233,7 +233,7 @@ fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     let shown = robot.run(&format!("SUDO_USER=robot {PROGRAM} install --dry-run"));
     assert!(shown.contains("disable --now roscore.service"), "{shown}");
     assert!(
-        shown.contains("myrobot.service") && shown.contains("`--wait`"),
+        shown.contains("myrobot.service") && shown.contains("add --wait"),
         "{shown}"
     );
     let unasked = robot.output(&format!("SUDO_USER=robot {PROGRAM} install"));

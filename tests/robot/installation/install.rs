@@ -332,7 +332,7 @@ fn units_that_start_a_master_are_found_and_the_plan_is_json() {
     let disables = commands.iter().find(is_old).unwrap();
     assert_eq!(disables[2], "disable", "{json}");
     assert!(json.contains("Before=robot.service"), "{json}");
-    assert!(json.contains("Add `--wait` to its roslaunch"), "{json}");
+    assert!(json.contains("add --wait to its roslaunch"), "{json}");
 
     let proxy = [
         "install",

@@ -1,7 +1,12 @@
 //! Judges the installed ROS, and what else starts a master.
 
 use super::{
-    super::{facts::SetupFacts, launch::Launches, ros::Responder, units::UnitKind},
+    super::{
+        facts::SetupFacts,
+        launch::Launches,
+        ros::Responder,
+        units::{ADD_WAIT, UnitKind},
+    },
     Findings, named,
 };
 use crate::status::software;
@@ -138,7 +143,9 @@ impl Findings {
                 (UnitKind::Roslaunch, true) => self.warn(
                     "systemd",
                     format!("{name} runs roslaunch, which starts a master if it finds none"),
-                    format!("add --wait to its roslaunch, and After=rosrescue.service: `{systemctl} edit --full {name}`"),
+                    format!(
+                        "{ADD_WAIT}, and After=rosrescue.service: `{systemctl} edit --full {name}`"
+                    ),
                 ),
                 _ => {}
             }

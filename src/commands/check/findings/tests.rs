@@ -166,7 +166,7 @@ fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut S
 /// Asserts that the advice contains a command, and that a shell can read each of its commands.
 #[track_caller]
 fn assert_has_a_command(finding: &Finding) {
-    const PROGRAMS: [&str; 29] = [
+    const PROGRAMS: [&str; 30] = [
         "cat",
         "conda",
         "deactivate",
@@ -185,6 +185,7 @@ fn assert_has_a_command(finding: &Finding) {
         "rosmaster",
         "rosnode",
         "rosrescue",
+        "rosrun",
         "sed",
         "source",
         "ss",
