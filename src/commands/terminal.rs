@@ -56,14 +56,11 @@ impl Terminal {
         self.put_lines(text.as_str().lines());
     }
 
-    /// Shows `sentence` and under it `text`.
-    pub(super) fn draw_under(&self, sentence: &str, text: &Printable) {
-        let sentence = Printable::line(sentence);
-        self.put_lines(
-            [sentence.as_str(), ""]
-                .into_iter()
-                .chain(text.as_str().lines()),
-        );
+    /// Shows `lines` and under them `text`.
+    pub(super) fn draw_under(&self, lines: &[String], text: &Printable) {
+        let lines: Vec<_> = lines.iter().map(|line| Printable::line(line)).collect();
+        let lines = lines.iter().map(Printable::as_str).chain([""]);
+        self.put_lines(lines.chain(text.as_str().lines()));
     }
 
     fn put_lines<'a>(&self, lines: impl Iterator<Item = &'a str>) {

@@ -309,8 +309,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
             Err(failure) => Some(failure),
         };
         match (&terminal, &failed) {
-            (Some(terminal), None) => terminal.draw(&shown),
-            (Some(terminal), Some(failure)) => terminal.draw_under(&failure.to_string(), &shown),
+            (Some(terminal), _) => draw(terminal, failed.as_ref(), &shown),
             (None, None) if !print_line(&shown)? => return Ok(Exit::Good),
             (None, None) => {}
             (None, Some(failure)) => note(&failure.to_string()),
@@ -329,7 +328,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
                 status = &mut next => break status,
                 () = ends.received() => return Ok(Exit::Good),
                 _ = resized.recv() => if let Some(terminal) = &terminal {
-                    terminal.draw(&shown);
+                    draw(terminal, failed.as_ref(), &shown);
                 },
                 key = async { keys.as_mut()?.recv().await }, if keys.is_some() => match key {
                     Some(b'q' | b'Q' | 3 | 4) => return Ok(Exit::Good),
@@ -338,6 +337,17 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, CommandFailure> {
                 },
             }
         };
+    }
+}
+
+/// Shows `shown`, and above it why the last look has failed, if it has.
+fn draw(terminal: &Terminal, failed: Option<&CommandFailure>, shown: &Printable) {
+    match failed {
+        None => terminal.draw(shown),
+        Some(failure) => {
+            let lines = wrapped(&failure.to_string(), terminal::size().0);
+            terminal.draw_under(&lines, shown);
+        }
     }
 }
 
