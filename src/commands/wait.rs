@@ -135,6 +135,8 @@ async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
         For::Answered => status.ready,
         For::Master => status.open || status.condition.apart_from_nodes == ConditionName::Following,
         For::Protected => status.condition.is_protected(),
+        // rosrescue would hold the lookup.
+        For::Node(_) if !status.ready => false,
         For::Node(name) => {
             let params = ["/rosrescue_wait", name].map(Value::from);
             let reply = running

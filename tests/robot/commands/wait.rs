@@ -4,7 +4,8 @@ use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, Tool, command, free_port, within,
+    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, Tool, command, eventually,
+    free_port, within,
 };
 
 #[test]
@@ -73,6 +74,18 @@ fn it_ends_in_time_if_rosrescue_does_not_answer() {
     });
     assert_eq!(ran.exit(), 1, "{ran:?}");
     assert!(ran.stdout.contains("no answer from"), "{ran:?}");
+}
+
+/// A lookup would be held until there is a master.
+#[test]
+fn it_says_that_there_has_never_been_a_master_instead_of_waiting_for_a_lookup() {
+    let scratch = Scratch::new();
+    let rescue = Setup::proxy(&scratch, free_port()).spawn();
+    eventually("the reason is that of the status", || {
+        let arguments = ["wait", "--for", "/talker", "--timeout", "1"];
+        let ran = Tool::rosrescue(&scratch, rescue.port(), &arguments);
+        ran.exit() == 1 && ran.stdout.contains("waiting for the first master")
+    });
 }
 
 /// While the mirror stands in, calls are answered although there is no master.
