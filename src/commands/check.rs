@@ -52,7 +52,7 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, CommandFailure> {
 /// What the rosrescue that runs already, if there is one, says about the robot.
 async fn robot(args: &CheckArgs) -> Result<Option<Finding>, CommandFailure> {
     match find_running(args) {
-        Ok(running) => Ok(robot::find_trouble(&running).await),
+        Ok(running) => Ok(robot::find_trouble(&running, args.target.uri.is_some()).await),
         // A wrong ROS_MASTER_URI is a finding of its own.
         Err(_) if args.target.uri.is_none() => Ok(None),
         Err(failure) => Err(failure),

@@ -41,7 +41,7 @@ pub(super) async fn check_links(args: &CheckArgs) -> Result<Vec<Finding>, Comman
         found.missing.retain(|link| before.missing.contains(link));
     }
     let mut findings = found.findings();
-    findings.extend(robot::find_trouble(&running).await);
+    findings.extend(robot::find_trouble(&running, false).await);
     Ok(findings)
 }
 

@@ -8,26 +8,28 @@ use crate::{
 
 const SUBJECT: &str = "robot";
 
-/// The condition of the robot, unless all is well.
-pub(super) async fn find_trouble(running: &Running) -> Option<Finding> {
+/// The condition of the robot, unless all is well. `must_run` says whether a rosrescue has to answer.
+pub(super) async fn find_trouble(running: &Running, must_run: bool) -> Option<Finding> {
     match running.status().await {
         Ok(status) => judge_condition(&status.condition),
-        Err(CommandFailure::Failed(why)) => Some(Finding {
+        // A bare master has no status.
+        Err(CommandFailure::Nobody { .. } | CommandFailure::Silent { .. }) if !must_run => None,
+        Err(failure) => Some(Finding {
             severity: Severity::Warning,
             subject: SUBJECT,
-            what: why,
+            what: failure.to_string(),
             todo: String::new(),
         }),
-        // No rosrescue runs. A bare master has no status.
-        Err(_) => None,
     }
 }
 
 fn judge_condition(condition: &Condition) -> Option<Finding> {
     // Calls pass and are recorded, but there is something to do, such as for a guardian that has ended.
     let works = condition.is_protected() && condition.name == condition.apart_from_nodes;
+    // What passes by itself, such as a rescue, has no action.
+    let is_warning = works || condition.action.is_none();
     (!condition.is_good()).then(|| Finding {
-        severity: match works {
+        severity: match is_warning {
             true => Severity::Warning,
             false => Severity::Problem,
         },
@@ -67,7 +69,7 @@ mod tests {
                 "find the reason."
             )
         );
-        let dead = finding(ConditionName::NodesDead, good, None).unwrap();
+        let dead = finding(ConditionName::NodesDead, good, Some("restart it.")).unwrap();
         assert_eq!(dead.severity, Severity::Problem);
     }
 }

@@ -4,6 +4,7 @@ use super::{
     super::{
         facts::{Port, Process, SetupFacts},
         ros::Responder,
+        units::{Unit, UnitKind},
     },
     Findings, named,
 };
@@ -43,11 +44,17 @@ impl Findings {
                         Ok(pids) => format!("when the robot is at rest, `kill {pids}`, and start it again"),
                         Err(hint) => hint.to_owned(),
                     };
+                    let is_users =
+                        |unit: &Unit| unit.kind == UnitKind::Rosrescue && unit.is_users;
+                    let systemctl = match facts.units.iter().any(is_users) {
+                        true => "systemctl --user",
+                        false => "sudo systemctl",
+                    };
                     self.note(
                         "port",
                         format!("the running rosrescue is {version}, this program is {own}"),
                         format!(
-                            "a service: `sudo systemctl kill --signal=KILL --kill-who=main rosrescue.service`. \
+                            "a service: `{systemctl} kill --signal=KILL --kill-who=main rosrescue.service`. \
                              Otherwise {restart}"
                         ),
                     );
@@ -107,6 +114,9 @@ fn pids(processes: &[Process]) -> Result<String, &'static str> {
     match pids.is_empty() {
         false => Ok(pids.join(" ")),
         true if processes.is_empty() => Err("`sudo rosrescue check` names the process"),
-        true => Err("`systemctl list-sockets` names the socket unit: stop that"),
+        true => Err(
+            "`systemctl list-sockets` names the socket unit and its service. If that is rosrescue, `journalctl -u \
+             rosrescue` shows why it does not start. Otherwise stop the socket unit",
+        ),
     }
 }

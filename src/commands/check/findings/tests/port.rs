@@ -75,7 +75,17 @@ fn systemd_is_never_stopped() {
     let [systemd, own] = [process(1, "systemd", 11311), process(8, "rosrescue", 11311)];
     for (server, by, command) in [
         (rosrescue(), vec![systemd.clone(), own], "`kill 8`"),
-        (Responder::Other, vec![systemd], "`systemctl list-sockets`"),
+        (
+            Responder::Other,
+            vec![systemd.clone()],
+            "`systemctl list-sockets`",
+        ),
+        // A service with a wrong option, between two starts.
+        (
+            Responder::Silent,
+            vec![systemd],
+            "`journalctl -u rosrescue`",
+        ),
     ] {
         let todo = todo(|facts| {
             port(facts).taken = Some(PortInUse { by, server });
