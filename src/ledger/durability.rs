@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use super::{
     Ledger,
     disk_jobs::{self, DISK_PATIENCE, Journal, SILENT, StoreState},
-    shared::SharedRecord,
+    shared::{Shared, SharedRecord},
 };
 
 /// Identifies a record that an answer may have to wait for.
@@ -40,7 +40,7 @@ pub(super) struct Whole {
     /// The version after the last change that has no record, so only a complete checkpoint holds it.
     pub(super) unrecorded: u64,
     /// The mirror's version in the last complete checkpoint that the store was told to write.
-    taken: u64,
+    pub(super) taken: u64,
     /// The mirror's version in the last complete checkpoint that was written.
     written: u64,
     /// Why the last checkpoint could not be written.
@@ -181,14 +181,17 @@ impl Ledger {
 
     /// Notes the result of the last complete checkpoint.
     pub fn set_attempted(&self, result: Result<(), &StoreError>) {
-        let mut inner = self.lock();
+        let inner = &mut *self.lock();
+        let was_due = inner.whole.is_due();
         let whole = &mut inner.whole;
         let taken = whole.taken;
         if result.is_ok() {
             whole.written = taken;
         }
         whole.failure = result.err().map(ToString::to_string);
-        drop(inner);
+        // A record of the session that was made meanwhile lacks the number of etcd's journal.
+        let is_shared = !matches!(inner.shared, Shared::Single);
+        inner.session_unwritten |= is_shared && was_due && !inner.whole.is_due();
         raise(&self.attempted, taken);
     }
 

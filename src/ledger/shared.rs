@@ -18,8 +18,8 @@ pub(super) enum Shared {
     Here { times_led: u64, sharing: Sharing },
 }
 
-/// A record among those that the other computers get: its number, and how often this computer has led before, which tells
-/// its terms apart.
+/// A record among those that the other computers get: its number, and how often [`Ledger::leave`](super::Ledger::leave) was
+/// called before, which tells the times in which this computer records apart.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct SharedRecord {
     times_led: u64,
@@ -311,6 +311,13 @@ mod tests {
         assert_eq!(cluster_seq(), 20);
         assert!(ledger.lock().session_unwritten);
         assert_eq!(ledger.lock().session_record().cluster_seq, 0);
+        // A record comes while that checkpoint is written, and the one after it must not count on from 0.
+        let version = ledger.lock().version;
+        ledger.lock().whole.taken = version;
+        ledger.follow(&[record(21, set(62))]).unwrap();
+        ledger.set_attempted(Ok(()));
+        assert!(ledger.lock().session_unwritten);
+        assert_eq!(ledger.lock().session_record().cluster_seq, 21);
     }
 
     #[tokio::test]

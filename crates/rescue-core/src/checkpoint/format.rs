@@ -62,7 +62,7 @@ pub struct Session {
     /// With several computers: the number of etcd's journal of `term`. 0 if it is unknown.
     pub cluster_journal: u64,
     /// With several computers: number of the last record in etcd's journal of `term` that this file contains. Each call
-    /// that follows in this file has the next number. 0 if it is unknown.
+    /// that follows in this file has the next number. 0 if it is unknown, so that what is counted from it is too low.
     pub cluster_seq: u64,
     /// Wall clock time at which this was written, in milliseconds since 1970. It is a label, like [`Label::at`].
     pub at: u64,
