@@ -75,7 +75,7 @@ impl Context {
             gate: self.gate.state(),
             gate_since: self.gate.opened_or_shut_at().into_std(),
             unprotected: self.ledger.unprotected(),
-            master: self.upstream.address().to_string(),
+            master: self.reach.upstream.address().to_string(),
         };
         self.board
             .update(|facts| condition(&situation, facts))
@@ -125,8 +125,15 @@ impl Context {
     }
 }
 
-/// The first process of a container with `docker run --init`, or `init: true` in a compose file. It ends with its child.
-const INITS: [&str; 4] = ["tini", "docker-init", "catatonit", "dumb-init"];
+/// The first process of a container with `--init` (docker, podman), or `init: true` in a compose file. It ends with its
+/// child.
+const INITS: [&str; 5] = [
+    "tini",
+    "docker-init",
+    "podman-init",
+    "catatonit",
+    "dumb-init",
+];
 
 /// Whether something restarts the guardian `pid` when it ends: systemd, or the runtime of its container.
 fn is_restarted(pid: u32) -> bool {
@@ -139,10 +146,16 @@ fn is_restarted(pid: u32) -> bool {
     by_systemd || by_runtime
 }
 
-/// Whether a process with these control groups (`cgroups(7)`) belongs to a systemd service. Those of a terminal or a
-/// login end in `.scope`. `INVOCATION_ID` would not do: terminals inherit it, and systemd sets it only since version 232.
+/// Whether a process with these control groups (`cgroups(7)`) belongs to a systemd service. Only systemd's own hierarchy
+/// tells: in others, a terminal has that of `user@1000.service`. The group of a terminal or a login ends in `.scope`, on
+/// Ubuntu 18.04 in `gnome-terminal-server.service`. `INVOCATION_ID` would not do: terminals inherit it, and systemd sets it
+/// only since version 232.
 fn is_in_service(groups: &str) -> bool {
-    groups.lines().any(|group| group.ends_with(".service"))
+    let mut own = (groups.lines())
+        .filter(|group| group.starts_with("0::") || group.contains(":name=systemd:"));
+    own.any(|group| {
+        group.ends_with(".service") && !group.ends_with("/gnome-terminal-server.service")
+    })
 }
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended. `guarded` is the
@@ -245,6 +258,11 @@ mod tests {
             "0::/\n",
             "0::/user.slice/user-1000.slice/session-3.scope\n",
             "0::/user.slice/user-1000.slice/user@1000.service/app.slice/vte-spawn-7.scope\n",
+            // Ubuntu 20.04 and 18.04.
+            "5:pids:/user.slice/user-1000.slice/user@1000.service\n\
+             1:name=systemd:/user.slice/user-1000.slice/user@1000.service/vte-spawn-7.scope\n",
+            "5:pids:/user.slice/user-1000.slice/user@1000.service\n\
+             1:name=systemd:/user.slice/user@1000.service/gnome-terminal-server.service\n",
         ] {
             assert!(!is_in_service(other), "{other}");
         }
