@@ -4,6 +4,7 @@ use std::{
     error::Error,
     ffi::OsString,
     io::{IsTerminal, Write},
+    panic::{self, AssertUnwindSafe},
     process::ExitCode,
     time::{Duration, Instant},
 };
@@ -164,11 +165,12 @@ fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn
         .worker_threads(1)
         .enable_all()
         .build()?;
-    let ended = runtime.block_on(boxed(serve(config, sockets, hostname)));
+    let served = || runtime.block_on(boxed(serve(config, sockets, hostname)));
+    let ended = panic::catch_unwind(AssertUnwindSafe(served));
     // The closing checkpoint is on the disk and newer than any write that still runs. A thread may be waiting for a
-    // dead name server. Dropping the runtime would wait for that thread; ending the process does not.
+    // silent disk or a dead name server. Dropping the runtime would wait for that thread; ending the process does not.
     runtime.shutdown_timeout(LAST_JOBS);
-    ended
+    ended.unwrap_or_else(|panic| panic::resume_unwind(panic))
 }
 
 async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
