@@ -528,7 +528,12 @@ impl World {
                 self.trace(|| format!("{at}: {said} -> {all}"));
             }
             for action in actions {
+                // Production carries out nothing after it.
+                let ends = matches!(action, Action::End);
                 self.act(at, action, &mut inputs);
+                if ends {
+                    return;
+                }
             }
             let computer = &mut self.computers[at];
             computer.followed = computer.member.position();
