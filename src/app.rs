@@ -141,7 +141,7 @@ pub async fn run(
     let process = tokio::select! {
         process = begun.run(stop, halt) => process?,
         () = announce(&context, say) => None,
-        () = looped.notified() => return Err(RunError::Loop { master: context.upstream.address() }),
+        () = looped.notified() => return Err(RunError::Loop { master: context.reach.upstream.address() }),
         panic = panicked(&mut tasks) => std::panic::resume_unwind(panic),
     };
     connections.close();
@@ -223,7 +223,7 @@ fn watch(config: &Config, context: &Context, tasks: &mut JoinSet<()>) {
     tasks.spawn(boxed(nodes::watch(context.nodes.clone())));
     if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(boxed(bypass::watch(
-            context.upstream.clone(),
+            context.reach.upstream.clone(),
             context.board.clone(),
             config.advertised.to_string(),
         )));

@@ -102,7 +102,8 @@ pub struct Ledger {
     pub work: Notify,
     /// Wakes the task that sends this computer's writes to the other computers.
     pub shared: Notify,
-    /// Wakes `nodes::watch`: something is unseen, the order has something to repeat, or a new node is to be identified.
+    /// Wakes `nodes::watch`: a notification waits or is to be repeated, something is unseen, or a new node is to be
+    /// identified.
     pub wake_nodes: Notify,
     order_changed: watch::Sender<()>,
     /// Signals that the master has run all writes that the mirror has answered first.

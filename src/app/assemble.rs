@@ -109,13 +109,12 @@ pub(super) async fn assemble(
         gate: ledger.gate(),
         ledger,
         reach: Reach {
-            upstream: upstream.clone(),
+            upstream,
             supervision,
             probing: config.probing,
             probe_timeout: config.probe_timeout,
             renewal: config.master.renewal(),
         },
-        upstream,
         write_queue,
         nodes,
         served,
@@ -176,7 +175,7 @@ pub(super) fn server(
     let clients = Arc::new(Clients::default());
     let pool = Pool::new(
         config.master_connections,
-        context.upstream.clone(),
+        context.reach.upstream.clone(),
         context.ledger.clone(),
     );
     let access = AccessRules::new(config.allow.clone(), config.allow_write.clone());
@@ -210,7 +209,7 @@ pub(super) fn server(
         pages: Pages {
             uri: context.uri.clone(),
             checkpoint: config.checkpoint.display().to_string(),
-            upstream: context.upstream.clone(),
+            upstream: context.reach.upstream.clone(),
             gate: context.gate.clone(),
             ledger: context.ledger.clone(),
             nodes: context.nodes.clone(),

@@ -24,7 +24,6 @@ use crate::{
     },
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
-    upstream::Upstream,
     wait,
     write_queue::WriteQueue,
 };
@@ -36,7 +35,6 @@ const SEARCH: Duration = Duration::from_secs(10);
 /// What the tasks of this process share, and the settings of the tasks that manage the master.
 pub(super) struct Context {
     pub(super) ledger: Arc<Ledger>,
-    pub(super) upstream: Arc<Upstream>,
     pub(super) gate: gate::Rx,
     pub(super) write_queue: WriteQueue,
     pub(super) nodes: Arc<Nodes>,
@@ -111,7 +109,7 @@ impl Context {
                 let writable = self.ledger.seen_store().is_some();
                 let claim = move || rosmaster.claim_orphan(port, writable);
                 if let Some(orphan) = wait::within(SEARCH, claim).await.flatten() {
-                    process.adopt(orphan, &self.ledger, &self.upstream);
+                    process.adopt(orphan, &self.ledger, &self.reach.upstream);
                 }
                 Some(process)
             }

@@ -87,7 +87,7 @@ fn write(checkpoint: &Path, kept: &ReportRecord) -> io::Result<()> {
     )?;
     fs::rename(&fresh, &path)?;
     let mut others = files(checkpoint)?;
-    // The new report always stays. If the clock was set back, its name would make it the oldest.
+    // The new report always stays. Its number is low if the earlier reports could not be read at the start.
     others.retain(|other| *other != path);
     let surplus = (others.len() + 1).saturating_sub(KEPT);
     others.iter().take(surplus).try_for_each(fs::remove_file)

@@ -119,8 +119,7 @@ impl CutOff {
         }
     }
 
-    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any partition
-    /// of being cut off.
+    /// Notes that the leader may make these calls of this computer. They do not count as others' changes in any partition.
     pub fn expect_in_all(&mut self, calls: &[Request]) {
         for partition in &mut self.partitions {
             partition.changes.expect(calls.iter().cloned());
@@ -270,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_period_that_ends_without_loss_keeps_the_writes_of_the_one_before() {
+    fn a_partition_that_ends_without_loss_keeps_the_writes_of_the_one_before() {
         let mut cut_off = begun();
         cut_off.add(&[change(5, set("/a", 1))], false);
         cut_off.begin(base());
@@ -284,7 +283,7 @@ mod tests {
 
     /// The leader made the first partition's write twice, because its first answer was lost.
     #[test]
-    fn a_write_that_is_sent_again_is_no_change_of_others_in_later_periods() {
+    fn a_write_that_is_sent_again_is_no_change_of_others_in_later_partitions() {
         let mut cut_off = begun();
         cut_off.add(&[change(5, set("/count", 1))], false);
         cut_off.begin(base());
@@ -309,7 +308,7 @@ mod tests {
 
     /// The first partition's writes are on their way when the second begins.
     #[test]
-    fn the_second_of_two_periods_continues_from_the_first() {
+    fn the_second_of_two_partitions_continues_from_the_first() {
         let others = base();
         let mut cut_off = begun();
         cut_off.add(&[change(5, set("/count", 1))], false);

@@ -86,7 +86,7 @@ impl Member {
     /// From now on, keeps answered writes for the leader. `base` is the present state.
     fn begin_cut_off(&mut self, base: Master) {
         let first = self.cut_off.is_empty();
-        // Before etcd has been read, the others' state is unknown. It will be compared with the first period's base.
+        // Before etcd has been read, the others' state is unknown. It will be compared with the first partition's base.
         if first || self.reading.loaded {
             self.cut_off.begin(base);
         }

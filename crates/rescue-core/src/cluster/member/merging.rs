@@ -47,7 +47,7 @@ enum Step {
 #[derive(Debug)]
 pub(super) struct Merging {
     /// The name under which this computer sends its partition writes. It is the same for all partitions:
-    /// what an earlier period has changed is older than the writes of a later one, and no conflict.
+    /// what an earlier partition has changed is older than the writes of a later one, and no conflict.
     id: Arc<str>,
     step: Step,
     /// The number of the last request to the leader. Answers to earlier ones are ignored.
@@ -148,7 +148,7 @@ impl Member {
         }
     }
 
-    /// Notes that these writes were kept. If the period that they belong to is being merged already, they are sent with
+    /// Notes that these writes were kept. If the partition that they belong to is being merged already, they are sent with
     /// what is left of it.
     pub(super) fn also_send(&mut self, kept: &[Request]) {
         if let Some(unsent) = &mut self.merging.unsent
@@ -165,19 +165,19 @@ impl Member {
 
     /// Decides which of the remaining writes conflict with others' changes, up to the journal's last record.
     fn find_conflicts(&mut self, now: Instant) {
-        let Some(period) = self.cut_off.first_mut() else {
+        let Some(partition) = self.cut_off.first_mut() else {
             self.merging.step = Step::Idle;
             return;
         };
         let left = self.merging.unsent.take();
-        let left = left.unwrap_or_else(|| period.pending.calls().cloned().collect());
+        let left = left.unwrap_or_else(|| partition.pending.calls().cloned().collect());
         if Mutant::MergesByState.lives() {
-            period.changes = Changes::default();
-            period
+            partition.changes = Changes::default();
+            partition
                 .changes
-                .note_difference(&period.base, &self.journal.state);
+                .note_difference(&partition.base, &self.journal.state);
         }
-        let merged = merge::merge(&period.changes, &self.journal.state, &left);
+        let merged = merge::merge(&partition.changes, &self.journal.state, &left);
         let parameters = merged.lost.iter();
         let parameters = parameters.filter_map(|lost| parameter_of(&lost.call));
         self.merging.untold.extend(parameters.chain(merged.equal));
@@ -191,14 +191,14 @@ impl Member {
         self.next_portion(now);
     }
 
-    /// Drops the oldest period's other writes, which are lost or need not be sent, also from the file. After a restart
+    /// Drops the oldest partition's other writes, which are lost or need not be sent, also from the file. After a restart
     /// this computer would not know why, and send them.
     fn keep_only(&mut self, writes: &[Request]) {
-        let Some(period) = self.cut_off.first_mut() else {
+        let Some(partition) = self.cut_off.first_mut() else {
             return;
         };
-        if period.pending.len() > writes.len() {
-            period.pending = writes.iter().collect();
+        if partition.pending.len() > writes.len() {
+            partition.pending = writes.iter().collect();
             if !self.chores.keeps_file() {
                 self.store_all_writes();
             }

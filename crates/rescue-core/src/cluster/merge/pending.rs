@@ -1,4 +1,4 @@
-//! The writes of one partition, without those that later writes of the period made superfluous.
+//! The writes of one partition, without those that later writes of the partition made superfluous.
 
 use std::collections::{BTreeMap, HashMap};
 

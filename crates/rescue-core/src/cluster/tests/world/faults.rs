@@ -142,7 +142,7 @@ impl Network {
 impl World {
     pub(super) fn etcd_is_lost(&mut self, at: usize) {
         self.counts.etcds_lost += 1;
-        // What it answered as the leader of the lost journal has a period of its own, too.
+        // What it answered as the leader of the lost journal has a partition of its own, too.
         self.computers[at].times_alone += 1;
         self.history.forgets(at, self.now);
     }
