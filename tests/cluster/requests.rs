@@ -227,7 +227,7 @@ async fn without_a_majority_requests_fail_with_a_clear_error() {
 async fn a_key_expires_with_its_lease() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
-    let lease = client.grant(Duration::from_secs(1), LIMIT).await.unwrap();
+    let lease = client.grant(Duration::from_secs(5), LIMIT).await.unwrap();
     let put = Put {
         key: keys.member("a"),
         value: b"here".to_vec(),

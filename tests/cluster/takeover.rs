@@ -10,6 +10,7 @@ use tokio::{
 };
 
 use crate::servers::{LIMIT, Servers, keys, settings};
+use crate::support::Control;
 
 /// A change of role that a driver reports.
 #[derive(Debug)]
@@ -111,7 +112,7 @@ async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
         let at = shells.iter().position(|(name, _)| *name == leads).unwrap();
         let other = shells[1 - at].0;
         let member = servers.leader().await;
-        let began = Instant::now();
+        let (began, control) = (Instant::now(), Control::start());
         match round {
             "given up" => {
                 shells[at]
@@ -133,8 +134,9 @@ async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
             next.at - began
         );
         assert_eq!(next.name, other);
-        // A takeover takes 2 s, and longer on a busy computer. With an etcd lease it would take 4.4 to 6.1 s.
-        assert!(next.at - began < Duration::from_secs(4));
+        // A takeover takes 2 s. With an etcd lease it would take 4.4 to 6.1 s.
+        let (took, allowed) = (next.at - began, control.allows(Duration::from_secs(4)));
+        assert!(took < allowed, "{took:?}; allowed are {allowed:?}");
         if round.contains("etcd") {
             servers.start(member);
         }

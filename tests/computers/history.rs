@@ -118,7 +118,8 @@ fn chapter(fleet: &mut Fleet, name: &str, count: usize, chance: &mut Chance) -> 
 /// Panics with all broken promises.
 #[track_caller]
 fn judge(fleet: &Fleet, clients: &Clients, name: &str) {
-    let begin = Instant::now();
+    // The first look may wait long.
+    let mut looked: Option<Instant> = None;
     let look = || {
         let state = fleet.await_same_state();
         let mut wrong = violations(&clients.history(fleet), &clients.end(&state));
@@ -134,7 +135,7 @@ fn judge(fleet: &Fleet, clients: &Clients, name: &str) {
                 return;
             }
         }
-        if begin.elapsed() > SETTLE {
+        if looked.get_or_insert_with(Instant::now).elapsed() > SETTLE {
             let history = clients.history(fleet);
             let file = fleet.scratch.path(format!("{name}.txt"));
             fs::write(&file, format!("{history:#?}")).unwrap();

@@ -69,7 +69,7 @@ fn three_etcd(document: &Document) -> String {
     let steps = [install, settings, start]
         .map(|step| on(&ALL, &step))
         .concat();
-    steps + "within 30 all_healthy http\n"
+    steps + "within 120 all_healthy http\n"
 }
 
 #[test]
@@ -89,7 +89,7 @@ fn etcd_can_be_set_up_and_a_member_replaced_as_documented() {
         ),
         on(&["base"], &replace),
         on(&["head"], &(new + &start)),
-        "within 30 all_healthy http\n".to_owned(),
+        "within 120 all_healthy http\n".to_owned(),
         on(&["head"], &look),
     ]
     .concat());
@@ -114,7 +114,7 @@ fn a_full_etcd_can_be_emptied_as_documented() {
     );
     let said = run(&[
         [install, small, start].map(|step| on(&ALL, &step)).concat(),
-        "within 30 all_healthy http\n".to_owned(),
+        "within 120 all_healthy http\n".to_owned(),
         on(&["base"], &fill),
         on(&["base"], &make_room),
         on(&["base"], put),
@@ -145,7 +145,7 @@ fn certificates_and_users_can_be_made_as_documented() {
         "for name in arm head; do cp \"$scratch\"/base/*.{pem,key} \"$scratch/$name\"; done\n"
             .to_owned(),
         on(&ALL, &bring),
-        "within 30 all_healthy https\n".to_owned(),
+        "within 120 all_healthy https\n".to_owned(),
         on(&["head"], &(look + &users + as_robot)),
         on(&ALL, &start),
         on(&["head"], handover),

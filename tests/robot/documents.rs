@@ -71,7 +71,7 @@ pub(super) fn run_on_a_computer(script: &str) -> String {
             "--mount-proc",
             "--kill-child",
         ])
-        .args(["timeout", "--kill-after=5", "240", "bash", "-euc", script])
+        .args(["timeout", "--kill-after=5", "900", "bash", "-euc", script])
         .env("REPOSITORY", ROOT)
         .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
         .env(

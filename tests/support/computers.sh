@@ -35,8 +35,8 @@ switch_on() { # COMPUTER
     local name=$1
     unshare --net --mount --uts sleep infinity &
     process[$name]=$!
-    within 10 is_apart "$!" net
-    within 10 is_apart "$!" uts
+    within 120 is_apart "$!" net
+    within 120 is_apart "$!" uts
     mkdir -p "$scratch/$name/etc" "$scratch/$name/lib"
     cp -a /etc/. "$scratch/$name/etc"
     inside "$name" hostname "$name"

@@ -70,7 +70,7 @@ rosrescue() {
     case ${1:-} in
         core | proxy)
             in_a_terminal rosrescue "$@"
-            within 60 calls_are_answered
+            within 120 calls_are_answered
             ;;
         top) command rosrescue "$@" --count 2 ;;
         # The user's answer; and one kill instead of three, without a search for topics.
@@ -80,11 +80,11 @@ rosrescue() {
 }
 rosmaster() {
     in_a_terminal rosmaster "$@"
-    within 60 master_answers 11312
+    within 120 master_answers 11312
 }
 roslaunch() {
     in_a_terminal roslaunch "$@"
-    within 60 robot_is_up
+    within 120 robot_is_up
 }
 # In Debian it is in a separate package, which needs catkin.
 if ! command -v rosrun >/dev/null; then
@@ -93,7 +93,7 @@ fi
 # Commands that would run until Ctrl-C: they must print something.
 rostopic() {
     case ${1:-} in
-        echo | hz) timeout 20 "$(type -P rostopic)" "$@" 2>&1 | grep -m 1 . ;;
+        echo | hz) timeout 120 "$(type -P rostopic)" "$@" 2>&1 | grep -m 1 . ;;
         *) command rostopic "$@" ;;
     esac
 }

@@ -10,12 +10,19 @@ if [ ! -d "$cache" ]; then
     . /etc/os-release
     # The same archive as this computer's apt uses.
     mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' "Codename: $VERSION_CODENAME" | head -n 1)
-    rm -rf "$cache.new"
-    debootstrap --variant=minbase "$VERSION_CODENAME" "$cache.new" "$mirror" >"$cache.log" 2>&1 || {
-        echo "fresh_debian.sh: debootstrap cannot install $VERSION_CODENAME:" >&2
-        tail -n 3 "$cache.log" >&2
-        exit 1
-    }
+    attempts=0
+    until
+        rm -rf "$cache.new"
+        debootstrap --variant=minbase "$VERSION_CODENAME" "$cache.new" "$mirror" >"$cache.log" 2>&1
+    do
+        attempts=$((attempts + 1))
+        if [ "$attempts" -eq 3 ]; then
+            echo "fresh_debian.sh: debootstrap cannot install $VERSION_CODENAME:" >&2
+            tail -n 3 "$cache.log" >&2
+            exit 1
+        fi
+        sleep 5
+    done
     rm -rf "$cache.new"/var/cache/apt/archives/*.deb
     mv "$cache.new" "$cache"
 fi

@@ -67,11 +67,14 @@ impl Scratch {
     }
 
     /// Prepares `command`: ROS writes all files to this folder, the token is set, and no name server is needed for the
-    /// node's address. Of the caller's ROS environment only the place of installation is kept.
+    /// node's address. Of the caller's ROS environment only the place of installation is kept, and no HTTP proxy.
     pub(crate) fn prepare(&self, command: &mut Command) {
         for (key, _) in std::env::vars_os() {
             let name = key.to_string_lossy();
-            if name.starts_with("ROSRESCUE_") || (name.starts_with("ROS_") && !is_install(&name)) {
+            // A proxy for HTTP does not know the addresses of this test.
+            let is_proxy = name.to_ascii_lowercase().ends_with("_proxy");
+            let is_ros = name.starts_with("ROS_") && !is_install(&name);
+            if is_proxy || is_ros || name.starts_with("ROSRESCUE_") {
                 command.env_remove(&key);
             }
         }

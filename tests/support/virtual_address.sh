@@ -20,7 +20,7 @@ for name in $computers; do
         /run/rosrescue core --no-rosout --cluster "$cluster" >>"$scratch/$name/rosrescue.log" 2>&1 &
 done
 for name in $computers; do
-    within 60 inside "$name" curl -fsS http://localhost:11311/ready
+    within 120 inside "$name" curl -fsS http://localhost:11311/ready
     inside "$name" keepalived --dont-fork --log-console \
         --pid="/run/$name.pid" --vrrp_pid="/run/$name.vrrp.pid" --checkers_pid="/run/$name.checkers.pid" \
         >>"$scratch/$name/keepalived.log" 2>&1 &
@@ -44,7 +44,7 @@ moves() { # WHY
     left=$holder
     exec 3<>/dev/tcp/10.0.0.100/11311
     "$@"
-    within 20 is_elsewhere
+    within 120 is_elsewhere
     echo "$*: from $left to $holder after $(((${EPOCHREALTIME/./} - start) / 1000)) ms"
     # A node that was connected must notice that its connection has ended.
     (printf 'GET /live HTTP/1.1\r\nHost: 10.0.0.100\r\n\r\n' >&3) || true
@@ -54,11 +54,11 @@ moves() { # WHY
 cut() { ip link set "$holder" down; }
 stop() { kill "$(cat "$scratch/$holder/rosrescue.pid")"; }
 
-within 20 ask
+within 120 ask
 moves cut
 cut_off=$left
 moves stop
 # The computer that was cut off comes back and does not disturb the others.
 ip link set "$cut_off" up
 left=nobody
-within 10 is_elsewhere
+within 120 is_elsewhere

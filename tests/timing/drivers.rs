@@ -91,8 +91,10 @@ impl Drivers {
     /// Panics if a pass takes longer than `limit` while `event` takes place, or if anything fails.
     #[track_caller]
     fn assert_no_stall(&mut self, what: &str, limit: f64, mut event: impl FnMut()) {
-        let is_calm = (1..=ATTEMPTS).any(|_| self.is_calm(what, limit, &mut event));
-        assert!(is_calm, "{what}: drivers stall each time");
+        // `is_calm` panics if drivers stall on a computer that is not busy.
+        if !(1..=ATTEMPTS).any(|_| self.is_calm(what, limit, &mut event)) {
+            println!("{what}: this computer was too busy to measure anything, {ATTEMPTS} times");
+        }
     }
 
     /// Whether no pass takes longer than `limit` while `event` takes place. Panics if one does on a computer that is not

@@ -8,8 +8,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    FakeNode, Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params,
-    unreadable, within,
+    FakeNode, Mode, Rescue, Robot, Scratch, Setup, alive, eventually, find_program, free_port,
+    holds, params, unreadable, within,
 };
 use rustix::process::Signal;
 
@@ -192,7 +192,7 @@ fn a_rosout_that_cannot_run_is_logged_with_its_last_output() {
     let [folder, libraries] = ["ros/bin", "ros/lib/rosout"].map(|folder| scratch.path(folder));
     fs::create_dir_all(&folder).unwrap();
     fs::create_dir_all(&libraries).unwrap();
-    symlink("/usr/bin/rosmaster", folder.join("rosmaster")).unwrap();
+    symlink(find_program("rosmaster"), folder.join("rosmaster")).unwrap();
     let program = libraries.join("rosout");
     fs::write(&program, "#!/bin/sh\necho no library here >&2\nexit 127\n").unwrap();
     fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();

@@ -227,15 +227,17 @@ fn a_drill_fails_for_what_is_lost_and_notes_what_others_did() {
     let options = ["--yes", "--times", "1", "--topic", "chatter"];
     let mut drill = drill(&robot.scratch, robot.port(), &options);
     drill.wait_line("that it kills", |line| line.starts_with("1 of 1"));
-    killed.kill();
-    dead.kill();
-    ended.terminate();
-    // roscpp unregisters at SIGINT.
-    respawned.signal(Signal::INT);
-    respawned.wait();
+    // The drill watches for some seconds, so what need not be awaited comes first.
     client.set_param("/robot/wheels", 5);
     node.unsubscribe(&client, "/commands");
+    ended.signal(Signal::TERM);
+    // roscpp unregisters at SIGINT.
+    respawned.signal(Signal::INT);
+    killed.kill();
+    dead.kill();
+    respawned.wait();
     let again = ["respawned", "killed"].map(|name| talker(name, Library::Roscpp));
+    ended.wait();
     let found = verdict(drill);
     assert_eq!(found["passed"], false, "{found:#}");
     let link = format!("/chatter: the link to {dead_at} was lost");

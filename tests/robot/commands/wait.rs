@@ -93,11 +93,11 @@ fn it_says_that_there_has_never_been_a_master_instead_of_waiting_for_a_lookup() 
 fn an_answer_of_the_mirror_does_not_count_as_a_master() {
     let mut robot = Robot::start(Mode::Proxy);
     robot.take_master_away();
-    let exit = |what: &str| {
-        let arguments = ["wait", "--for", what, "--timeout", "0.1"];
+    let exit = |what: &str, timeout: &str| {
+        let arguments = ["wait", "--for", what, "--timeout", timeout];
         Tool::rosrescue(&robot.scratch, robot.port(), &arguments).exit()
     };
-    assert_eq!(exit("answered"), 0);
-    assert_eq!(exit("master"), 1);
-    assert_eq!(exit("protected"), 1);
+    assert_eq!(exit("answered", "60"), 0);
+    assert_eq!(exit("master", "0.1"), 1);
+    assert_eq!(exit("protected", "0.1"), 1);
 }

@@ -144,11 +144,14 @@ fn other_writes_are_not_delayed_by_calls_that_only_the_master_understands() {
     let client = robot.client();
     let many = (0..5_000).map(|i| (format!("p{i}"), Value::from(format!("the value of {i}"))));
     client.set_param("/many", Value::Struct(Struct::from_iter(many)));
-    let start = Instant::now();
-    for value in 0..100 {
-        client.set_param("/mine", value);
-    }
-    let alone = start.elapsed() / 100;
+    let measure_alone = || {
+        let start = Instant::now();
+        for value in 0..100 {
+            client.set_param("/mine", value);
+        }
+        start.elapsed() / 100
+    };
+    let before = measure_alone();
     let (waits, time) = waits_beside(&client, || {
         thread::scope(|scope| {
             for number in 0..CALLS {
@@ -159,6 +162,8 @@ fn other_writes_are_not_delayed_by_calls_that_only_the_master_understands() {
             }
         });
     });
+    // This computer may have become busy.
+    let alone = before.max(measure_alone());
     println!(
         "{} writes in {time:?}; without load {alone:?} each",
         waits.len()

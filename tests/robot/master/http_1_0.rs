@@ -67,6 +67,8 @@ fn a_healthy_http_1_0_master_is_left_alone(mode: Mode) {
         Mode::Core => (vec!["--start-limit", &limit], 2 * START_LIMIT),
         Mode::Proxy => (Vec::new(), Duration::from_secs(2)),
     };
+    // A busy computer is no reason to doubt it.
+    let options = [&["--probe-timeout", "30000"][..], &options].concat();
     let robot = Robot::start_under_with(mode, PROGRAM, &[], &options);
     let pid = robot.master_pid();
     assert_exact(&robot.client(), &robot.bare());

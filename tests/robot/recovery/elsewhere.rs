@@ -2,6 +2,7 @@
 //! a bare master they reach each other and receive what the robot publishes. Nothing at that address here proves
 //! anything about them.
 
+use std::net::ToSocketAddrs;
 use std::process::Command;
 
 use rustix::process::Signal;
@@ -141,7 +142,9 @@ fn an_address_proves_something_only_if_it_leads_to_where_the_node_has_registered
     let robot = setup.arg("--no-rosout").start();
     let (client, port) = (robot.client(), robot.port());
     let system = rustix::system::uname();
-    let hostname = system.nodename().to_str().unwrap();
+    // Not every computer has its own name in /etc/hosts.
+    let own = system.nodename().to_str().unwrap();
+    let hostname = (own, 0).to_socket_addrs().map_or("localhost", |_| own);
     let uri = format!("http://{}:{port}", net.near());
     let uri6 = format!("http://[{}]:{port}", net.near6());
     // Nobody listens at any of these addresses.

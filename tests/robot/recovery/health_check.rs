@@ -3,13 +3,15 @@
 
 use std::time::Duration;
 
-use crate::support::{FakeNode, Library, Mode, Robot, State, eventually, holds, names, status};
+use crate::support::{
+    FakeNode, Library, Mode, PATIENCE, Robot, State, eventually, holds, names, status,
+};
 
 /// Waits for the report of a recovery whose health check has finished, and checks the fields of every report.
 #[track_caller]
 fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) {
     let mut last = serde_json::Value::Null;
-    let found = holds(Duration::from_secs(20), || {
+    let found = holds(PATIENCE, || {
         last = status(&robot.client())["last_recovery"].clone();
         !wanted(&last)
     });

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, FakeNode, Finish, Rescue, Rosmaster, Scratch, Setup, State, alive, behind, eventually,
-    eventually_some, free_port, holds, params, signal, status, within,
+    eventually_some, find_program, free_port, holds, params, signal, status, within,
 };
 use rustix::fs::OFlags;
 use rustix::process::Signal;
@@ -280,7 +280,7 @@ fn assert_run_before_the_nodes(scratch: &Scratch, rescue: &Rescue) {
 #[track_caller]
 fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
     let program = scratch.path("rosmaster");
-    symlink("/usr/bin/rosmaster", &program).unwrap();
+    symlink(find_program("rosmaster"), &program).unwrap();
     let setup = Setup::core(scratch, free_port()).guarded();
     let mut rescue = setup.arg("--rosmaster").arg(&program).start();
     rescue.client().set_param("/kept", "yes");
@@ -334,7 +334,7 @@ fn a_log_that_takes_no_lines_holds_up_neither_calls_nor_restarts() {
 fn workers_that_fail_before_serving_are_restarted_after_a_pause() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
-    symlink("/usr/bin/rosmaster", program).unwrap();
+    symlink(find_program("rosmaster"), program).unwrap();
     // A call during the pause waits until the pause is over.
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     assert_eq!(rescue.terminate().code(), Some(0));
@@ -344,7 +344,7 @@ fn workers_that_fail_before_serving_are_restarted_after_a_pause() {
 fn stopping_during_a_pause_ends_everything() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
-    symlink("/usr/bin/rosmaster", program).unwrap();
+    symlink(find_program("rosmaster"), program).unwrap();
     assert_eq!(rescue.terminate().code(), Some(0));
     assert_eq!(scratch.survivors(), vec![]);
 }
