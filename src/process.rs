@@ -2,7 +2,12 @@
 
 use std::{io, panic::resume_unwind, path::Path, process::ExitStatus, thread, time::Duration};
 
-use rustix::process::{Pid, Signal, getpriority_process, kill_process, setpriority_process};
+use rustix::{
+    io::Errno,
+    process::{
+        Pid, Signal, getpriority_process, kill_process, setpriority_process, test_kill_process,
+    },
+};
 use tokio::{
     process::{Child, Command},
     runtime::Handle,
@@ -95,7 +100,9 @@ pub(crate) fn signal_process(pid: u32, signal: Signal) {
 /// Whether the process `pid` exists and has not ended. A zombie has: its parent may never wait for it, as the first
 /// process of some containers.
 pub(crate) fn is_alive(pid: u32) -> bool {
-    Stat::read(pid).is_some_and(|stat| !stat.is_zombie())
+    // EPERM: the process is another user's. A `stat` that cannot be read says nothing.
+    let exists = raw_pid(pid).is_some_and(|pid| test_kill_process(pid) != Err(Errno::SRCH));
+    exists && !Stat::read(pid).is_some_and(Stat::is_zombie)
 }
 
 /// Whether the process `pid` runs a program with this name, according to its command line. A process id that was
