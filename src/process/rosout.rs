@@ -29,8 +29,10 @@ impl Rosout {
     /// Finds the rosout program. `None` if it is not installed. Its stderr goes to a file next to `checkpoint`.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let rosmaster = find_program("rosmaster", &["bin"]);
-        let beside = rosmaster.as_deref().and_then(beside);
-        let program = beside.or_else(|| find_program("rosout", &["lib/rosout"]))?;
+        let program = (rosmaster.as_deref().and_then(of_ros_with))
+            .or_else(|| find_program("rosout", &["lib/rosout"]))
+            // An overlay may have a rosmaster only.
+            .or_else(|| of_ros_with(Path::new("/usr/bin/rosmaster")))?;
         Some(Self {
             program,
             output: Output::beside(checkpoint, ".rosout-output.log"),
@@ -90,7 +92,7 @@ impl Rosout {
 
 /// The rosout of the ROS installation that contains `rosmaster`. Only there is the one of a ROS that was built from
 /// source or that conda has installed.
-fn beside(rosmaster: &Path) -> Option<PathBuf> {
+fn of_ros_with(rosmaster: &Path) -> Option<PathBuf> {
     let program = rosmaster.ancestors().nth(2)?.join("lib/rosout/rosout");
     is_program(&program).then_some(program)
 }
