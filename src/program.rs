@@ -81,7 +81,8 @@ fn report(error: &(dyn Error + 'static)) -> ExitCode {
         }
         None => {
             // The name and address of another computer may be in it.
-            eprintln!("rosrescue: {}", Printable::line(&error.to_string()));
+            let line = error.to_string();
+            let _ = writeln!(std::io::stderr(), "rosrescue: {}", Printable::line(&line));
             ExitCode::FAILURE
         }
     }

@@ -218,7 +218,7 @@ async fn install(
             ));
         }
     } else if !is_enabled || (!is_running && paths.systemd_runs()) {
-        // A service that has failed or a proxy that waits for its first master does not run, but its socket listens.
+        // A service whose starts fail or a proxy that waits for its first master does not run, but its socket listens.
         let listens =
             !is_running && paths.systemd_runs() && paths.systemctl_confirms("is-active", UNITS[1]);
         if listens {

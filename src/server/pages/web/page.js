@@ -168,6 +168,8 @@ async function refused() {
       showStatus();
       showNow();
       readState();
+    } else {
+      setLink("lost", "no answer from rosrescue, retrying");
     }
   } catch {
     setLink("lost", "no answer from rosrescue, retrying");
