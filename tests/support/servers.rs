@@ -10,11 +10,12 @@ use rescue_core::cluster::journal::Keys;
 use rosrescue::cluster::etcd::{Credentials, Etcd, Options};
 use rustix::process::Signal;
 
+use super::patience::PATIENCE;
 use super::process::{signal, stop};
 use super::scratch::{Scratch, free_port};
 
 /// How long an answer may take on two busy cores.
-pub(crate) const LIMIT: Duration = Duration::from_secs(60);
+pub(crate) const LIMIT: Duration = Duration::from_secs(20);
 
 #[derive(Debug)]
 pub(crate) struct Servers {
@@ -61,11 +62,11 @@ impl Servers {
         if scheme == "http" {
             let keys = Keys::new("robot");
             let client = servers.client();
-            client.view(&keys, LIMIT).await.unwrap();
+            client.view(&keys, PATIENCE).await.unwrap();
             // A member answers only after the others have got to know its address.
             let start = Instant::now();
             while let Some(error) = client.status(LIMIT).await.into_iter().find_map(Result::err) {
-                assert!(start.elapsed() < LIMIT, "{error}");
+                assert!(start.elapsed() < PATIENCE, "{error}");
                 tokio::time::sleep(Duration::from_millis(10)).await;
             }
         }
@@ -164,7 +165,7 @@ impl Servers {
     pub(crate) async fn leader(&self) -> usize {
         let (client, start) = (self.client(), Instant::now());
         loop {
-            assert!(start.elapsed() < LIMIT, "etcd has no leader");
+            assert!(start.elapsed() < PATIENCE, "etcd has no leader");
             let all = client.status(Duration::from_secs(1)).await;
             if let Some(at) = all
                 .iter()
