@@ -239,10 +239,8 @@ fn the_previous_generation_makes_room(full: i32) {
     assert!(fs.read(&names.path, 1 << 20).is_ok());
 }
 
-/// A loss of power just after a compaction can leave some records only in the previous generation. A start that is
-/// killed must not replace that file before the next generation is complete.
-#[test]
-fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
+/// A store that has just been compacted. Some synced records are durable only in the previous generation.
+fn just_compacted() -> (SimFs, Model, Store<SimFs>) {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -255,6 +253,14 @@ fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
     model.sync(&mut store);
     store.finish_compaction(job.run()).unwrap();
     assert_eq!(model.synced, 3);
+    (fs, model, store)
+}
+
+/// A loss of power just after a compaction can leave some records only in the previous generation. A start that is
+/// killed must not replace that file before the next generation is complete.
+#[test]
+fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
+    let (fs, model, store) = just_compacted();
     drop(store);
     for (nth, image) in fs.after_power_loss(4_096).iter().enumerate() {
         let context = format!("image {nth}");
@@ -268,18 +274,7 @@ fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
 /// not replace it.
 #[test]
 fn a_present_file_that_cannot_be_synced_never_replaces_the_previous_generation() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let (mut store, _) = open(&fs).unwrap();
-    model.begin(&mut store);
-    model.append(&mut store, 1);
-    let job = store
-        .begin_compaction(model.checkpoint(store.seq()))
-        .unwrap();
-    model.append(&mut store, 2);
-    model.sync(&mut store);
-    store.finish_compaction(job.run()).unwrap();
-    assert_eq!(model.synced, 3);
+    let (fs, mut model, mut store) = just_compacted();
     fs.arm(0, Fault::Once(EIO));
     let job = store
         .begin_compaction(model.checkpoint(store.seq()))
