@@ -44,7 +44,7 @@ impl Node {
                 let text = "no such method".to_owned();
                 Reply::Fault { code: 1, text }
             } else {
-                notes.lock().unwrap().push(call);
+                notes.lock().unwrap().push(blank(call));
                 Reply::Value(vec![Value::Int(1), "".into(), 0.into()].into())
             };
             FakeMaster::proper(&reply)

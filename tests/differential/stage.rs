@@ -182,8 +182,12 @@ impl<'n> Stage<'n> {
     }
 
     /// Compares the callbacks of a node, and waits for replacements of those that a crash has lost.
-    fn judge(&self, node: &Node, expected: &[Expected], heard: Vec<Call>) -> Result<(), Failure> {
-        let mut heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
+    fn judge(
+        &self,
+        node: &Node,
+        expected: &[Expected],
+        mut heard: Vec<Call>,
+    ) -> Result<(), Failure> {
         let mut expected = expected.to_vec();
         if unordered() {
             // The order in which rosmaster notifies nodes is that of a dictionary, too.
