@@ -67,9 +67,11 @@ impl SmallDisk {
         );
     }
 
+    /// A core whose checkpoint and whose master's log are on this disk, as they are by default.
     pub(crate) fn rescue(&self, scratch: &Scratch) -> Rescue {
         Setup::core(scratch, free_port())
             .at_checkpoint(self.folder.join("latest-chkpt.yaml"))
+            .env("ROS_LOG_DIR", &self.folder)
             .wrapped(|command| self.on(command))
             .start()
     }
