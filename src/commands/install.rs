@@ -26,7 +26,7 @@ use self::{
 };
 use super::{
     CommandFailure, Exit,
-    check::units::{self as others, ADD_WAIT, UnitKind},
+    check::units::{self as others, ADD_WAIT, REMOVE_ROSCORE, UnitKind},
 };
 use crate::{
     cli::{InstallArgs, ScopeArgs, UninstallArgs},
@@ -276,13 +276,22 @@ impl SystemChanges {
     ) -> (Vec<String>, Vec<String>) {
         let (mut disabled, mut before) = (Vec::new(), Vec::new());
         let all = paths.other_units().into_iter();
+        let needs = |port| service.listen.iter().any(|at| at.port() == port);
         for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {
             match kind {
-                UnitKind::Roscore if !service.runs_rosmaster => self.obstacles.push(format!(
-                    "{name} starts a master at port 11311, which rosrescue needs: give the master another port, as \
-                     in `rosmaster --core -p 11312`, then run this again"
+                UnitKind::Roscore(port) | UnitKind::RoscoreAndNodes(port) if !needs(port) => {}
+                UnitKind::Roscore(port) | UnitKind::RoscoreAndNodes(port)
+                    if !service.runs_rosmaster =>
+                {
+                    self.obstacles.push(format!(
+                        "{name} starts a master at port {port}, which rosrescue needs: give the master another port, \
+                         as in `rosmaster --core -p 11312`, then run this again"
+                    ));
+                }
+                UnitKind::RoscoreAndNodes(_) => self.obstacles.push(format!(
+                    "{name} starts a master and nodes: {REMOVE_ROSCORE}, then run this again"
                 )),
-                UnitKind::Roscore => {
+                UnitKind::Roscore(_) => {
                     self.notes.push(format!(
                         "{name} starts a master: rosrescue replaces it, and uninstall enables it again"
                     ));

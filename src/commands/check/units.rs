@@ -5,6 +5,10 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use clap::CommandFactory;
+
+use crate::{cli::Cli, ros_env::DEFAULT_MASTER_PORT};
+
 /// Folders of the system's units. A unit in an earlier folder overrides one in a later folder.
 const FOLDERS: [&str; 4] = [
     "/etc/systemd/system",
@@ -15,6 +19,20 @@ const FOLDERS: [&str; 4] = [
 /// What to do about a unit that runs roslaunch. That of robot_upstart starts a script.
 pub(in crate::commands) const ADD_WAIT: &str = "add --wait to its roslaunch, so that it never starts a master \
                                                 (robot_upstart: `rosrun robot_upstart install --wait …`)";
+/// What to do about a unit that runs a roscore and nodes.
+pub(in crate::commands) const REMOVE_ROSCORE: &str = "remove roscore from it, and let it wait for the master (roslaunch --wait, or `rosrescue wait`)";
+/// Programs whose arguments name other programs that they do not start.
+const LOOKUPS: [&str; 9] = [
+    "echo",
+    "grep",
+    "killall",
+    "logger",
+    "pgrep",
+    "pidof",
+    "pkill",
+    "printf",
+    "systemctl",
+];
 /// Largest unit or script that is read, in bytes.
 const MOST: u64 = 1 << 20;
 
@@ -31,8 +49,10 @@ pub(in crate::commands) struct Unit {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::commands) enum UnitKind {
     Rosrescue,
-    /// The unit runs a roscore, or a rosmaster at port 11311.
-    Roscore,
+    /// The unit runs a roscore or rosmaster at this port.
+    Roscore(u16),
+    /// The unit runs a roscore or rosmaster at this port, and nodes.
+    RoscoreAndNodes(u16),
     /// The unit runs roslaunch, which starts a master if it finds none.
     Roslaunch,
 }
@@ -84,53 +104,95 @@ pub(super) fn read(path: &Path) -> String {
     }
 }
 
-/// Classifies a unit by the command that it starts. If the command is a script, as with robot_upstart, its text counts.
+/// Classifies a unit by the commands that it starts. If a command is a script, as with robot_upstart, its text counts.
 fn kind_of(unit: &str) -> Option<UnitKind> {
-    let mut found = None;
-    for line in unit.lines() {
-        if line.trim_start().starts_with("ListenStream=11311") {
-            found = Some(UnitKind::Rosrescue);
+    let unit = unit.replace("\\\n", " ");
+    let mut text = String::new();
+    for line in unit.lines().map(str::trim_start) {
+        if line.starts_with("ListenStream=11311") {
+            return Some(UnitKind::Rosrescue);
         }
-        let Some(command) = line.trim_start().strip_prefix("ExecStart=") else {
+        let Some((_, command)) = line
+            .split_once('=')
+            .filter(|it| it.0.starts_with("ExecStart"))
+        else {
             continue;
         };
-        let of_command = words(command);
-        let script = command.split_whitespace().next().unwrap_or_default();
-        let script = script.trim_start_matches(['-', '@', '+', '!', ':']);
-        let of_script = || {
-            // roslaunch itself is not read: its arguments show what it does.
-            let text = match script.ends_with("roslaunch") {
-                true => String::new(),
-                false => read(Path::new(script)),
-            };
-            text.starts_with("#!").then(|| words(&text)).flatten()
-        };
-        found = found.or(of_command).or_else(of_script);
+        text.extend([command, "\n"]);
+        // roslaunch and roscore are scripts, too. Their names show what they do.
+        if started_by(command).is_none() && !command.contains("roslaunch") {
+            let script = command.split_whitespace().next().unwrap_or_default();
+            let script = read(Path::new(
+                script.trim_start_matches(['-', '@', '+', '!', ':']),
+            ));
+            if script.starts_with("#!") {
+                text.push_str(&script);
+            }
+        }
     }
-    found
+    started_by(&text)
 }
 
-/// Classifies a command line.
-fn words(text: &str) -> Option<UnitKind> {
+/// Classifies a command line or a script.
+fn started_by(text: &str) -> Option<UnitKind> {
+    let text = text.replace("\\\n", " ");
     let lines = text
         .lines()
         .filter(|line| !line.trim_start().starts_with('#'));
-    let names: Vec<_> = lines
-        .flat_map(|line| line.split(|c: char| c.is_whitespace() || "/;'\"()".contains(c)))
-        .collect();
-    let has = |name: &str| names.contains(&name);
-    let port = names
-        .iter()
-        .position(|name| ["-p", "--port"].contains(name));
-    let port = port.and_then(|at| names.get(at + 1));
-    let is_elsewhere = port.is_some_and(|port| *port != "11311");
-    match () {
-        () if has("rosrescue") => Some(UnitKind::Rosrescue),
-        () if has("roscore") || has("rosmaster") => (!is_elsewhere).then_some(UnitKind::Roscore),
-        // With --wait, roslaunch starts no master.
-        () if has("roslaunch") && !has("--wait") => Some(UnitKind::Roslaunch),
-        () => None,
+    let commands = lines.flat_map(|line| line.split([';', '&', '|']));
+    let commands = commands.map(|command| {
+        let words = command.split(|c: char| c.is_whitespace() || "/'\"()".contains(c));
+        words.filter(|word| !word.is_empty()).collect::<Vec<_>>()
+    });
+    let names_only = |words: &Vec<&str>| {
+        let is_lookup = words.iter().any(|word| LOOKUPS.contains(word));
+        is_lookup || words.iter().take(2).any(|word| *word == "which")
+    };
+    let commands: Vec<_> = commands.filter(|words| !names_only(words)).collect();
+    // The words after the program in each command that has it.
+    let after = |program: &'static str| {
+        let commands = commands.iter();
+        commands.filter_map(move |words| {
+            let at = words.iter().rposition(|word| *word == program)?;
+            words.get(at + 1..)
+        })
+    };
+    // `rosrescue wait` and the like are no service.
+    let cli = Cli::command();
+    let is_tool = |word: &&str| {
+        let mut all = cli.get_subcommands().map(clap::Command::get_name);
+        !["core", "proxy"].contains(word) && all.any(|name| name == *word)
+    };
+    if after("rosrescue").any(|words| !words.first().is_some_and(is_tool)) {
+        return Some(UnitKind::Rosrescue);
     }
+    let mut masters = after("roscore").chain(after("rosmaster"));
+    let runs_nodes = ["roslaunch", "rosrun"].map(|program| after(program).next().is_some());
+    match (masters.next().and_then(port), runs_nodes) {
+        (Some(port), [false, false]) => Some(UnitKind::Roscore(port)),
+        (Some(port), _) => Some(UnitKind::RoscoreAndNodes(port)),
+        // With --wait, roslaunch starts no master.
+        (None, _) => after("roslaunch")
+            .any(|words| !words.contains(&"--wait"))
+            .then_some(UnitKind::Roslaunch),
+    }
+}
+
+/// The port in the arguments of a roscore or rosmaster. `None` if it is not a number, as with a variable.
+fn port(arguments: &[&str]) -> Option<u16> {
+    let mut words = arguments.iter();
+    while let Some(word) = words.next() {
+        let value = match *word {
+            "-p" | "--port" => words.next().copied(),
+            _ => word
+                .strip_prefix("--port=")
+                .or_else(|| word.strip_prefix("-p")),
+        };
+        if let Some(value) = value {
+            return value.parse().ok();
+        }
+    }
+    Some(DEFAULT_MASTER_PORT)
 }
 
 fn is_enabled(folders: &[PathBuf], name: &str) -> bool {
@@ -172,6 +234,38 @@ mod tests {
             ),
             ("other.service", "ExecStart=/usr/bin/other roscored"),
             ("behind.service", "ExecStart=rosmaster --core -p 11312"),
+            (
+                "both.service",
+                "ExecStart=/bin/bash -c 'mkdir -p /var/log/robot; \\\n roscore -p11411 & roslaunch --wait a b.launch'",
+            ),
+            (
+                "looks.service",
+                "ExecStart=/bin/sh -c 'until pgrep roscore; do sleep 1; done; roslaunch --wait a b.launch'",
+            ),
+            (
+                "echo.service",
+                "ExecStart=/bin/sh -c 'echo Waiting for roscore; if which roscore; then rosrun a b; fi'",
+            ),
+            (
+                "found.service",
+                "ExecStart=/bin/sh -c 'exec $(which roslaunch) a b.launch'",
+            ),
+            (
+                "launched.service",
+                "ExecStart=/bin/sh -c 'roslaunch rosrescue core.launch'",
+            ),
+            (
+                "own.service",
+                "ExecStart=/opt/rosrescue/bin/rosrescue $OPTIONS",
+            ),
+            (
+                "two.service",
+                "ExecStart=/opt/ros/noetic/bin/roscore\nExecStartPost=/bin/sh -c 'rosrun a b'",
+            ),
+            (
+                "waiting.service",
+                "ExecStart=/bin/sh -c 'rosrescue wait && roslaunch --wait a b.launch'",
+            ),
             ("notes.txt", "ExecStart=roscore"),
         ] {
             fs::write(path(name), text).unwrap();
@@ -188,9 +282,15 @@ mod tests {
         assert_eq!(
             in_folders(&[folder.path().to_owned()], false),
             [
-                unit("core.service", UnitKind::Roscore, true),
+                unit("behind.service", UnitKind::Roscore(11312), false),
+                unit("both.service", UnitKind::RoscoreAndNodes(11411), false),
+                unit("core.service", UnitKind::Roscore(11311), true),
+                unit("found.service", UnitKind::Roslaunch, false),
+                unit("launched.service", UnitKind::Rosrescue, false),
+                unit("own.service", UnitKind::Rosrescue, false),
                 unit("rescue.service", UnitKind::Rosrescue, false),
                 unit("robot.service", UnitKind::Roslaunch, false),
+                unit("two.service", UnitKind::RoscoreAndNodes(11311), false),
             ]
         );
     }

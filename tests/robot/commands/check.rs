@@ -359,7 +359,7 @@ fn open_to_all(folder: &std::path::Path) {
     fs::set_permissions(folder, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
-/// On Debian the computer's own name resolves to 127.0.1.1. A roscore also starts at boot.
+/// On Debian the computer's own name resolves to 127.0.1.1. A roscore also starts at boot, at the same port.
 #[test]
 fn problems_in_the_hosts_file_and_units_are_found() {
     let scratch = Scratch::new();
@@ -369,7 +369,8 @@ fn problems_in_the_hosts_file_and_units_are_found() {
     let units = scratch.path("units");
     fs::create_dir_all(units.join("multi-user.target.wants")).unwrap();
     let core = units.join("roscore.service");
-    fs::write(&core, "[Service]\nExecStart=/opt/ros/noetic/bin/roscore\n").unwrap();
+    let unit = format!("[Service]\nExecStart=/opt/ros/noetic/bin/roscore -p {port}\n");
+    fs::write(&core, unit).unwrap();
     std::os::unix::fs::symlink(&core, units.join("multi-user.target.wants/roscore.service"))
         .unwrap();
     const INSIDE: &str = r#"mount --bind "$0" /etc/hosts && mount --bind "$1" /run && mkdir -p /run/systemd/system &&

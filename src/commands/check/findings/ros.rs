@@ -5,7 +5,7 @@ use super::{
         facts::SetupFacts,
         launch::Launches,
         ros::Responder,
-        units::{ADD_WAIT, UnitKind},
+        units::{ADD_WAIT, REMOVE_ROSCORE, UnitKind},
     },
     Findings, named,
 };
@@ -120,6 +120,11 @@ impl Findings {
 
     pub(super) fn systemd(&mut self, facts: &SetupFacts) {
         let mut own = 0;
+        // A proxy's master is intended, and one at another port is a different robot's.
+        let is_rival = |port| {
+            let own = facts.port.as_ref().map(|own| own.number);
+            facts.proxied.is_none() && own.is_ok_and(|own| own == port)
+        };
         for unit in &facts.units {
             let name = &unit.name;
             let systemctl = match unit.is_users {
@@ -135,9 +140,14 @@ impl Findings {
                     let todo = format!("`{systemctl} enable {name}`");
                     self.note("systemd", format!("{name} does not start at boot"), todo);
                 }
-                (UnitKind::Roscore, true) if facts.proxied.is_none() => {
+                (UnitKind::Roscore(port), true) if is_rival(port) => {
                     let todo = format!("`{systemctl} disable --now {name}`");
                     let what = format!("{name} starts another master at boot");
+                    self.bad("systemd", what, todo);
+                }
+                (UnitKind::RoscoreAndNodes(port), true) if is_rival(port) => {
+                    let todo = format!("{REMOVE_ROSCORE}: `{systemctl} edit --full {name}`");
+                    let what = format!("{name} starts another master at boot, and nodes");
                     self.bad("systemd", what, todo);
                 }
                 (UnitKind::Roslaunch, true) => self.warn(

@@ -56,7 +56,7 @@ fn the_master_of_a_proxy() {
         // A master at that address is intended.
         facts
             .units
-            .push(unit("roscore.service", UnitKind::Roscore, true));
+            .push(unit("roscore.service", UnitKind::Roscore(11311), true));
     };
     assert_eq!(
         findings_of(|facts| proxy(facts, Responder::Master(Some(9)))),
@@ -82,7 +82,13 @@ fn units_of_systemd() {
         Problem,
         "systemd",
         "robot.service starts another master",
-        with(UnitKind::Roscore, true),
+        with(UnitKind::Roscore(11311), true),
+    );
+    one(
+        Problem,
+        "systemd",
+        "robot.service starts another master at boot, and nodes",
+        with(UnitKind::RoscoreAndNodes(11311), true),
     );
     one(
         Warning,
@@ -90,7 +96,13 @@ fn units_of_systemd() {
         "robot.service runs roslaunch",
         with(UnitKind::Roslaunch, true),
     );
-    assert_eq!(findings_of(with(UnitKind::Roscore, false)), []);
+    for (kind, is_enabled) in [
+        (UnitKind::Roscore(11311), false),
+        (UnitKind::Roscore(11411), true),
+        (UnitKind::RoscoreAndNodes(11411), true),
+    ] {
+        assert_eq!(findings_of(with(kind, is_enabled)), []);
+    }
     one(Note, "systemd", "no rosrescue service", |facts| {
         facts.units.clear()
     });
