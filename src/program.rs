@@ -4,6 +4,7 @@ use std::{
     error::Error,
     ffi::OsString,
     io::{IsTerminal, Write},
+    net::IpAddr,
     panic::{self, AssertUnwindSafe},
     process::ExitCode,
     time::{Duration, Instant},
@@ -222,6 +223,11 @@ async fn warn_of_another_master(served: MasterUri) {
     let Ok(uri) = MasterUri::parse(&given) else {
         return;
     };
+    // At boot, the network that has the own address may come up later.
+    let is_address = uri.host.parse::<IpAddr>().is_ok();
+    if is_address && uri.host == served.host && uri.port == served.port {
+        return;
+    }
     if let Some(why) = resolver::why_not_here(&uri, served.port, LOOKUP).await {
         tracing::warn!(
             "ROS_MASTER_URI={given} {why}: nodes started with it do not use this rosrescue; where they start, run \
