@@ -37,10 +37,11 @@ use crate::{
 /// Longest time for the lookup of the host in `ROS_MASTER_URI`.
 const LOOKUP: Duration = Duration::from_secs(6);
 /// ROS's variables that concern the master.
-const SETTINGS: [&str; 5] = [
+const SETTINGS: [&str; 6] = [
     "ROS_MASTER_URI",
     "ROS_IP",
     "ROS_HOSTNAME",
+    "ROS_IPV6",
     "ROS_HOME",
     "ROS_LOG_DIR",
 ];

@@ -101,12 +101,17 @@ impl NodesTrouble {
                 .iter()
                 .map(|it| format!("{} as {}", it.node, it.api))
                 .collect();
+            // roscpp does not understand an IPv6 address in a URI.
+            let setting = match from.is_ipv6() {
+                true => format!("ROS_HOSTNAME=NAME` on {from}, with a name that leads to it"),
+                false => format!("ROS_IP={from}` on {from}"),
+            };
             all.push((
                 format!(
                     "No other computer can reach nodes of {from}, and they cannot be checked from here: they have registered under an address that means each computer itself ({}).",
                     shortened(&addresses)
                 ),
-                format!("run `export ROS_IP={from}` on {from}, and restart these nodes there."),
+                format!("run `export {setting}, and restart these nodes there."),
             ));
         }
         if !self.feuds.is_empty() {

@@ -82,7 +82,7 @@ impl Findings {
                     "the master at {uri} accepts connections from other computers, which can bypass rosrescue"
                 ),
                 format!(
-                    "start it with `env -u ROS_HOSTNAME ROS_IP=127.0.0.1 rosmaster --core -p {}`",
+                    "start it with `env -u ROS_HOSTNAME -u ROS_IPV6 ROS_IP=127.0.0.1 rosmaster --core -p {}`",
                     uri.port
                 ),
             );

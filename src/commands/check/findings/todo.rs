@@ -19,6 +19,12 @@ pub(super) fn own_uri(facts: &SetupFacts) -> String {
 
 /// How to register this computer's nodes at an address that others reach.
 pub(super) fn set_address(facts: &SetupFacts) -> String {
+    if let Some(address) = facts.local.filter(|address| address.is_ipv6()) {
+        // roscpp does not understand an IPv6 address in a URI.
+        return format!(
+            "`export ROS_HOSTNAME=NAME` before anything starts, with a name that every computer resolves to {address}"
+        );
+    }
     let unset = match facts.env.hostname {
         Some(_) => "unset ROS_HOSTNAME; ",
         None => "",
