@@ -19,7 +19,7 @@ pub(super) fn units(user: bool) -> [String; 2] {
             .split_once("\n[Install]")
             .map_or("", |(_, install)| install);
         service = format!("{common}NoNewPrivileges=yes\n\n[Install]{install}")
-            .replace("/etc/default/rosrescue", "%E/rosrescue/environment")
+            .replace("/etc/default/rosrescue", "%h/.config/rosrescue/environment")
             .replace("multi-user.target", "default.target");
     }
     [service, SOCKET.to_owned()].map(|text| format!("{MARK}\n{text}"))
@@ -284,7 +284,7 @@ mod tests {
         for word in [
             "\nOOMPolicy=continue\n",
             "\nWantedBy=default.target\n",
-            "=-%E/rosrescue",
+            "=-%h/.config/rosrescue/environment",
         ] {
             assert!(service.contains(word), "{word}: {service}");
         }
