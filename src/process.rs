@@ -35,7 +35,7 @@ pub(crate) use orphan::{Orphan, is_in_our_network};
 use output::Output;
 use pid_file::PidFile;
 pub(crate) use ros_programs::{SERVICE_PATH, find_program, interpreter, output_of, python};
-use ros_programs::{add_ros_paths, command, is_program};
+use ros_programs::{command, is_program, ros_paths};
 pub(crate) use rosmaster::{ProcessError, Rosmaster, find_rosmaster, find_rosmaster_on};
 pub(crate) use rosout::Rosout;
 pub(crate) use stat::Stat;

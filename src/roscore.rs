@@ -130,7 +130,7 @@ static ENDED: AlarmLimit = AlarmLimit::new();
 
 /// Keeps one rosout running: that of this rosrescue, or one that exists already.
 async fn supervise_rosout(roscore: &Roscore) {
-    let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
+    let Some(rosout) = block_in_place(|| Rosout::find(&roscore.checkpoint)) else {
         tracing::warn!(
             "rosout is not installed, so /rosout is not collected; run `apt-get install rosout`, or use --no-rosout"
         );
@@ -218,8 +218,7 @@ const STARTED: Duration = Duration::from_millis(500);
 async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
         // A rosout that an earlier rosrescue left running may not have been found yet.
-        0 => Rosout::find(&roscore.checkpoint)
-            .and_then(|rosout| block_in_place(|| rosout.find_orphan())),
+        0 => block_in_place(|| Rosout::find(&roscore.checkpoint)?.find_orphan()),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };

@@ -1,7 +1,7 @@
 //! ROS's programs: finds them, and prepares the commands that run them.
 
 use std::{
-    ffi::OsStr,
+    ffi::{OsStr, OsString},
     path::{Path, PathBuf},
     process::Stdio,
     time::Duration,
@@ -32,7 +32,7 @@ pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
 /// contains `program`.
 pub(crate) fn python(python: &Path, program: &Path) -> Command {
     let mut command = command(python);
-    add_ros_paths(&mut command, program, 2);
+    command.envs(ros_paths(program, 2));
     command.stdin(Stdio::null()).kill_on_drop(true);
     command
 }
@@ -44,31 +44,31 @@ pub(super) fn command(program: &Path) -> Command {
     command
 }
 
-/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these paths to
-/// find modules and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of folders
-/// between the installation and the program.
-pub(super) fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
+/// The variables with the paths of the ROS installation in `/opt/ros` that contains `program`. ROS's programs need these
+/// paths to find modules and libraries. A shell has them from `setup.bash`, a service does not. `depth` is the number of
+/// folders between the installation and the program. Reads folders, so it may block.
+pub(super) fn ros_paths(program: &Path, depth: usize) -> Vec<(&'static str, OsString)> {
     let Some(prefix) = program
         .ancestors()
         .nth(depth)
         .filter(|p| p.starts_with(ROS_PREFIXES))
     else {
-        return;
+        return Vec::new();
     };
     let libraries = prefix.join("lib");
     let modules = python_folders(&libraries);
-    for (variable, folders) in [
+    let all = [
         ("PYTHONPATH", modules),
         ("LD_LIBRARY_PATH", vec![libraries]),
-    ] {
+    ];
+    let joined = all.into_iter().filter_map(|(variable, folders)| {
         let own = std::env::var_os(variable).unwrap_or_default();
         // An overlay of the shell comes first, as for roscore.
         let paths = std::env::split_paths(&own).chain(folders);
         let paths = paths.filter(|path| !path.as_os_str().is_empty());
-        if let Ok(joined) = std::env::join_paths(paths) {
-            command.env(variable, joined);
-        }
-    }
+        Some((variable, std::env::join_paths(paths).ok()?))
+    });
+    joined.collect()
 }
 
 /// Names the ROS installation in `/opt/ros` that contains `rosmaster`, as its `setup.bash` does, unless the environment
@@ -203,12 +203,13 @@ mod tests {
 
     #[test]
     fn a_ros_in_opt_gets_its_own_paths() {
-        let paths = |program: &str, depth| {
-            variables(|command| add_ros_paths(command, Path::new(program), depth))
-        };
-        let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
-        let libraries = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).last();
-        assert_eq!(libraries.unwrap(), Path::new("/opt/ros/noetic/lib"));
-        assert!(paths("/usr/bin/rosmaster", 2).is_empty());
+        let set = ros_paths(Path::new("/opt/ros/noetic/bin/rosmaster"), 2);
+        let (_, libraries) = set
+            .iter()
+            .find(|(name, _)| *name == "LD_LIBRARY_PATH")
+            .unwrap();
+        let last = std::env::split_paths(libraries).last();
+        assert_eq!(last.unwrap(), Path::new("/opt/ros/noetic/lib"));
+        assert!(ros_paths(Path::new("/usr/bin/rosmaster"), 2).is_empty());
     }
 }

@@ -11,13 +11,13 @@ use std::{
 
 use socket2::{Domain, Socket, Type};
 use thiserror::Error;
-use tokio::process::Child;
+use tokio::{process::Child, task::block_in_place};
 
 use super::{
-    Output, PidFile, add_ros_paths, command, is_program, listeners,
+    Output, PidFile, command, is_program, listeners,
     log_config::{self, LogConfig},
     orphan,
-    ros_programs::{find_program, find_program_on},
+    ros_programs::{find_program, find_program_on, ros_paths},
     start,
 };
 use crate::config::SupervisedConfig;
@@ -29,7 +29,7 @@ pub enum ProcessError {
     /// No rosmaster was found.
     #[error(
         "there is no rosmaster on the PATH or in /opt/ros/*/bin: install it (apt-get install \
-         python3-rosmaster, or ros-noetic-rosmaster), source ROS's setup.bash, or name it with \
+         python3-rosmaster, or ros-DISTRO-rosmaster as in ros-noetic-rosmaster), source ROS's setup.bash, or name it with \
          --rosmaster"
     )]
     NoRosmaster,
@@ -47,6 +47,8 @@ pub enum ProcessError {
 #[derive(Clone, Debug)]
 pub(crate) struct Rosmaster {
     pub(super) program: PathBuf,
+    /// Variables with the paths of its ROS, read once: a disk that is silent later must not delay the next master.
+    paths: Vec<(&'static str, OsString)>,
     config: SupervisedConfig,
     /// Stdout and stderr of the last rosmaster.
     output: Output,
@@ -67,8 +69,10 @@ impl Rosmaster {
 
     /// Finds the rosmaster program. Its output and PID files are created next to `checkpoint`.
     pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
+        let program = find_rosmaster(config.rosmaster.as_deref())?;
         Ok(Self {
-            program: find_rosmaster(config.rosmaster.as_deref())?,
+            paths: ros_paths(&program, 2),
+            program,
             config: config.clone(),
             output: Output::beside(checkpoint, ".rosmaster-output.log"),
             log_config: LogConfig::unless_given(),
@@ -89,7 +93,7 @@ impl Rosmaster {
             return if is_free(port) {
                 Ok(port)
             } else {
-                let by = listeners::named(port);
+                let by = block_in_place(|| listeners::named(port));
                 Err(ProcessError::PortInUse { port, by })
             };
         }
@@ -122,7 +126,7 @@ impl Rosmaster {
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
-        add_ros_paths(&mut command, &self.program, 2);
+        command.envs(self.paths.iter().cloned());
         command.env(orphan::OWNER, &self.owner);
         // The master listens on loopback only, because nodes connect to rosrescue.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());

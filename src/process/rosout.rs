@@ -10,13 +10,15 @@ use std::{
 use tokio::process::{Child, Command};
 
 use super::{
-    Output, PidFile, add_ros_paths, command, find_program, is_program, orphan, pid_file::Last,
-    runs, start,
+    Output, PidFile, command, find_program, is_program, orphan, pid_file::Last, ros_paths, runs,
+    start,
 };
 
 #[derive(Debug)]
 pub(crate) struct Rosout {
     program: PathBuf,
+    /// Variables with the paths of its ROS.
+    paths: Vec<(&'static str, OsString)>,
     /// Stderr of the last rosout.
     output: Output,
     /// PID file of the last rosout.
@@ -26,7 +28,8 @@ pub(crate) struct Rosout {
 }
 
 impl Rosout {
-    /// Finds the rosout program. `None` if it is not installed. Its stderr goes to a file next to `checkpoint`.
+    /// Finds the rosout program. `None` if it is not installed. Its stderr goes to a file next to `checkpoint`. May block
+    /// on a slow disk.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let rosmaster = find_program("rosmaster", &["bin"]);
         let program = (rosmaster.as_deref().and_then(of_ros_with))
@@ -34,6 +37,7 @@ impl Rosout {
             // An overlay may have a rosmaster only.
             .or_else(|| of_ros_with(Path::new("/usr/bin/rosmaster")))?;
         Some(Self {
+            paths: ros_paths(&program, 3),
             program,
             output: Output::beside(checkpoint, ".rosout-output.log"),
             pid_file: PidFile::beside(checkpoint, "rosout"),
@@ -76,7 +80,7 @@ impl Rosout {
         let mut command = command(&self.program);
         command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
         command.env(orphan::OWNER, &self.owner);
-        add_ros_paths(&mut command, &self.program, 3);
+        command.envs(self.paths.iter().cloned());
         command
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -105,8 +109,10 @@ mod tests {
 
     #[test]
     fn a_rosout_in_opt_finds_its_libraries() {
+        let program = PathBuf::from("/opt/ros/noetic/lib/rosout/rosout");
         let rosout = Rosout {
-            program: PathBuf::from("/opt/ros/noetic/lib/rosout/rosout"),
+            paths: ros_paths(&program, 3),
+            program,
             output: Output::beside(Path::new(""), ""),
             pid_file: PidFile::beside(Path::new(""), "rosout"),
             owner: OsString::new(),
