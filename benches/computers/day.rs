@@ -18,7 +18,7 @@ use std::{
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use rescue_core::{
-    checkpoint::format::{Checkpoint, Record, RecordContent},
+    checkpoint::format::{self, Checkpoint, Record, RecordContent},
     cluster::{
         journal::{self, Keys},
         machine::{EtcdAnswer, Op, Settings},
@@ -248,17 +248,17 @@ impl Robot<'_> {
             seq,
             ..self.snapshot.clone()
         };
+        let encoded = format::encode_checkpoint(&checkpoint, 1).expect("a snapshot");
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build();
         let replica = self.replica();
-        let written = runtime
-            .expect("a runtime")
-            .block_on(replica.write_snapshot(self.term, &checkpoint));
-        assert!(
-            written.expect("a snapshot").is_some(),
-            "the robot does not lead"
-        );
+        let written = runtime.expect("a runtime").block_on(replica.write_snapshot(
+            self.term,
+            seq,
+            &encoded.bytes,
+        ));
+        assert!(written.expect("a snapshot"), "the robot does not lead");
     }
 
     /// Makes etcd discard what is older than at the previous time.

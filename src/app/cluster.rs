@@ -17,11 +17,11 @@ use std::{
 use bytes::Bytes;
 use rescue_core::{
     checkpoint::{
-        format::{Checkpoint, Origin},
+        format::{self, Checkpoint, Origin},
         session::{self, Decision, RestorePolicy, SessionEvidence},
     },
     cluster::{
-        journal::{self, Keys, Manifest, Put},
+        journal::{self, JournalError, Keys, Manifest, Put},
         machine::{EtcdAnswer, Op, Settings, View},
         member::{
             Action, Evidence, Input, Member, MemberEntry, MemberEntryChange, PROBES, Read,
@@ -34,7 +34,7 @@ use rescue_core::{
 use ros1_master::{master::Master, xmlrpc};
 use tokio::{
     sync::{mpsc, oneshot, watch},
-    task::JoinSet,
+    task::{JoinSet, block_in_place},
 };
 use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
@@ -44,7 +44,7 @@ use super::{RunError, life, master_duties::MasterDuties};
 use crate::{
     cluster::{
         etcd::{self, Etcd, KeyChange, Kv, Watch, WatchEnd},
-        replica::{LoadedState, Replica},
+        replica::{LoadedState, Replica, ReplicaError},
     },
     gate::State,
     guardian::handover,
@@ -170,7 +170,9 @@ impl ClusterDriver {
         if lease.is_none() {
             self.setup.context.ledger.lease.set(None);
         }
+        // The file is beside the checkpoint. A disk that is silent would delay every write here.
         if self.partition_writes.must_be_replaced()
+            && self.setup.context.ledger.unprotected().is_none()
             && let Some(writes) = self.member.partition_writes()
         {
             let path = &self.setup.context.checkpoint;
@@ -355,19 +357,27 @@ impl ClusterDriver {
                 displaced,
             } => {
                 let replica = self.replica.clone();
-                let checkpoint = Checkpoint {
-                    seq: progress.seq,
-                    snapshot: state.snapshot(),
-                    displaced,
-                    ..Checkpoint::default()
+                let seq = progress.seq;
+                // With a large state, this takes longer than calls and heartbeats may wait.
+                let encode = move || {
+                    let checkpoint = Checkpoint {
+                        seq,
+                        snapshot: state.snapshot(),
+                        displaced,
+                        ..Checkpoint::default()
+                    };
+                    format::encode_checkpoint(&checkpoint, 1).map_err(JournalError::Encode)
                 };
                 self.spawn(Input::SnapshotWritten(None), async move {
-                    let written = replica.write_snapshot(term, &checkpoint).await;
-                    if let Err(error) = &written {
+                    let written = async {
+                        let encoded = block_in_place(encode)?;
+                        let leads = replica.write_snapshot(term, seq, &encoded.bytes).await?;
+                        Ok::<_, ReplicaError>(leads.then_some((progress, encoded.bytes.len())))
+                    };
+                    Input::SnapshotWritten(written.await.unwrap_or_else(|error| {
                         rarely!(warn, %error, "the snapshot in etcd could not be written; retrying");
-                    }
-                    let bytes = written.ok().flatten();
-                    Input::SnapshotWritten(bytes.map(|bytes| (progress, bytes)))
+                        None
+                    }))
                 });
             }
             Action::CompactEtcd(revision) => {

@@ -202,8 +202,8 @@ impl Replica {
             .await?)
     }
 
-    /// Writes a snapshot and deletes what it replaces. The checkpoint's `seq` is the last journal record in it. Returns
-    /// the snapshot's size, or `None` if this process no longer leads.
+    /// Writes an encoded checkpoint as the snapshot, and deletes what it replaces. `seq` is the last journal record in it.
+    /// Returns whether this process still leads.
     ///
     /// # Errors
     ///
@@ -211,23 +211,19 @@ impl Replica {
     pub async fn write_snapshot(
         &self,
         term: u64,
-        checkpoint: &Checkpoint,
-    ) -> Result<Option<usize>, ReplicaError> {
-        let seq = checkpoint.seq;
-        let encoded = format::encode_checkpoint(checkpoint, 1).map_err(JournalError::Encode)?;
-        let (mut puts, manifest) = journal::snapshot(&self.keys, seq, &encoded.bytes);
+        seq: u64,
+        encoded: &[u8],
+    ) -> Result<bool, ReplicaError> {
+        let (mut puts, manifest) = journal::snapshot(&self.keys, seq, encoded);
         // The manifest comes last, because it declares the snapshot complete.
         puts.push(manifest);
         if !self.client.put(&self.keys, term, &puts, self.limit).await? {
-            return Ok(None);
+            return Ok(false);
         }
         let [journal, blobs] = self.keys.behind(seq);
         let replaced = [journal, blobs, self.keys.snapshots_before(seq)];
-        let leads = self
-            .client
-            .delete(&self.keys, term, &replaced, self.limit)
-            .await?;
-        Ok(leads.then_some(encoded.bytes.len()))
+        let leads = self.client.delete(&self.keys, term, &replaced, self.limit);
+        Ok(leads.await?)
     }
 }
 

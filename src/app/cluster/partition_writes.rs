@@ -133,17 +133,17 @@ impl PartitionWritesFile {
     }
 
     async fn write(&mut self, mut store: Store, writes: PartitionWrites) {
-        let checkpoint = Checkpoint {
-            seq: store.seq(),
-            session: Session {
-                cluster_seq: writes.held,
-                ..Session::default()
-            },
-            snapshot: writes.base.snapshot(),
-            ..Checkpoint::default()
-        };
-        let entries = entries(writes.calls);
         let write = move || {
+            let checkpoint = Checkpoint {
+                seq: store.seq(),
+                session: Session {
+                    cluster_seq: writes.held,
+                    ..Session::default()
+                },
+                snapshot: writes.base.snapshot(),
+                ..Checkpoint::default()
+            };
+            let entries = entries(writes.calls);
             let written = store.begin(&checkpoint);
             let written = written.and_then(|()| store.append(&entries).map(|_| ()));
             // The file that it replaces had them synced.
