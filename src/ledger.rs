@@ -806,8 +806,7 @@ impl Ledger {
 
     /// Runs `work` on the [`Order`]. If it returns true, wakes the calls and notifications that wait.
     pub(crate) fn release(&self, work: impl FnOnce(&mut Order) -> bool) {
-        let awaited = work(&mut self.lock().order);
-        if awaited {
+        if self.with_order(|order, _| work(order)) {
             self.order_changed.send_replace(());
         }
     }

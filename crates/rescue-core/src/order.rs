@@ -129,10 +129,13 @@ impl Order {
         std::mem::take(&mut self.awaited)
     }
 
-    /// Notes that the answer has been written to its caller, or never will be. Returns whether a call or a notification
-    /// waits for that.
+    /// Notes that the answer has been written to its caller, or never will be. If that took longer than [`ANSWER_LIMIT`],
+    /// the node is told the state again. Returns whether a call or a notification waits for that.
     pub fn answer_written(&mut self, now: Instant, answer: u64) -> bool {
-        self.under_way.written(now, answer);
+        // The node may have been notified while the answer was overdue. It is older, and comes last.
+        for Recipient { port, subject } in self.under_way.written(now, answer) {
+            self.repeats.add(now + REPEAT_AFTER, port, subject);
+        }
         std::mem::take(&mut self.awaited)
     }
 

@@ -3,14 +3,18 @@
 use std::{
     collections::VecDeque,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
 };
 
 use bytes::Bytes;
-use rescue_core::order::ANSWER_LIMIT;
 use tokio::{runtime::Handle, time::Instant};
 
 use super::{super::replies::UntilWritten, control::Control};
 use crate::upstream::{Head, peer::Peer};
+
+/// How long a value is kept whose follower says nothing: it may have died. Nothing waits for an answer that is older than
+/// [`ANSWER_LIMIT`](rescue_core::order::ANSWER_LIMIT), but its node is told the state when it has been passed on.
+const KEPT: Duration = Duration::from_secs(60);
 
 /// Answers on their way through followers to callers. With each answer, the leader keeps a value until the caller has
 /// the answer, because some notifications must wait for that.
@@ -36,13 +40,13 @@ impl ForwardedAnswers {
     }
 
     /// Keeps `held`, which must not be dropped before the caller has the answer. Returns the answer's number, for
-    /// [`Self::release`]. Drops values that are older than [`ANSWER_LIMIT`], because their followers may have died.
+    /// [`Self::release`]. Drops values that are older than [`KEPT`].
     pub(super) fn add(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
         let Inner { last, held: kept } = &mut *passing;
         while let Some((since, ..)) = kept.front()
-            && now.duration_since(*since) > ANSWER_LIMIT
+            && now.duration_since(*since) > KEPT
         {
             old.extend(kept.pop_front());
         }
@@ -114,7 +118,7 @@ mod tests {
         passing.release(second);
         assert_eq!(told.try_recv(), Ok(2));
         assert_ne!(first, second);
-        keep(now + 2 * ANSWER_LIMIT, 3);
+        keep(now + 2 * KEPT, 3);
         assert_eq!(told.try_recv(), Ok(1));
         assert!(told.try_recv().is_err());
     }

@@ -51,6 +51,24 @@ fn sent(next: NextNotification) -> (Value, u64) {
 }
 
 #[test]
+fn a_node_whose_answer_was_overdue_is_told_the_state_after_it() {
+    let (mut order, start, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    for call in [subscribe("/a", "/t"), publish("/b", "/t")] {
+        mirror.apply(&call);
+    }
+    for (late, repeats) in [(ANSWER_LIMIT / 2, false), (ANSWER_LIMIT, true)] {
+        let number = begin(&mut order, start, &subscribe("/a", "/t"));
+        order.answer_ready(start, number);
+        order.answer_written(start + late, number);
+        let expected = repeats.then_some(start + late + REPEAT_AFTER);
+        assert_eq!(order.next_repeat(), expected);
+    }
+    let due = start + ANSWER_LIMIT + REPEAT_AFTER;
+    order.queue_due_repeats(due);
+    sent(order.next_notification(due, A, &mirror));
+}
+
+#[test]
 fn a_write_that_notifies_a_node_waits_for_an_answer_to_that_node_about_the_same_subject() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     let subscribed = begin(&mut order, now, &subscribe("/a", "/t"));

@@ -85,20 +85,23 @@ impl UnderWay {
         }
     }
 
-    /// Notes that the answer has been written to its caller.
-    pub(super) fn written(&mut self, now: Instant, number: u64) {
+    /// Notes that the answer has been written to its caller. Returns its recipients if that was after its limit.
+    pub(super) fn written(&mut self, now: Instant, number: u64) -> Vec<Recipient> {
         let Some(delivery) = self.deliveries.get_mut(&number) else {
-            return;
+            return Vec::new();
         };
+        let is_overdue = delivery.delays(now).is_none();
         delivery.written = Some(now);
         self.written.push_back((now, number));
-        for recipient in delivery.recipients.clone() {
+        let recipients = delivery.recipients.clone();
+        for recipient in &recipients {
             if let Some(before) = self.newest.insert(recipient.clone(), number)
                 && before != number
             {
-                self.drop_recipient(before, &recipient);
+                self.drop_recipient(before, recipient);
             }
         }
+        if is_overdue { recipients } else { Vec::new() }
     }
 
     /// Removes a recipient of an answer.
