@@ -64,8 +64,10 @@ impl Findings {
             }
         };
         if is_read_only {
-            let todo =
-                format!("`sudo mount -o remount,rw $(df --output=target {folder} | tail -n 1)`");
+            let todo = format!(
+                "`sudo mount -o remount,rw $(df --output=target {folder} | tail -n 1)`. If it is intended, choose a \
+                 --checkpoint, and a ROS_LOG_DIR for the nodes, on another disk"
+            );
             return self.bad(SUBJECT, format!("{folder} is mounted read-only"), todo);
         }
         if let Some((refused, why)) = &disk.refused {
