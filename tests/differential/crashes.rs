@@ -14,6 +14,7 @@ use ros1_master::{
 use rosrescue::clock;
 use rustix::process::Signal;
 
+use crate::NO_HANGS;
 use crate::dice::{Cast, Dice};
 use crate::nodes::{Node, patience};
 use crate::real::{Rosmaster, Wire};
@@ -87,7 +88,8 @@ impl Rig {
             }
         };
         // Calls that only a master can answer wait long enough for a busy computer.
-        let rescue = setup.args(["--hold", "60", "--reads", reads]).start();
+        let setup = setup.args(["--hold", "60", "--reads", reads]);
+        let rescue = setup.args(NO_HANGS).start();
         Self {
             supervised: core,
             master,

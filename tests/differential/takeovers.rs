@@ -15,6 +15,7 @@ use ros1_master::{
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
+use crate::NO_HANGS;
 use crate::crashes::{self, Share, has_params, read_state, skipped};
 use crate::dice::Dice;
 use crate::nodes::{Node, patience};
@@ -76,6 +77,7 @@ impl Computer {
             .args(["--alone", "refuse", "--hold", "60"])
             // Each computer would otherwise have its own rosout node.
             .arg("--no-rosout")
+            .args(NO_HANGS)
             .guarded()
             .spawn();
         Self {

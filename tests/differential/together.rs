@@ -15,9 +15,9 @@ use ros1_master::{
 };
 
 use crate::dice::{Cast, Dice};
-use crate::number;
 use crate::real::Rosmaster;
 use crate::support::{Client, Scratch, Setup, eventually, http_request, short, status};
+use crate::{NO_HANGS, number};
 
 const CALLERS: usize = 24;
 const CALLS: usize = 150;
@@ -241,6 +241,7 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
     let scratch = Scratch::new();
     let rescue = Setup::proxy(&scratch, behind.port)
         .args(["--reads", reads])
+        .args(NO_HANGS)
         .start();
     // Other tests check the callbacks. rosrescue does not take a node that does not answer for dead.
     let silent = TcpListener::bind(("127.0.0.1", 0)).unwrap();
