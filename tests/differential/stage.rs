@@ -155,21 +155,22 @@ impl<'n> Stage<'n> {
             "registerPublisher",
             &["/last", last[0], "a/B", last[1]],
         ));
-        calls.extend(of_listeners("unregisterSubscriber", false));
-        calls.push(call("unregisterPublisher", &["/last", last[0], last[1]]));
-        for call in calls {
-            self.call(0, &call)
-                .map_err(|why| format!("settling: {call:?} {why}"))?;
-        }
+        // These cause no callbacks: the subscribers go first.
+        let mut removals = of_listeners("unregisterSubscriber", false);
+        removals.push(call("unregisterPublisher", &["/last", last[0], last[1]]));
+        self.call_all(&calls)?;
         // With several computers, a node may also get the list of this topic while it is still empty.
         let publishers = Value::from(vec![Value::from(last[1])]);
         let is_last = |call: &Call| {
             call.params
                 .ends_with(&[Value::from(topic.as_str()), publishers.clone()])
         };
-        for (index, node) in self.nodes.iter().enumerate() {
+        // rosrescue may send the last callback later, and only to a subscriber.
+        let heard = self.nodes.iter().map(|node| node.take(is_last));
+        let heard = heard.collect::<Result<Vec<_>, _>>()?;
+        self.call_all(&removals)?;
+        for (index, (node, heard)) in self.nodes.iter().zip(heard).enumerate() {
             let expected = std::mem::take(&mut self.told[index]);
-            let heard = node.take(is_last)?;
             if self.callbacks {
                 self.judge(node, &expected, heard)
                     .map_err(|why| format!("callbacks to node{index}: {why}"))?;
@@ -179,6 +180,14 @@ impl<'n> Stage<'n> {
             repeats.settled(&self.model);
         }
         Ok(())
+    }
+
+    /// Makes these calls, which [`Self::settle`] needs.
+    fn call_all(&mut self, calls: &[Call]) -> Result<(), Failure> {
+        calls.iter().try_for_each(|call| {
+            self.call(0, call)
+                .map_err(|why| format!("settling: {call:?} {why}"))
+        })
     }
 
     /// Compares the callbacks of a node, and waits for replacements of those that a crash has lost.
