@@ -4,7 +4,8 @@
 //! again now and then (`docs/decisions/0031`). A crash of the master may have these effects, and no others:
 //!
 //! * The callbacks of the call under way may be lost or repeated: the master may have run the call before it died, and
-//!   its successor runs it again. The call is answered once.
+//!   its successor runs it again. The call is answered once. With several computers, the next leader does not know what
+//!   its predecessor has sent. So the callbacks of a call that runs twice may come twice, all in order.
 //! * The callbacks of unregistrations that are answered without a master may be lost or repeated too. The final list
 //!   may stand for several of them.
 //! * While the mirror stands in, outdated callbacks may be left out.
@@ -37,7 +38,7 @@ pub(crate) struct Expected {
 type List = (String, String, Vec<String>);
 
 /// An event of the model.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 enum Moment {
     /// The model sends this call to the node at this address. No node sees the states inside a multicall.
     Notice(String, Call),
@@ -96,6 +97,17 @@ impl TrueLists {
     pub(crate) fn answered(&mut self, model: &Master) {
         self.faithful = None;
         self.add(model);
+    }
+
+    /// Notes that another computer may have run the last call once more, with its callbacks.
+    pub(crate) fn ran_again(&mut self) {
+        let is_callback = |moment: &&Moment| matches!(moment, Moment::Notice(..));
+        let mut moments = self.course.iter().rev();
+        // The state to which a call leads comes after its callbacks.
+        moments.next();
+        let callbacks = moments.take_while(is_callback).count();
+        let begin = self.course.len() - callbacks - 1;
+        self.course.extend_from_within(begin..);
     }
 
     /// Notes that the model sends this call to the node at `api`.
@@ -311,26 +323,39 @@ mod tests {
         }
     }
 
-    #[test]
-    fn repeated_callbacks_never_go_back() {
-        let update = |value: i32| {
-            let params = vec!["/master".into(), "/k/".into(), value.into()];
-            Call::new("paramUpdate", params)
-        };
+    /// The callback about a value of `/k`.
+    fn update(value: i32) -> Call {
+        let params = vec!["/master".into(), "/k/".into(), value.into()];
+        Call::new("paramUpdate", params)
+    }
+
+    /// A model in which `/k` gets each list of values within one call.
+    fn course(calls: &[&[i32]]) -> (Master, TrueLists) {
         let mut model = Master::default();
         let mut lists = TrueLists::default();
         let subscribe = vec!["/s".into(), "http://s".into(), "/k".into()];
         model.apply(&Call::new("subscribeParam", subscribe).into());
-        for value in [1, 2, 3, 1] {
-            let params = vec!["/n".into(), "/k".into(), value.into()];
-            model.apply(&Call::new("setParam", params).into());
-            lists.send("http://s", &update(value));
+        for values in calls {
+            for value in *values {
+                let params = vec!["/n".into(), "/k".into(), (*value).into()];
+                model.apply(&Call::new("setParam", params).into());
+                lists.send("http://s", &update(*value));
+            }
             lists.add(&model);
         }
-        let told = |values: &[i32]| {
-            let heard: Vec<_> = values.iter().copied().map(update).collect();
-            lists.goes_back("http://s", &heard).cloned()
-        };
+        (model, lists)
+    }
+
+    /// The first of these callbacks that goes back.
+    fn goes_back(lists: &TrueLists, values: &[i32]) -> Option<Call> {
+        let heard: Vec<_> = values.iter().copied().map(update).collect();
+        lists.goes_back("http://s", &heard).cloned()
+    }
+
+    #[test]
+    fn repeated_callbacks_never_go_back() {
+        let (model, mut lists) = course(&[&[1], &[2], &[3], &[1]]);
+        let told = |values: &[i32]| goes_back(&lists, values);
         for good in [
             &[1, 2, 3, 1][..],
             &[1, 1, 2, 2, 3, 3, 1, 1],
@@ -349,6 +374,18 @@ mod tests {
         lists.settled(&model);
         lists.add(&model);
         assert_eq!(lists.goes_back("http://s", &[update(1)]), None);
+    }
+
+    #[test]
+    fn the_callbacks_of_a_call_that_runs_twice_may_come_twice() {
+        let (_, mut lists) = course(&[&[9], &[1, 2]]);
+        assert_eq!(goes_back(&lists, &[1, 2, 1, 2]), Some(update(1)));
+        lists.ran_again();
+        for good in [&[9, 1, 2, 1, 2][..], &[1, 1, 2], &[2, 1, 2, 2]] {
+            assert_eq!(goes_back(&lists, good), None, "{good:?}");
+        }
+        assert_eq!(goes_back(&lists, &[1, 2, 1, 2, 1]), Some(update(1)));
+        assert_eq!(goes_back(&lists, &[1, 2, 9]), Some(update(9)));
     }
 
     #[test]

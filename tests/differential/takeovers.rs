@@ -409,7 +409,11 @@ fn play(
     rig.end(end)?;
     stage.away = true;
     let reply = stage.wires[by].receive()?;
-    stage.answered(&call, &reply, true)
+    stage.answered(&call, &reply, true)?;
+    if let Some(repeats) = &mut stage.repeats {
+        repeats.ran_again();
+    }
+    Ok(())
 }
 
 /// Compares the state at each computer, and again after the leader's death, when it comes from the journal.
