@@ -9,7 +9,8 @@ use ros1_master::{
     xmlrpc::{Call, Reply, Struct, Value, decode_call},
 };
 
-use crate::support::{FakeMaster, sorted, unordered};
+use crate::oracle::Heard;
+use crate::support::{FakeMaster, is_from_rosrescue, sorted, unordered};
 
 thread_local! {
     /// Whether a failure was found, so that only a shorter script is searched for. Each test has its own thread, so
@@ -28,7 +29,7 @@ const QUESTIONS: [&str; 3] = ["getPid", "getPublications", "getSubscriptions"];
 /// A node that records callbacks.
 pub(crate) struct Node {
     pub(crate) api: String,
-    heard: Arc<Mutex<Vec<Call>>>,
+    heard: Arc<Mutex<Vec<Heard>>>,
     _server: FakeMaster,
 }
 
@@ -36,7 +37,7 @@ impl Node {
     pub(crate) fn start() -> Self {
         let heard = Arc::new(Mutex::new(Vec::new()));
         let notes = Arc::clone(&heard);
-        let server = FakeMaster::start(move |body| {
+        let server = FakeMaster::start_with_heads(move |head, body| {
             let call = decode_call(body).unwrap();
             // A call of the health check changes nothing in a node. The fault proves that the node lives, and reports
             // no registrations, because those in the master are random.
@@ -44,7 +45,10 @@ impl Node {
                 let text = "no such method".to_owned();
                 Reply::Fault { code: 1, text }
             } else {
-                notes.lock().unwrap().push(blank(call));
+                notes.lock().unwrap().push(Heard {
+                    call: blank(call),
+                    by_rosrescue: is_from_rosrescue(head),
+                });
                 Reply::Value(vec![Value::Int(1), "".into(), 0.into()].into())
             };
             FakeMaster::proper(&reply)
@@ -57,11 +61,11 @@ impl Node {
     }
 
     /// Waits for a callback that `last` accepts, and takes all callbacks so far.
-    pub(crate) fn take(&self, last: impl Fn(&Call) -> bool) -> Result<Vec<Call>, String> {
+    pub(crate) fn take(&self, last: impl Fn(&Call) -> bool) -> Result<Vec<Heard>, String> {
         let deadline = Instant::now() + patience();
         loop {
             let mut heard = self.heard.lock().unwrap();
-            if heard.iter().any(&last) {
+            if heard.iter().any(|it| last(&it.call)) {
                 return Ok(std::mem::take(&mut *heard));
             }
             if Instant::now() > deadline {
@@ -73,7 +77,7 @@ impl Node {
     }
 
     /// Takes the callbacks so far.
-    pub(crate) fn take_now(&self) -> Vec<Call> {
+    pub(crate) fn take_now(&self) -> Vec<Heard> {
         std::mem::take(&mut *self.heard.lock().unwrap())
     }
 }

@@ -17,6 +17,8 @@
 //!
 //! The callbacks of one node about one topic or parameter **never go back**, even when they are repeated: no callback
 //! has a state that is older than that of an earlier callback. The order is that in which the model reached its states.
+//! There is one exception. A node may read callbacks of two senders in the wrong order, because rosrescue waits only
+//! 0.3 s until the node has read the first one. It gets the newest state once more then.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
@@ -33,6 +35,19 @@ pub(crate) struct Expected {
     pub(crate) call: Call,
     /// Whether a crash may have lost or repeated this callback.
     pub(crate) risky: bool,
+}
+
+/// A callback that a node has got.
+#[derive(Clone, Debug)]
+pub(crate) struct Heard {
+    pub(crate) call: Call,
+    /// Whether rosrescue has sent it, and not the master.
+    pub(crate) by_rosrescue: bool,
+}
+
+/// The calls of these callbacks.
+pub(crate) fn calls(heard: &[Heard]) -> Vec<Call> {
+    heard.iter().map(|it| it.call.clone()).collect()
 }
 
 type List = (String, String, Vec<String>);
@@ -125,21 +140,32 @@ impl TrueLists {
         self.course = vec![Moment::State(Box::new(model.clone()))];
     }
 
-    /// The first callback whose state is older than that of an earlier callback to the node at `api`.
-    pub(crate) fn goes_back<'c>(&self, api: &str, heard: &'c [Call]) -> Option<&'c Call> {
-        let mut reached = BTreeMap::new();
-        heard.iter().find(|call| {
-            let subject = (&call.method, call.params.get(1).and_then(Value::as_str));
-            let from = reached.get(&subject).copied().unwrap_or_default();
+    /// The first callback whose state is older than that of an earlier callback to the node at `api`, if rosrescue has
+    /// sent both, or if it is the last callback about its subject.
+    pub(crate) fn goes_back<'c>(&self, api: &str, heard: &'c [Heard]) -> Option<&'c Call> {
+        let own = heard.iter().filter(|it| it.by_rosrescue);
+        let own = self.older(api, own).first().copied();
+        let is_last = |call: &&Call| {
+            let last = heard.iter().rfind(|it| subject(&it.call) == subject(call));
+            last.is_some_and(|last| std::ptr::eq(&last.call, *call))
+        };
+        own.or_else(|| self.older(api, heard.iter()).into_iter().find(is_last))
+    }
+
+    /// The callbacks whose state is older than that of an earlier one of `heard`.
+    fn older<'c>(&self, api: &str, heard: impl Iterator<Item = &'c Heard>) -> Vec<&'c Call> {
+        let mut reached: BTreeMap<(&str, Option<&str>), usize> = BTreeMap::new();
+        let mut older = Vec::new();
+        for Heard { call, .. } in heard {
+            let from = reached.get(&subject(call)).copied().unwrap_or_default();
             let says = |moment: &Moment| moment.says(api, call);
-            match self.course[from..].iter().position(says) {
-                Some(steps) => {
-                    reached.insert(subject, from + steps);
-                    false
-                }
-                None => self.course[..from].iter().any(says),
+            if let Some(steps) = self.course[from..].iter().position(says) {
+                reached.insert(subject(call), from + steps);
+            } else if self.course[..from].iter().any(says) {
+                older.push(call);
             }
-        })
+        }
+        older
     }
 
     /// Adds this state, with its lists and values.
@@ -195,6 +221,12 @@ fn is_true_param(state: &Master, api: &str, call: &Call) -> bool {
         state.subscribes_param(|at| at == api, key)
             && state.param_update(key).map(blank).as_ref() == Some(call)
     })
+}
+
+/// What a callback is about: its method, and the topic or the parameter.
+fn subject(call: &Call) -> (&str, Option<&str>) {
+    let about = call.params.get(1).and_then(Value::as_str);
+    (call.method.as_str(), about)
 }
 
 /// Subscriber, topic and publishers of a `publisherUpdate`.
@@ -346,9 +378,14 @@ mod tests {
         (model, lists)
     }
 
-    /// The first of these callbacks that goes back.
+    fn heard(value: i32, by_rosrescue: bool) -> Heard {
+        let call = update(value);
+        Heard { call, by_rosrescue }
+    }
+
+    /// The first of these callbacks of rosrescue that goes back.
     fn goes_back(lists: &TrueLists, values: &[i32]) -> Option<Call> {
-        let heard: Vec<_> = values.iter().copied().map(update).collect();
+        let heard: Vec<_> = values.iter().map(|value| heard(*value, true)).collect();
         lists.goes_back("http://s", &heard).cloned()
     }
 
@@ -367,13 +404,37 @@ mod tests {
         }
         assert_eq!(told(&[1, 3, 2]), Some(update(2)));
         assert_eq!(told(&[2, 1, 3]), Some(update(3)));
-        assert_eq!(
-            lists.goes_back("http://other", &[update(3), update(2)]),
-            None
-        );
+        let other = [heard(3, true), heard(2, true)];
+        assert_eq!(lists.goes_back("http://other", &other), None);
         lists.settled(&model);
         lists.add(&model);
-        assert_eq!(lists.goes_back("http://s", &[update(1)]), None);
+        assert_eq!(goes_back(&lists, &[1]), None);
+    }
+
+    #[test]
+    fn two_senders_may_be_read_in_the_wrong_order_if_the_newest_comes_once_more() {
+        let (_, lists) = course(&[&[1], &[2], &[3], &[1], &[4]]);
+        let (master, rosrescue) = (false, true);
+        let told = |all: &[(bool, i32)]| {
+            let all = all.iter().map(|(sender, value)| heard(*value, *sender));
+            let all: Vec<_> = all.collect();
+            lists.goes_back("http://s", &all).cloned()
+        };
+        for good in [
+            &[(master, 1), (master, 3), (rosrescue, 2), (rosrescue, 3)][..],
+            &[(master, 2), (rosrescue, 4), (master, 3), (master, 4)],
+            &[(master, 4), (rosrescue, 1), (master, 4)],
+        ] {
+            assert_eq!(told(good), None, "{good:?}");
+        }
+        let bad = [(master, 1), (master, 3), (rosrescue, 2)];
+        assert_eq!(told(&bad), Some(update(2)));
+        // The state of the last one is newer than that of the one before it, but not the newest.
+        let bad = [(master, 4), (rosrescue, 2), (rosrescue, 3)];
+        assert_eq!(told(&bad), Some(update(3)));
+        // rosrescue sends its own callbacks one after the other.
+        let bad = [(rosrescue, 3), (rosrescue, 2), (master, 4)];
+        assert_eq!(told(&bad), Some(update(2)));
     }
 
     #[test]

@@ -12,7 +12,7 @@ use ros1_master::{
 
 use crate::dice::{CALLERS, KEYS, NAMES};
 use crate::nodes::{self, Node};
-use crate::oracle::{Expected, TrueLists, judge};
+use crate::oracle::{Expected, Heard, TrueLists, calls, judge};
 use crate::real::Wire;
 use crate::script::with_real_apis;
 use crate::support::{sorted, unordered};
@@ -190,40 +190,40 @@ impl<'n> Stage<'n> {
         })
     }
 
-    /// Compares the callbacks of a node, and waits for replacements of those that a crash has lost.
+    /// Compares the callbacks of a node. Waits for replacements of those that a crash has lost, and for the newest one
+    /// if an older one came after it.
     fn judge(
         &self,
         node: &Node,
         expected: &[Expected],
-        mut heard: Vec<Call>,
+        mut heard: Vec<Heard>,
     ) -> Result<(), Failure> {
         let mut expected = expected.to_vec();
         if unordered() {
             // The order in which rosmaster notifies nodes is that of a dictionary, too.
-            heard.sort_by_key(|call| format!("{call:?}"));
+            heard.sort_by_key(|it| format!("{:?}", it.call));
             expected.sort_by_key(|it| format!("{:?}", it.call));
         }
         let nothing = TrueLists::default();
         let lists = self.repeats.as_ref().unwrap_or(&nothing);
-        let swallowed = judge(&expected, &heard, |call| lists.has(&node.api, call))?;
+        let swallowed = judge(&expected, &calls(&heard), |call| lists.has(&node.api, call))?;
         let deadline = Instant::now() + nodes::patience();
-        let mut news = heard;
-        while let Some(owed) = swallowed.iter().find(|it| lists.owes(&node.api, it, &news)) {
+        loop {
+            let news = calls(&heard);
+            let owed = swallowed.iter().find(|it| lists.owes(&node.api, it, &news));
+            let older = lists.goes_back(&node.api, &heard).filter(|_| !unordered());
+            let why = match (owed, older) {
+                (Some(owed), _) => format!("lost in the crash and never made good is\n  {owed:?}"),
+                (None, Some(call)) => format!("it goes back to\n  {call:?}\nin\n  {heard:?}"),
+                (None, None) => return Ok(()),
+            };
             if Instant::now() > deadline {
-                return Err(format!(
-                    "lost in the crash and never made good is\n  {owed:?}"
-                ));
+                return Err(why);
             }
             std::thread::sleep(Duration::from_millis(5));
             let late = node.take_now();
-            judge(&[], &late, |call| lists.has(&node.api, call))?;
-            news.extend(late);
-        }
-        match lists.goes_back(&node.api, &news) {
-            Some(call) if !unordered() => {
-                Err(format!("it goes back to\n  {call:?}\nin\n  {news:?}"))
-            }
-            _ => Ok(()),
+            judge(&[], &calls(&late), |call| lists.has(&node.api, call))?;
+            heard.extend(late);
         }
     }
 

@@ -242,14 +242,13 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
         let Ok(call) = xmlrpc::decode_call(&body) else {
             break;
         };
-        let head = head.to_ascii_lowercase();
         // The flag is read before the call is recorded: a test that sees the call and then sets the flag means later
         // calls.
         let is_held = *lock(&inner.holding);
         lock(&inner.received).push(ReceivedCall {
             method: call.method.clone(),
             params: call.params,
-            from_rosrescue: head.contains("\nuser-agent: rosrescue/"),
+            from_rosrescue: is_from_rosrescue(&head),
             from,
             at: rosrescue::clock::wall_millis(),
         });
@@ -312,10 +311,17 @@ pub(crate) struct FakeMaster {
 impl FakeMaster {
     /// Starts a server. `answer` gets the body of a request and returns all bytes to send back.
     pub(crate) fn start(answer: impl Fn(&[u8]) -> Vec<u8> + Send + Sync + 'static) -> Self {
+        Self::start_with_heads(move |_, body| answer(body))
+    }
+
+    /// Like [`Self::start`]. `answer` also gets the head of the request.
+    pub(crate) fn start_with_heads(
+        answer: impl Fn(&str, &[u8]) -> Vec<u8> + Send + Sync + 'static,
+    ) -> Self {
         let server = Server::start(move |stream| {
             let mut stream = BufReader::new(stream);
-            while let Some((_, body)) = read_request(&mut stream) {
-                let bytes = answer(&body);
+            while let Some((head, body)) = read_request(&mut stream) {
+                let bytes = answer(&head, &body);
                 let whole = bytes.starts_with(b"HTTP/1.1 200 OK\r\nServer: fake-keep-alive");
                 if stream.get_mut().write_all(&bytes).is_err() || !whole {
                     break;
@@ -347,6 +353,12 @@ fn http_reply(body: &[u8]) -> Vec<u8> {
     let head =
         format!("HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n");
     [head.as_bytes(), body].concat()
+}
+
+/// Whether rosrescue itself has sent the request with this head.
+pub(crate) fn is_from_rosrescue(head: &str) -> bool {
+    let head = head.to_ascii_lowercase();
+    head.contains("\nuser-agent: rosrescue/")
 }
 
 /// Reads the head and body of the next request. `None` at the end of the connection.

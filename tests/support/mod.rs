@@ -50,7 +50,7 @@ pub(crate) use blocks::{blocks, documents};
 pub(crate) use browser::Browser;
 pub(crate) use disk::{FailingDisk, SmallDisk, Trouble};
 pub(crate) use failing::{Failing, Failures, Forkserver, page};
-pub(crate) use fake::{FakeMaster, FakeNode, ReceivedCall, read_request};
+pub(crate) use fake::{FakeMaster, FakeNode, ReceivedCall, is_from_rosrescue, read_request};
 pub(crate) use feed::{feed, gzip};
 pub(crate) use kinds::{kinds, sorted, unordered};
 pub(crate) use name_server::NameServer;
