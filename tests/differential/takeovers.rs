@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use ros1_master::{
-    master::{Master, Request},
+    master::{Kind, Master, Method, Request},
     xmlrpc::{Call, Reply, Value},
 };
 use rustix::process::Signal;
@@ -21,7 +21,7 @@ use crate::dice::Dice;
 use crate::nodes::{Node, patience};
 use crate::real::Wire;
 use crate::script::{Script, Step};
-use crate::stage::{CLIENTS, Failure, Stage};
+use crate::stage::{CLIENTS, Failure, Stage, alike};
 use crate::support::{Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal};
 
 /// The time to live, in seconds. With a shorter one, a busy computer would lose the lead before etcd answers.
@@ -134,6 +134,8 @@ struct Rig {
     computers: Vec<Computer>,
     /// The computer of each client, and the number of its starts at the time of the connection.
     at: [(usize, u32); CLIENTS],
+    /// The one of these through which the last write was made.
+    wrote: (usize, u32),
 }
 
 impl Rig {
@@ -148,6 +150,7 @@ impl Rig {
         Self {
             computers,
             at: [(0, 0); CLIENTS],
+            wrote: (0, 0),
         }
     }
 
@@ -199,8 +202,11 @@ impl Rig {
         })
     }
 
-    fn is_open(&self) -> bool {
-        self.leader().is_some_and(|(_, open)| open)
+    /// Compares all callbacks so far.
+    fn settle(&mut self, stage: &mut Stage<'_>) -> Result<(), Failure> {
+        stage.settle()?;
+        self.wrote = self.at[0];
+        Ok(())
     }
 
     fn await_leader(&self) -> Result<usize, Failure> {
@@ -356,7 +362,7 @@ fn steps(
             match step {
                 // The last callbacks may be lost with the leader, and are replaced later.
                 Step::Crash { .. } => stage.risk(),
-                _ => stage.settle()?,
+                _ => rig.settle(&mut stage)?,
             }
             let repeats = stage.repeats.get_or_insert_default();
             match step {
@@ -383,9 +389,11 @@ fn play(
     nth: usize,
 ) -> Result<(), Failure> {
     let call = stage.real(call);
-    stage.away &= !rig.is_open();
+    let leader = rig.leader();
+    stage.away &= !leader.is_some_and(|(_, open)| open);
+    let request = Request::from(call.clone());
     let mut after = stage.model.clone();
-    after.apply(&Request::from(call.clone()));
+    after.apply(&request);
     if stage.away && !survives(&after) {
         // Only a running master can return what a successor could not get.
         rig.await_open()?;
@@ -400,27 +408,52 @@ fn play(
     stage
         .model
         .set_identity(1, rig.computers[index].uri.clone());
-    let Some(end) = end else {
-        return stage.call(by, &call);
-    };
     stage.wires[by].send(&call)?;
-    let micros = Dice(nth as u64).next() % IN_FLIGHT_MICROS;
-    std::thread::sleep(Duration::from_micros(micros));
-    rig.end(end)?;
-    stage.away = true;
-    let reply = stage.wires[by].receive()?;
-    stage.answered(&call, &reply, true)?;
-    if let Some(repeats) = &mut stage.repeats {
+    if let Some(end) = end {
+        let micros = Dice(nth as u64).next() % IN_FLIGHT_MICROS;
+        std::thread::sleep(Duration::from_micros(micros));
+        rig.end(end)?;
+        stage.away = true;
+    }
+    let mut reply = stage.wires[by].receive()?;
+    // If the leader is late, or no computer leads, the mirror of this computer answers these.
+    let subscribes = *request.method() == Method::SubscribeParam;
+    if request.kind() == Kind::Read || subscribes && !stage.model.would_change(&request) {
+        // Another computer may see a write some milliseconds later. The leader and the one that made it see it.
+        if rig.at[by] != rig.wrote && leader.is_none_or(|(leader, _)| leader != index) {
+            reply = latest(&stage.model, &mut stage.wires[by], &call, reply)?;
+        }
+    } else if request.kind().mutates() {
+        rig.wrote = rig.at[by];
+    }
+    stage.answered(&call, &reply, end.is_some())?;
+    if let (Some(_), Some(repeats)) = (end, &mut stage.repeats) {
         repeats.ran_again();
     }
     Ok(())
+}
+
+/// Repeats a call that changes nothing until its reply is the model's.
+fn latest(
+    model: &Master,
+    wire: &mut Wire,
+    call: &Call,
+    mut reply: Reply,
+) -> Result<Reply, Failure> {
+    let expected = model.clone().apply(&call.clone().into()).reply;
+    let deadline = Instant::now() + patience();
+    while !alike(&expected, &reply) && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(2));
+        reply = wire.call(call)?;
+    }
+    Ok(reply)
 }
 
 /// Compares the state at each computer, and again after the leader's death, when it comes from the journal.
 fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     let leader = rig.await_all()?;
     rig.attach(stage)?;
-    stage.settle()?;
+    rig.settle(stage)?;
     for (index, computer) in rig.computers.iter().enumerate() {
         let status = computer.status().ok_or("no status")?;
         let counters = [
@@ -433,6 +466,10 @@ fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
             ));
         }
         let mut wire = computer.wire().ok_or("it is not listening")?;
+        // This shows each write of the comparison above. Later reads at this computer never go back.
+        let read = Call::new("getSystemState", vec!["/test".into()]);
+        let reply = wire.call(&read)?;
+        latest(&stage.model, &mut wire, &read, reply)?;
         stage
             .same_reads(&mut wire)
             .map_err(|why| format!("computer {index}: {why}"))?;
