@@ -13,15 +13,16 @@ use ros1_master::{
 };
 use rosrescue::clock;
 use rustix::process::Signal;
+use serde_json::Value as Json;
 
 use crate::NO_HANGS;
 use crate::dice::{Cast, Dice};
 use crate::nodes::{Node, patience};
 use crate::real::{Rosmaster, Wire};
 use crate::script::{Script, Step, node_api};
-use crate::stage::{CLIENTS, Failure, Stage};
+use crate::stage::{CLIENTS, Failure, Stage, undisturbed};
 use crate::support::{
-    Client, Rescue, Scratch, Setup, free_port, http_request, signal, status, unordered,
+    Client, Rescue, Scratch, Setup, free_port, http_request, signal, status, try_status, unordered,
 };
 
 /// A random sequence with this many crashes.
@@ -170,10 +171,16 @@ impl Rig {
         }
     }
 
-    /// Whether calls pass to a living master.
-    fn is_open(&self) -> bool {
-        let status = status(&self.rescue.client());
+    /// Whether calls pass to a living master, according to this status.
+    fn is_open(&self, status: &Json) -> bool {
         status["open"] == true && status["last_recovery"]["master_pid"] != self.killed
+    }
+
+    /// Lets `stage` look at the master, if rosrescue lives.
+    fn look(&self, stage: &mut Stage<'_>) {
+        if let Some(status) = try_status(&self.rescue.client()) {
+            stage.look(&status, self.is_open(&status));
+        }
     }
 
     /// Whether the log has the state of each instant.
@@ -201,7 +208,7 @@ impl Rig {
     /// Waits until calls pass to a master, or until they no longer do.
     fn await_gate(&self, open: bool) -> Result<(), Failure> {
         let deadline = Instant::now() + patience();
-        while self.is_open() != open {
+        while self.is_open(&status(&self.rescue.client())) != open {
             if Instant::now() > deadline {
                 return Err(format!("the gate never becomes open: {open}"));
             }
@@ -286,12 +293,27 @@ pub(crate) fn run(
     reads: &str,
     tally: &mut Tally,
 ) -> Result<(), Failure> {
-    let mut rig = Rig::start(core, reads);
-    let model = rig.state();
-    let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
-    let mut stage = Stage::new(nodes, wires, model);
-    stage.allow_repeats();
-    stage.callbacks = !script.unreturnable;
+    undisturbed(|| {
+        let mut rig = Rig::start(core, reads);
+        let model = rig.state();
+        let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
+        let mut stage = Stage::new(nodes, wires, model);
+        stage.allow_repeats();
+        stage.callbacks = !script.unreturnable;
+        let result = steps(script, &mut rig, &mut stage, tally);
+        if result.is_err() {
+            rig.look(&mut stage);
+        }
+        (result, stage.disturbance)
+    })
+}
+
+fn steps(
+    script: &Script,
+    rig: &mut Rig,
+    stage: &mut Stage<'_>,
+    tally: &mut Tally,
+) -> Result<(), Failure> {
     let mut in_flight = false;
     let mut instants = Vec::new();
     for (nth, step) in script.steps.iter().enumerate() {
@@ -311,13 +333,13 @@ pub(crate) fn run(
                     rig.revive();
                     rig.await_gate(true)?;
                 }
-                stage.away &= !rig.is_open();
+                rig.look(stage);
                 match std::mem::take(&mut in_flight) {
                     false => stage.call(by, &call).and_then(|()| match request.kind() {
                         Kind::Read if !stage.away => rig.same_bytes(&call, &request),
                         _ => Ok(()),
                     }),
-                    true => crash_under(&mut rig, &mut stage, by, &call, nth),
+                    true => crash_under(rig, stage, by, &call, nth),
                 }
             }
             Step::Crash { in_flight: during } => {
@@ -372,7 +394,10 @@ pub(crate) fn run(
         }
     }
     rig.revive();
-    let end = rig.await_gate(true).and_then(|()| stage.settle());
+    let end = rig.await_gate(true).and_then(|()| {
+        rig.look(stage);
+        stage.settle()
+    });
     let end = end.and_then(|()| {
         let divergences = &status(&rig.rescue.client())["counters"]["divergences"];
         if *divergences != 0 {
@@ -400,8 +425,8 @@ fn crash_under(
     stage.wires[by].send(call)?;
     let micros = Dice(nth as u64).next() % 2_000;
     std::thread::sleep(Duration::from_micros(micros));
-    rig.crash()?;
     stage.away = true;
+    rig.crash()?;
     let reply = stage.wires[by].receive()?;
     stage.answered(call, &reply, true)
 }

@@ -7,7 +7,11 @@
 //!
 //! `together.rs` has callers that do not take turns.
 //!
-//! A sequence that fails is shortened as far as possible and printed. The variables are:
+//! A sequence that fails is shortened as far as possible and printed. On a busy computer a master may be late, or lose
+//! its lead, without a step of the sequence. Callbacks then come in another order, or not at all. A sequence that fails
+//! after such a disturbance is played again, and the disturbance is printed.
+//!
+//! The variables are:
 //!
 //! | variable | |
 //! |---|---|
@@ -101,6 +105,11 @@ fn nodes() -> Vec<Node> {
     (0..NODES).map(|_| Node::start()).collect()
 }
 
+/// Prints `text` at once, and not with the test's output.
+fn say(text: &str) {
+    drop(writeln!(std::io::stderr(), "{text}"));
+}
+
 /// Plays `script`. If that fails, searches for a shorter script that fails too, and panics.
 fn play_or_shorten(
     what: &str,
@@ -108,9 +117,8 @@ fn play_or_shorten(
     mut run: impl FnMut(&Script) -> Result<(), Failure>,
 ) {
     let Err(first) = run(script) else { return };
-    // Printed at once and not with the test's output, because the search takes long.
-    let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
-    say(format!(
+    // The search takes long.
+    say(&format!(
         "{what} fails: {first}\n\n{}\nIt is being shortened, for at most {SHRINKING:?}.",
         script.print()
     ));
@@ -128,7 +136,7 @@ fn play_or_shorten(
         let fails = failure.is_some();
         if let Some(failure) = failure {
             why = failure;
-            say(format!(
+            say(&format!(
                 "{what} fails with {} steps, too",
                 shorter.steps.len()
             ));

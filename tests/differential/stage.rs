@@ -9,6 +9,7 @@ use ros1_master::{
     master::{Master, Notice, Request, port_of},
     xmlrpc::{Call, Reply, Value},
 };
+use serde_json::{Value as Json, json};
 
 use crate::dice::{CALLERS, KEYS, NAMES};
 use crate::nodes::{self, Node};
@@ -22,6 +23,25 @@ pub(crate) const CLIENTS: usize = 3;
 
 /// Why a run failed.
 pub(crate) type Failure = String;
+
+/// How often a script is played at most.
+const TRIES: usize = 3;
+
+/// Plays a script with `once`, which also returns what has disturbed the master, if anything has. A script that fails
+/// then is played again. One that fails undisturbed has failed.
+pub(crate) fn undisturbed(
+    mut once: impl FnMut() -> (Result<(), Failure>, Option<String>),
+) -> Result<(), Failure> {
+    for _ in 1..TRIES {
+        match once() {
+            (Err(why), Some(disturbance)) => crate::say(&format!(
+                "The script is played again, because {disturbance}. It failed: {why}"
+            )),
+            (result, _) => return result,
+        }
+    }
+    once().0
+}
 
 /// One run.
 pub(crate) struct Stage<'n> {
@@ -37,6 +57,10 @@ pub(crate) struct Stage<'n> {
     pub(crate) repeats: Option<TrueLists>,
     /// Whether the master may be away. Then rosrescue notifies the nodes.
     pub(crate) away: bool,
+    /// The master that served at the last [`Self::look`] that found one.
+    serving: Json,
+    /// What has happened to the master without a step of the script.
+    pub(crate) disturbance: Option<String>,
 }
 
 impl<'n> Stage<'n> {
@@ -53,6 +77,29 @@ impl<'n> Stage<'n> {
             callbacks: true,
             repeats: None,
             away: false,
+            serving: Json::Null,
+            disturbance: None,
+        }
+    }
+
+    /// Looks at the status of rosrescue. `serves` says whether calls pass to a living master. If no step has sent the
+    /// master away, it is a disturbance if none serves, if another one does, or if rosrescue has answered in its place.
+    pub(crate) fn look(&mut self, status: &Json, serves: bool) {
+        let now = match serves {
+            true => json!({
+                "process of rosrescue": status["pid"],
+                "masters": status["recoveries"],
+                "calls that no master answered": status["counters"]["calls_without_master"],
+            }),
+            false => Json::Null,
+        };
+        let before = &self.serving;
+        if !self.away && !before.is_null() && *before != now {
+            let text = format!("the master was away or late without a step: {before} became {now}");
+            self.disturbance.get_or_insert(text);
+        }
+        if serves {
+            (self.serving, self.away) = (now, false);
         }
     }
 
@@ -309,4 +356,46 @@ fn in_order(mut elements: Vec<Value>) -> Vec<Value> {
         elements.sort_by_key(|it| format!("{it:?}"));
     }
     elements
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_script_that_fails_disturbed_is_played_again() {
+        let fails = || Err("a callback is missing".to_owned());
+        let disturbed = || Some("the master was late".to_owned());
+        let plays = |results: &[(Result<(), Failure>, Option<String>)]| {
+            let mut left = results.iter().cloned();
+            let result = undisturbed(|| left.next().expect("no further play"));
+            (result.is_ok(), results.len() - left.len())
+        };
+        assert_eq!(plays(&[(fails(), None)]), (false, 1));
+        assert_eq!(plays(&[(Ok(()), disturbed())]), (true, 1));
+        assert_eq!(plays(&[(fails(), disturbed()), (Ok(()), None)]), (true, 2));
+        let always = [(); TRIES].map(|()| (fails(), disturbed()));
+        assert_eq!(plays(&always), (false, TRIES));
+    }
+
+    #[test]
+    fn only_what_no_step_has_done_is_a_disturbance() {
+        let status = |masters: i32, answered: i32| {
+            let counters = json!({ "calls_without_master": answered });
+            json!({ "pid": 1, "recoveries": masters, "counters": counters })
+        };
+        let after = |masters: i32, answered: i32, serves: bool| {
+            let mut stage = Stage::new(&[], Vec::new(), Master::default());
+            stage.look(&status(1, 0), true);
+            stage.away = true;
+            stage.look(&status(1, 0), false);
+            stage.look(&status(2, 5), true);
+            stage.look(&status(masters, answered), serves);
+            stage.disturbance.is_some()
+        };
+        assert!(!after(2, 5, true));
+        for (masters, answered, serves) in [(3, 5, true), (2, 6, true), (2, 5, false)] {
+            assert!(after(masters, answered, serves));
+        }
+    }
 }

@@ -21,8 +21,10 @@ use crate::dice::Dice;
 use crate::nodes::{Node, patience};
 use crate::real::Wire;
 use crate::script::{Script, Step};
-use crate::stage::{CLIENTS, Failure, Stage, alike};
-use crate::support::{Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal};
+use crate::stage::{CLIENTS, Failure, Stage, alike, undisturbed};
+use crate::support::{
+    Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal, try_status,
+};
 
 /// The time to live, in seconds. With a shorter one, a busy computer would lose the lead before etcd answers.
 const TTL: &str = "1.5";
@@ -118,10 +120,8 @@ impl Computer {
 
     /// The content of `/status.json`. `None` if rosrescue does not answer.
     fn status(&self) -> Option<Json> {
-        let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
         self.life?;
-        let response = self.rescue.client().exchange(get).ok()?;
-        serde_json::from_slice(&response.body).ok()
+        try_status(&self.rescue.client())
     }
 
     fn wire(&self) -> Option<Wire> {
@@ -193,13 +193,23 @@ impl Rig {
         })
     }
 
-    /// The leader, and whether calls pass to its master.
-    fn leader(&self) -> Option<(usize, bool)> {
+    /// The leader and its status.
+    fn leader(&self) -> Option<(usize, Json)> {
         let mut all = self.computers.iter().enumerate();
         all.find_map(|(index, computer)| {
             let status = computer.status()?;
-            (status["cluster"]["role"] == "leading").then(|| (index, status["open"] == true))
+            (status["cluster"]["role"] == "leading").then_some((index, status))
         })
+    }
+
+    /// Lets `stage` look at the leader's master, or see that no computer leads. Returns the leader.
+    fn look(&self, stage: &mut Stage<'_>) -> Option<usize> {
+        let Some((leader, status)) = self.leader() else {
+            stage.look(&Json::Null, false);
+            return None;
+        };
+        stage.look(&status, status["open"] == true);
+        Some(leader)
     }
 
     /// Compares all callbacks so far.
@@ -222,7 +232,8 @@ impl Rig {
 
     fn await_open(&self) -> Result<usize, Failure> {
         await_some("a leader with a master", || {
-            self.leader().filter(|(_, open)| *open).map(|it| it.0)
+            let (leader, status) = self.leader()?;
+            (status["open"] == true).then_some(leader)
         })
     }
 
@@ -305,34 +316,40 @@ pub(crate) fn run(
     count: usize,
     tally: &mut Tally,
 ) -> Result<(), Failure> {
-    let mut rig = Rig::start(servers, count);
-    let result = rig
-        .state()
-        .and_then(|model| steps(script, nodes, &mut rig, model, tally));
-    if result.is_err() && !crate::nodes::HURRIED.get() {
-        for computer in &rig.computers {
-            eprintln!("{}", computer.rescue.log());
+    undisturbed(|| {
+        let mut rig = Rig::start(servers, count);
+        let model = match rig.state() {
+            Ok(model) => model,
+            Err(why) => return (Err(why), None),
+        };
+        let wires = (0..CLIENTS).map(|_| rig.computers[0].wire().unwrap());
+        let mut stage = Stage::new(nodes, wires.collect(), model);
+        stage.allow_repeats();
+        stage.callbacks = !script.unreturnable;
+        let result = steps(script, &mut rig, &mut stage, tally);
+        if result.is_err() {
+            rig.look(&mut stage);
+            if !crate::nodes::HURRIED.get() {
+                for computer in &rig.computers {
+                    eprintln!("{}", computer.rescue.log());
+                }
+            }
         }
-    }
-    result
+        (result, stage.disturbance)
+    })
 }
 
 fn steps(
     script: &Script,
-    nodes: &[Node],
     rig: &mut Rig,
-    model: Master,
+    stage: &mut Stage<'_>,
     tally: &mut Tally,
 ) -> Result<(), Failure> {
-    let wires = (0..CLIENTS).map(|_| rig.computers[0].wire().unwrap());
-    let mut stage = Stage::new(nodes, wires.collect(), model);
-    stage.allow_repeats();
-    stage.callbacks = !script.unreturnable;
     let mut next_end = None;
     for (nth, step) in script.steps.iter().enumerate() {
         let (end, in_flight) = match step {
             Step::Call { by, call } => {
-                play(rig, &mut stage, by % CLIENTS, call, next_end.take(), nth)
+                play(rig, stage, by % CLIENTS, call, next_end.take(), nth)
                     .map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
                 continue;
             }
@@ -358,11 +375,11 @@ fn steps(
             continue;
         }
         share.happened += 1;
-        let ended = rig.attach(&mut stage).and_then(|()| {
+        let ended = rig.attach(stage).and_then(|()| {
             match step {
                 // The last callbacks may be lost with the leader, and are replaced later.
                 Step::Crash { .. } => stage.risk(),
-                _ => rig.settle(&mut stage)?,
+                _ => rig.settle(stage)?,
             }
             let repeats = stage.repeats.get_or_insert_default();
             match step {
@@ -375,7 +392,7 @@ fn steps(
         });
         ended.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
-    let end = finish(rig, &mut stage);
+    let end = finish(rig, stage);
     end.map_err(|why| format!("at the end: {why}"))
 }
 
@@ -389,8 +406,7 @@ fn play(
     nth: usize,
 ) -> Result<(), Failure> {
     let call = stage.real(call);
-    let leader = rig.leader();
-    stage.away &= !leader.is_some_and(|(_, open)| open);
+    let leader = rig.look(stage);
     let request = Request::from(call.clone());
     let mut after = stage.model.clone();
     after.apply(&request);
@@ -412,15 +428,15 @@ fn play(
     if let Some(end) = end {
         let micros = Dice(nth as u64).next() % IN_FLIGHT_MICROS;
         std::thread::sleep(Duration::from_micros(micros));
-        rig.end(end)?;
         stage.away = true;
+        rig.end(end)?;
     }
     let mut reply = stage.wires[by].receive()?;
     // If the leader is late, or no computer leads, the mirror of this computer answers these.
     let subscribes = *request.method() == Method::SubscribeParam;
     if request.kind() == Kind::Read || subscribes && !stage.model.would_change(&request) {
         // Another computer may see a write some milliseconds later. The leader and the one that made it see it.
-        if rig.at[by] != rig.wrote && leader.is_none_or(|(leader, _)| leader != index) {
+        if rig.at[by] != rig.wrote && leader != Some(index) {
             reply = latest(&stage.model, &mut stage.wires[by], &call, reply)?;
         }
     } else if request.kind().mutates() {
@@ -452,6 +468,7 @@ fn latest(
 /// Compares the state at each computer, and again after the leader's death, when it comes from the journal.
 fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     let leader = rig.await_all()?;
+    rig.look(stage);
     rig.attach(stage)?;
     rig.settle(stage)?;
     for (index, computer) in rig.computers.iter().enumerate() {
@@ -482,6 +499,7 @@ fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     if !survives(&stage.model) {
         return Ok(());
     }
+    stage.away = true;
     rig.end(End::Death)?;
     rig.attach(stage)?;
     let (index, _) = rig.at[0];

@@ -73,7 +73,7 @@ pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request,
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use servers::{LIMIT, Servers};
 pub(crate) use state::State;
-pub(crate) use status::{names, open_to, status};
+pub(crate) use status::{names, open_to, status, try_status};
 pub(crate) use streams::{LIBRARIES, Streams, port_of};
 pub(crate) use turn::{Turn, turn};
 pub(crate) use twins::{Twins, assert_form};

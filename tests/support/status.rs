@@ -4,12 +4,19 @@ use serde_json::Value;
 
 use super::rpc::Client;
 
+const GET: &[u8] = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
+
 /// Fetches `/status.json`.
 #[track_caller]
 pub(crate) fn status(client: &Client) -> Value {
-    let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
-    let response = client.exchange(get).expect("the status page");
+    let response = client.exchange(GET).expect("the status page");
     serde_json::from_slice(&response.body).expect("JSON")
+}
+
+/// Fetches `/status.json`. `None` if rosrescue does not answer.
+pub(crate) fn try_status(client: &Client) -> Option<Value> {
+    let response = client.exchange(GET).ok()?;
+    serde_json::from_slice(&response.body).ok()
 }
 
 /// The process id of the master to which calls pass, according to `status`. `None` while they pass to none.
