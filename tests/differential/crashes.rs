@@ -18,7 +18,7 @@ use serde_json::Value as Json;
 use crate::NO_HANGS;
 use crate::dice::{Cast, Dice};
 use crate::nodes::{Node, patience};
-use crate::real::{Rosmaster, Wire};
+use crate::real::{Rosmaster, Wire, lost_callback};
 use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage, undisturbed};
 use crate::support::{
@@ -301,10 +301,13 @@ pub(crate) fn run(
         stage.allow_repeats();
         stage.callbacks = !script.unreturnable;
         let result = steps(script, &mut rig, &mut stage, tally);
-        if result.is_err() {
-            rig.look(&mut stage);
+        if result.is_ok() {
+            return (result, None);
         }
-        (result, stage.disturbance)
+        rig.look(&mut stage);
+        let scratch = rig.master.as_ref().map(|master| &master.scratch);
+        let lost = || lost_callback(scratch.unwrap_or(&rig.scratch));
+        (result, stage.disturbance.or_else(lost))
     })
 }
 

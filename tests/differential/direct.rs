@@ -8,9 +8,9 @@ use ros1_master::{
 
 use crate::dice::{Cast, Dice};
 use crate::nodes::Node;
-use crate::real::{Rosmaster, Wire};
+use crate::real::{Rosmaster, Wire, lost_callback};
 use crate::script::{Script, Step, node_api};
-use crate::stage::{CLIENTS, Failure, Stage};
+use crate::stage::{CLIENTS, Failure, Stage, undisturbed};
 use crate::support::unordered;
 
 /// Maximum number of calls that a successor has answered before it gets the state.
@@ -52,15 +52,30 @@ fn successor(dice: &mut Dice, cast: &Cast) -> Step {
 
 /// Plays a sequence. `spare` is started in time for the next master that is needed.
 pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Result<(), Failure> {
+    undisturbed(|| {
+        let mut real = None;
+        let result = steps(script, nodes, spare, &mut real);
+        (result, real.and_then(|real| lost_callback(&real.scratch)))
+    })
+}
+
+/// Plays a sequence. `real` is the present master.
+fn steps(
+    script: &Script,
+    nodes: &[Node],
+    spare: &mut Rosmaster,
+    real: &mut Option<Rosmaster>,
+) -> Result<(), Failure> {
     let mut fresh = || {
-        let mut real = std::mem::replace(spare, Rosmaster::start());
-        let mut wires = vec![real.ready()];
-        wires.extend((1..CLIENTS).map(|_| Wire::connect(real.port).unwrap()));
+        let mut next = std::mem::replace(spare, Rosmaster::start());
+        let mut wires = vec![next.ready()];
+        wires.extend((1..CLIENTS).map(|_| Wire::connect(next.port).unwrap()));
         let mut model = Master::default();
         wires[0].identify(&mut model);
-        (real, wires, model)
+        *real = Some(next);
+        (wires, model)
     };
-    let (mut real, wires, model) = fresh();
+    let (wires, model) = fresh();
     let mut stage = Stage::new(nodes, wires, model);
     stage.callbacks = !script.unreturnable;
     for (nth, step) in script.steps.iter().enumerate() {
@@ -70,17 +85,14 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
                 stage.call(by % CLIENTS, &call)
             }
             Step::Successor(found) => finish(&mut stage).and_then(|()| {
-                let (next, wires, model) = fresh();
-                real = next;
+                let (wires, model) = fresh();
                 succeed(&mut stage, wires, model, found)
             }),
             Step::Crash { .. } | Step::Handover { .. } | Step::Away | Step::Back => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
-    finish(&mut stage).map_err(|why| format!("at the end: {why}"))?;
-    drop(real);
-    Ok(())
+    finish(&mut stage).map_err(|why| format!("at the end: {why}"))
 }
 
 /// Compares the remaining callbacks and all reads.

@@ -14,7 +14,7 @@ use crate::support::{self, Client, PATIENCE, Scratch, find_program, free_port, h
 pub(crate) struct Rosmaster {
     process: Child,
     pub(crate) port: u16,
-    _scratch: Scratch,
+    pub(crate) scratch: Scratch,
 }
 
 impl Rosmaster {
@@ -43,7 +43,7 @@ impl Rosmaster {
         Self {
             process,
             port,
-            _scratch: scratch,
+            scratch,
         }
     }
 
@@ -77,6 +77,15 @@ impl Drop for Rosmaster {
     fn drop(&mut self) {
         self.kill();
     }
+}
+
+/// The line in the log of a rosmaster, which writes to `scratch`, that says that it has lost a callback. A struct in a
+/// callback is the dict of the parameter tree, and cannot be encoded if a later call changes its keys meanwhile.
+pub(crate) fn lost_callback(scratch: &Scratch) -> Option<String> {
+    let log = std::fs::read(scratch.log_dir().join("master.log")).ok()?;
+    let log = String::from_utf8_lossy(&log);
+    let line = log.lines().find(|line| line.contains("during iteration"))?;
+    Some(format!("rosmaster has lost a callback: {line}"))
 }
 
 /// A client's connection to a master.
@@ -132,16 +141,24 @@ impl Wire {
     }
 }
 
+/// The log has only what [`lost_callback`] reads.
 const LOGGING: &str = "[loggers]
-keys=root
+keys=root,notifiers
 [handlers]
-keys=none
+keys=none,file
 [formatters]
 keys=
 [logger_root]
 level=CRITICAL
 handlers=none
+[logger_notifiers]
+qualname=rosmaster.threadpool
+level=ERROR
+handlers=file
 [handler_none]
 class=NullHandler
 args=()
+[handler_file]
+class=FileHandler
+args=(os.environ['ROS_LOG_FILENAME'],)
 ";

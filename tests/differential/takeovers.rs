@@ -19,7 +19,7 @@ use crate::NO_HANGS;
 use crate::crashes::{self, Share, has_params, read_state, skipped};
 use crate::dice::Dice;
 use crate::nodes::{Node, patience};
-use crate::real::Wire;
+use crate::real::{Wire, lost_callback};
 use crate::script::{Script, Step};
 use crate::stage::{CLIENTS, Failure, Stage, alike, undisturbed};
 use crate::support::{
@@ -327,15 +327,18 @@ pub(crate) fn run(
         stage.allow_repeats();
         stage.callbacks = !script.unreturnable;
         let result = steps(script, &mut rig, &mut stage, tally);
-        if result.is_err() {
-            rig.look(&mut stage);
-            if !crate::nodes::HURRIED.get() {
-                for computer in &rig.computers {
-                    eprintln!("{}", computer.rescue.log());
-                }
+        if result.is_ok() {
+            return (result, None);
+        }
+        rig.look(&mut stage);
+        if !crate::nodes::HURRIED.get() {
+            for computer in &rig.computers {
+                eprintln!("{}", computer.rescue.log());
             }
         }
-        (result, stage.disturbance)
+        let mut computers = rig.computers.iter();
+        let lost = || computers.find_map(|computer| lost_callback(&computer.scratch));
+        (result, stage.disturbance.or_else(lost))
     })
 }
 
