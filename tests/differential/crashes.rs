@@ -412,7 +412,9 @@ fn steps(
         stage
             .same_reads(&mut behind)
             .map_err(|why| format!("the master behind: {why}"))?;
-        rig.had_states(&instants)
+        // The files may be replaced while they are read.
+        let had = rig.had_states(&instants);
+        had.or_else(|_| rig.had_states(&instants))
     });
     end.map_err(|why| format!("at the end: {why}"))
 }

@@ -315,13 +315,13 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
     states(behind.port, behind.port, "at the end");
     if !unreturnable {
         let port = behind.port;
+        let restored = || status(&rescue.client())["counters"]["masters_restored"].clone();
+        let before = restored();
         behind.kill();
         let mut behind = Rosmaster::start_at(port);
         drop(behind.ready());
         eventually("the state is back", || {
-            let status = status(&rescue.client());
-            status["open"] == true
-                && status["counters"]["masters_restored"] != counters["masters_restored"]
+            restored() != before && status(&rescue.client())["open"] == true
         });
         states(rescue.port(), port, "after a crash");
     }
