@@ -303,7 +303,10 @@ fn a_web_page_cannot_change_anything() {
     ];
     for bytes in &fine {
         assert_eq!(client.exchange(bytes).unwrap().code, 200);
-        assert_eq!(robot.bare().param("/evil"), Some(1.into()));
+        // The mirror may answer for a late master, because it still has the value.
+        eventually("the master has the value", || {
+            robot.bare().param("/evil") == Some(1.into())
+        });
         robot.bare().ok("deleteParam", params!["/c", "/evil"]);
     }
 }

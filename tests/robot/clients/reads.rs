@@ -5,7 +5,7 @@ use std::thread;
 
 use ros1_master::xmlrpc::Value;
 
-use crate::support::{Mode, Robot, tree};
+use crate::support::{Mode, Robot, eventually, tree};
 
 const WRITERS: usize = 6;
 const READERS: usize = 4;
@@ -81,7 +81,10 @@ fn a_core_forwards_reads_if_asked_to() {
     client.set_param("/gain", 7);
     let past = robot.bare();
     past.set_param("/gain", 8);
-    assert_eq!(client.param("/gain"), Some(8.into()));
+    // On a busy computer the mirror may answer once for a late master.
+    eventually("the master answers", || {
+        client.param("/gain") == Some(8.into())
+    });
     assert_eq!(robot.counter("calls_from_mirror"), 0);
 }
 
