@@ -135,6 +135,11 @@ fn lines(picture: &str) -> Vec<String> {
         .lines()
         .filter(|line| line.starts_with("<text class=\"line"));
     let texts = lines.map(|line| line.split_once('>').unwrap().1);
+    // A talker that gets no processor during the rescue sends nothing, so the line has no first and last message.
+    let texts = texts.map(|text| match text.contains("meanwhile the listener heard") {
+        true => text.split_once(" messages").unwrap().0,
+        false => text,
+    });
     let words = texts.map(|text| text.split(|c: char| c.is_ascii_digit() || c == '.'));
     words
         .map(|words| {
