@@ -216,12 +216,14 @@ fn a_drill_fails_for_what_is_lost_and_notes_what_others_did() {
     node.subscribe(&client, "/commands", "std_msgs/String");
     let talker = |name: &str, library| {
         let name = format!("__name:={name}");
-        robot.node(library, "talker", &["50", "quiet", &name])
+        robot.spawn_node(library, "talker", &["50", "quiet", &name])
     };
-    let mut respawned = talker("respawned", Library::Roscpp);
-    let mut killed = talker("killed", Library::Roscpp);
-    let mut dead = talker("dead", Library::Roscpp);
-    let mut ended = talker("ended", Library::Rospy);
+    let [mut respawned, mut killed, mut dead, mut ended] = Node::all_ready([
+        talker("respawned", Library::Roscpp),
+        talker("killed", Library::Roscpp),
+        talker("dead", Library::Roscpp),
+        talker("ended", Library::Rospy),
+    ]);
     eventually("all publish", || {
         robot.state().publishers_of("/chatter").len() == 4
     });
@@ -230,16 +232,17 @@ fn a_drill_fails_for_what_is_lost_and_notes_what_others_did() {
     let options = ["--yes", "--times", "1", "--topic", "chatter"];
     let mut drill = drill(&robot.scratch, robot.port(), &options);
     drill.wait_line("that it kills", |line| line.starts_with("1 of 1"));
-    // The drill watches for some seconds, so what need not be awaited comes first.
-    client.set_param("/robot/wheels", 5);
-    node.unsubscribe(&client, "/commands");
-    ended.signal(Signal::TERM);
+    // The drill watches for some seconds, so what takes longest comes first, and both talkers start at once.
     // roscpp unregisters at SIGINT.
     respawned.signal(Signal::INT);
+    ended.signal(Signal::TERM);
     killed.kill();
     dead.kill();
+    client.set_param("/robot/wheels", 5);
+    node.unsubscribe(&client, "/commands");
     respawned.wait();
     let again = ["respawned", "killed"].map(|name| talker(name, Library::Roscpp));
+    let again = Node::all_ready(again);
     ended.wait();
     let found = verdict(drill);
     assert_eq!(found["passed"], false, "{found:#}");
