@@ -302,9 +302,10 @@ fn an_interrupted_drill_leaves_nothing_behind() {
         let options = ["--no-kill", "--seconds", "600", "--topic", "chatter"];
         let mut drill = drill(&robot.scratch, robot.port(), &options);
         drill.wait_line("that it watches", |line| line.starts_with("watching for"));
-        let names = robot.client().ok("getParamNames", vec!["/test".into()]);
-        let names = format!("{names:?}");
-        assert!(names.contains("/rosrescue_drill_"), "{names}");
+        eventually("the drill's parameter is set", || {
+            let names = robot.client().ok("getParamNames", vec!["/test".into()]);
+            format!("{names:?}").contains("/rosrescue_drill_")
+        });
         drill.signal(which);
         assert_eq!(drill.wait_output().code(), Some(1));
         assert!(drill.stderr().join(" ").contains("cleaned up"));
