@@ -238,6 +238,8 @@ fn hangs_under_writes_lose_nothing() {
     // The master was restored once after each hang that was noticed, however often the gate was shut for other reasons.
     assert!(robot.counter("masters_restored") >= injections + shut);
     for (key, written) in keys.into_iter().zip(written) {
+        // The last write may have been answered in place of a late master.
+        robot.await_gate();
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
         // rosrescue leaves out outdated values. The last value may come from rosrescue before the master sends the
         // value before that; then it is sent again.
@@ -266,6 +268,8 @@ fn an_unregistration_under_way_in_a_hung_master_is_not_forgotten() {
     for node in [&leaving, &staying] {
         node.publish(&client, "/topic", "std_msgs/String");
     }
+    // The master may have been late.
+    robot.await_gate();
     let after = robot.settled_state().without_node("/leaving");
     let dead = robot.master_pid();
     crate::support::stop(dead);
@@ -286,6 +290,8 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
     let talker = robot.node(Library::Rospy, "talker", &[]);
     let listener = robot.node(Library::Roscpp, "listener", &[]);
     listener.wait_messages("/talker", 5);
+    // The master may have been late.
+    robot.await_gate();
     let before = robot.settled_state();
     let hung = robot.master_pid();
     crate::support::stop(hung);
@@ -307,10 +313,13 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
         1
     );
     client.ok("deleteParam", params!["/test", "/waits"]);
+    // The next master may have been late, too.
+    robot.await_gate();
     before.assert_same(&robot.state(), "after the hung master was replaced");
     let status = robot.status().unwrap();
+    // The last recovery may be that of a late master. It does not count as a rescue.
     assert_eq!(
-        status["last_recovery"]["cause"],
+        status["last_rescues"][0]["cause"],
         "the master stopped answering"
     );
     listener.wait_messages("/talker", 10);
