@@ -328,8 +328,8 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
     talker.assert_no_link_lost();
 }
 
-/// A master that takes two seconds per call, with a time limit of three, is left alone. One that takes twenty seconds
-/// is replaced.
+/// A master that takes five seconds per call, with a time limit of eight, is left alone. One that takes twenty seconds
+/// is replaced. The master may get no processor for three seconds.
 #[test]
 fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
     let program = format!("{NODES}/slow_rosmaster.py");
@@ -340,7 +340,7 @@ fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
         "--probe-interval",
         "100",
         "--probe-timeout",
-        "1500",
+        "4000",
         "--probe-count",
         "2",
         // Writes wait for the master here.
@@ -354,7 +354,7 @@ fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
     let slow = robot.scratch.path("slow");
 
     // The first value is almost as long as a probe may take, and the second one is longer.
-    for (number, seconds) in (1..).zip(["1.2", "2"]) {
+    for (number, seconds) in (1..).zip(["3.5", "5"]) {
         fs::write(&slow, seconds).unwrap();
         let start = Instant::now();
         client.set_param("/kept", number);
@@ -370,7 +370,7 @@ fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
         });
         assert_eq!(value, Some(Value::Int(number)));
         // Several probes have run in this time.
-        let probes = Duration::from_millis(3500);
+        let probes = Duration::from_secs(10);
         assert!(holds(probes, || robot.is_open()), "{seconds} s a call");
     }
     // roslaunch waits for this.
