@@ -164,7 +164,11 @@ fn rosrescue_can_be_run_and_handed_over_as_documented() {
     let said = run(&[
         three_etcd(&document),
         on(&ALL, &core),
-        on(&["head"], &look),
+        // A computer that has just started may not know the others yet.
+        on(
+            &["head"],
+            &format!("rosrescue wait --for protected\n{look}"),
+        ),
         // The exit status depends on whether the next master already answers, which the test does not check.
         on(&["base"], "rosrescue status || true"),
         // On such a computer `check` has further findings.

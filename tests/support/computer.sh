@@ -7,6 +7,8 @@ id etcd >/dev/null 2>&1 || echo "etcd:x:990:990::/var/lib/etcd:/usr/sbin/nologin
 export ROS_HOME=$folder ROS_LOG_DIR=$folder/log ROS_MASTER_URI=http://localhost:11311
 ROS_IP=$(ip -4 -o addr show dev eth0 | sed 's|.*inet \([0-9.]*\)/.*|\1|')
 export ROS_IP
+# A computer that gets no processor for 2 s, the default, keeps its leadership here.
+export ROSRESCUE_CLUSTER_TTL=20
 
 # Programs that keep running get a terminal of their own.
 rosrescue() {
