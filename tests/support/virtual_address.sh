@@ -40,9 +40,14 @@ is_elsewhere() { ask && [ "$holder" != "$left" ]; }
 
 # Waits until the address has moved to another computer, and prints how long that took.
 moves() { # WHY
+    # keepalived may move the address by itself before the connection is made.
+    left=
+    until [ "$left" = "$holder" ]; do
+        left=$holder
+        exec 3<>/dev/tcp/10.0.0.100/11311
+        within 120 ask
+    done
     local start=${EPOCHREALTIME/./}
-    left=$holder
-    exec 3<>/dev/tcp/10.0.0.100/11311
     "$@"
     within 120 is_elsewhere
     echo "$*: from $left to $holder after $(((${EPOCHREALTIME/./} - start) / 1000)) ms"
