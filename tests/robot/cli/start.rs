@@ -6,7 +6,7 @@ use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::Command;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, Rescue, Rosmaster, Scratch, Setup, behind, eventually, find_program, free_port, holds,
@@ -278,11 +278,15 @@ fn rosrescue_waits_for_a_port_that_becomes_free_soon() {
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
     let taken = TcpListener::bind(("0.0.0.0", setup.port)).unwrap();
+    let start = Instant::now();
     let mut rescue = setup.spawn();
     // A rosrescue that does not wait for the port would end within this time.
     holds(Duration::from_millis(300), || rescue.exited().is_none());
     drop(taken);
-    rescue.wait_serving();
+    // It waits for 2 s, and this test may have got no processor for that long.
+    if start.elapsed() < Duration::from_millis(1500) {
+        rescue.wait_serving();
+    }
 }
 
 #[test]
