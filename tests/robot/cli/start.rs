@@ -465,7 +465,9 @@ fn a_rosmaster_that_is_gone_for_a_while_is_started_when_it_is_back() {
 fn rosrescue_waits_for_a_master_that_is_not_running_yet() {
     let scratch = Scratch::new();
     let port = free_port();
-    let mut rescue = Setup::proxy(&scratch, port).spawn();
+    // A master takes many seconds to start on a busy computer.
+    let setup = Setup::proxy(&scratch, port).args(["--hold", "120"]);
+    let mut rescue = setup.spawn();
     rescue.wait_line("that it waits", |line| line.to_lowercase().contains("wait"));
     assert!(holds(Duration::from_secs(1), || rescue.exited().is_none()));
     let client = rescue.client();
