@@ -1,7 +1,7 @@
 //! `rosrescue top`: a live picture on a terminal, and plain text elsewhere.
 
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::support::{
     Mode, NODES, Process, Robot, Tool, behind, command, eventually, free_port, params, stop, within,
@@ -31,10 +31,13 @@ fn on_terminal(robot: &Robot, key: &str, size: &str) -> (String, Vec<String>) {
 fn it_is_live_on_a_terminal_and_leaves_it_as_it_was() {
     let robot = Robot::start(Mode::Core);
     robot.client().call("getPid", params!["/caller"]).unwrap();
+    let start = Instant::now();
     let (verdict, pictures) = on_terminal(&robot, "q", "80x24");
+    // The key may be typed late.
+    let most = 1 + usize::try_from(start.elapsed().as_secs()).unwrap();
     assert_eq!(verdict, "0 True");
     assert!(
-        (2..=4).contains(&pictures.len()),
+        (2..=most).contains(&pictures.len()),
         "once a second: {pictures:?}"
     );
     for picture in &pictures {
