@@ -58,9 +58,10 @@ fn another_program_at_the_port_of_our_master_receives_no_call() {
         "--rosmaster",
     ];
     let setup = Setup::bare(&scratch, arguments).arg(robbed).at_port(port);
+    let setup = setup.args(["--start-limit", "300"]);
     let take = rob(&scratch);
-    // rosrescue must not wait for the 30 s that a rosmaster has for its start.
-    let soon = Duration::from_secs(25);
+    // rosrescue must not wait for the 300 s that a rosmaster has for its start. Two starts may take long.
+    let soon = Duration::from_secs(120);
     let (rescue, first, bytes) = within(soon, "the start", || {
         let mut rescue = setup.spawn();
         let (first, bytes) = take();
