@@ -110,7 +110,7 @@ impl Robot {
         };
         eventually("all pending notifications have been sent", || {
             let before = counts();
-            holds(Duration::from_millis(500), || counts() == before)
+            holds(Duration::from_secs(3), || counts() == before)
         });
         counts()
     }
