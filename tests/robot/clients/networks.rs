@@ -90,10 +90,10 @@ fn allow_and_allow_write_decide_who_may_call_and_who_may_change() {
         line.contains("only these may change: this computer")
     });
     for host in [net.far(2), net.far(5), net.far6(2), net.far6(5)] {
+        let refused = format!("refused: {host} may");
+        rescue.wait_line("who is refused", |line| line.contains(&refused));
         let log = rescue.output();
-        let lines = log
-            .iter()
-            .filter(|line| line.contains(&format!("refused: {host} may")));
+        let lines = log.iter().filter(|line| line.contains(&refused));
         assert_eq!(lines.count(), 1, "{host}");
     }
 }
