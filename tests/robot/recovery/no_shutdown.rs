@@ -111,9 +111,9 @@ in_both_modes!(nodes_that_start_during_an_outage_are_not_shut_down);
 /// * two nodes die, and their ports go to other nodes. The dead nodes do not come back.
 /// * two nodes die and come back at other ports, and their old ports go to other nodes, in either order. rosrescue must
 ///   notice that the node at the old port is another one, and not shut it down. If the port was taken first, even a master
-///   that never dies shuts down its new owner. The master of a core may be back by then, so only a proxy plays this.
+///   that never dies shuts down its new owner.
 fn nodes_that_start_during_an_outage_are_not_shut_down(mode: Mode) {
-    let mut robot = Robot::start(mode);
+    let mut robot = Robot::start_for_outages(mode);
     let client = robot.client();
     let witness = Witness::start(&client);
     let both = |name: &str| [0, 1].map(|i| claimed(&format!("{name}{i}"), 0, &client));
@@ -129,10 +129,7 @@ fn nodes_that_start_during_an_outage_are_not_shut_down(mode: Mode) {
         for node in phoenixes.iter().chain(&mortals) {
             assert_not_shut_down(node, round);
         }
-        let moving = match mode {
-            Mode::Proxy => both("/moving").into(),
-            Mode::Core => Vec::new(),
-        };
+        let moving = both("/moving");
         let gone = mortals.each_ref().map(|node| node.name.clone());
         let [dead, alive] = phoenixes;
         let moved: Vec<[FakeNode; 2]>;
