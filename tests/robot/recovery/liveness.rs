@@ -1,5 +1,9 @@
 //! The status reports dead nodes, long before a rescue or `--reap` unregisters them.
 
+use std::time::Instant;
+
+use rescue_core::order::RECENT;
+
 use super::reap::{await_watched, has_logged, shown};
 use crate::support::{
     FakeNode, Library, Mode, Robot, Tool, eventually, free_port, names, page, params,
@@ -102,11 +106,23 @@ fn a_node_that_refuses_a_notification_stays_registered() {
     let node = FakeNode::start("/subscriber");
     let publisher = FakeNode::start("/publisher");
     node.subscribe(&client, "/topic", "std_msgs/String");
-    publisher.publish(&client, "/topic", "std_msgs/String");
-    eventually("the master has notified the subscriber", || {
-        !node.updates("/topic").is_empty()
-    });
+    let again = params![
+        "/subscriber",
+        "/topic",
+        "std_msgs/String",
+        node.api.as_str()
+    ];
     drop(node);
+    eventually("the master notifies the node soon after an answer", || {
+        let asked = Instant::now();
+        client.ok("registerSubscriber", again.clone());
+        publisher.publish(&client, "/topic", "std_msgs/String");
+        let is_soon = asked.elapsed() < RECENT;
+        if !is_soon {
+            publisher.unpublish(&client, "/topic");
+        }
+        is_soon
+    });
     let registered = robot.settled_state();
     for part in [
         "a node does not answer",
