@@ -11,7 +11,7 @@ use crate::support::{
 
 #[test]
 fn killed_nodes_are_reported_as_dead_and_stay_registered() {
-    let robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
+    let robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let mut talker = robot.node(Library::Roscpp, "talker", &[]);
     let mut listener = robot.node(Library::Rospy, "listener", &[]);
