@@ -32,6 +32,8 @@ pub(crate) struct ReceivedCall {
 struct Inner {
     received: Mutex<Vec<ReceivedCall>>,
     holding: Mutex<bool>,
+    /// A method, and the number of its call with which holding begins.
+    hold_at: Mutex<Option<(String, usize)>>,
     released: Condvar,
     publications: Mutex<BTreeMap<String, String>>,
     subscriptions: Mutex<BTreeMap<String, String>>,
@@ -147,6 +149,11 @@ impl FakeNode {
         *lock(&self.inner.holding) = true;
     }
 
+    /// Like [`Self::hold`], from the `number`th call of `method` on.
+    pub(crate) fn hold_at(&self, method: &str, number: usize) {
+        *lock(&self.inner.hold_at) = Some((method.to_owned(), number));
+    }
+
     /// Answers calls again, including those that are waiting.
     pub(crate) fn release(&self) {
         *lock(&self.inner.holding) = false;
@@ -244,14 +251,23 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
         };
         // The flag is read before the call is recorded: a test that sees the call and then sets the flag means later
         // calls.
-        let is_held = *lock(&inner.holding);
-        lock(&inner.received).push(ReceivedCall {
+        let mut is_held = *lock(&inner.holding);
+        let mut received = lock(&inner.received);
+        received.push(ReceivedCall {
             method: call.method.clone(),
             params: call.params,
             from_rosrescue: is_from_rosrescue(&head),
             from,
             at: rosrescue::clock::wall_millis(),
         });
+        if let Some((method, number)) = &*lock(&inner.hold_at)
+            && call.method == *method
+            && received.iter().filter(|it| it.method == *method).count() == *number
+        {
+            *lock(&inner.holding) = true;
+            is_held = true;
+        }
+        drop(received);
         if lock(&inner.ignored).as_ref() == Some(&call.method) {
             continue;
         }

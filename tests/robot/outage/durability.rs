@@ -210,16 +210,14 @@ fn a_new_registration_is_not_removed_because_of_an_older_report_of_the_node() {
     subscriber.subscribe(&client, "/topic", "std_msgs/String");
     let asked = |method: &str| node.received(method).len();
     eventually("the node has been asked after it registered", || {
-        asked("getPid") == 1
+        asked("getPid") > 0
     });
     node.claim_publication("/topic", None);
-    robot.crash_master();
     // A topic that the node does not report is unregistered only after the second report.
-    eventually("the node is asked once", || {
-        asked("getSubscriptions") == 1 && asked("getPublications") == 1
-    });
-    node.hold();
-    eventually("the node is asked again", || asked("getPid") == 3);
+    let second = asked("getPid") + 2;
+    node.hold_at("getPid", second);
+    robot.crash_master();
+    eventually("the node is asked again", || asked("getPid") >= second);
     let dead = robot.master_pid();
     robot.kill_master_at_once(dead);
     eventually("the gate is shut", || !robot.is_open());
@@ -228,7 +226,7 @@ fn a_new_registration_is_not_removed_because_of_an_older_report_of_the_node() {
     client.ok("registerPublisher", params);
     node.release();
     eventually("the node has answered", || {
-        asked("getSubscriptions") == 2 && asked("getPublications") == 2
+        asked("getSubscriptions") >= 2 && asked("getPublications") >= 2
     });
     node.claim_publication("/topic", Some("std_msgs/String"));
     robot.revive_master();
