@@ -138,7 +138,7 @@ fn undecodable_calls_share_the_read_of_the_master_that_shows_their_effect() {
     relay.swallow("getSystemState", 2);
     let first = send_unreadable(&rescue.client(), "/first");
     eventually("one attempt to read the state is lost", || {
-        relay.to_swallow() == 1
+        relay.to_swallow() < 2
     });
     let second = send_unreadable(&rescue.client(), "/second");
     for call in [first, second] {
