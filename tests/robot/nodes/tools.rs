@@ -229,7 +229,10 @@ fn await_launched(master: &Client, launch: &mut Process, namespace: &str) {
         &format!("the nodes of {namespace} talk to each other"),
         || {
             assert!(launch.exited().is_none(), "roslaunch ended");
-            says(launch, &format!("got /{namespace}/talker ")) >= 20
+            // A node is ready after its last registration.
+            let is_ready = |node: &&str| says(launch, &format!("ready /{namespace}/{node}")) > 0;
+            nodes.iter().all(is_ready)
+                && says(launch, &format!("got /{namespace}/talker ")) >= 20
                 && says(launch, &format!("reply /{namespace}/server")) >= 3
         },
     );
