@@ -19,9 +19,15 @@ pub(crate) struct Twins {
 
 impl Twins {
     pub(crate) fn start() -> Self {
+        Self::start_with(&[])
+    }
+
+    /// Like [`Self::start`], with further options for rosrescue.
+    pub(crate) fn start_with(options: &[&str]) -> Self {
         let scratch = Scratch::new();
         let masters = [Rosmaster::start(&scratch), Rosmaster::start(&scratch)];
-        let rescue = Setup::proxy(&scratch, masters[1].port).start();
+        let setup = Setup::proxy(&scratch, masters[1].port);
+        let rescue = setup.args(options).start();
         Self {
             bare: masters[0].client(),
             through: rescue.client(),

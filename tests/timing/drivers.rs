@@ -184,7 +184,8 @@ fn no_driver_stalls_behind_a_master_that_hangs(mode: Mode) {
     let _turn = crate::turn();
     let hangs = std::env::var("ROSRESCUE_HANGS");
     let hangs = hangs.map_or(1, |text| text.parse().unwrap());
-    let robot = Robot::start_with(mode, &["--stand-in-after", "100"]);
+    let options = ["--stand-in-after", "100", "--probe-timeout", "500"];
+    let robot = Robot::start_with(mode, &options);
     let mut drivers = Drivers::start_with(&robot, &["writes"]);
     let mut ends = Vec::<Instant>::new();
     for hang in 1..=hangs {

@@ -132,7 +132,7 @@ fn board(node: &str) -> Vec<u8> {
 
 #[test]
 fn boards_are_answered_as_by_a_bare_master() {
-    let twins = Twins::start();
+    let twins = Twins::start_with(&["--probe-timeout", "500"]);
     let state = encode_call("getSystemState", params!["/script"]);
     let compare = |node: &str| {
         twins.same(&board(node));

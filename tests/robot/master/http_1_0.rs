@@ -96,7 +96,8 @@ fn a_healthy_http_1_0_master_is_left_alone(mode: Mode) {
 }
 
 fn the_state_survives_deaths_and_a_hang_of_such_a_master(mode: Mode) {
-    let mut robot = Robot::start_under(mode, PROGRAM, &[]);
+    let probes = ["--probe-timeout", "500"];
+    let mut robot = Robot::start_under_with(mode, PROGRAM, &[], &probes);
     robot.stay_away();
     let client = robot.client();
     let node = FakeNode::start("/node");

@@ -272,11 +272,12 @@ fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     assert_eq!(client.param("/gain"), None);
 }
 
-/// `rosrescue core` whose rosmaster uses any free port.
+/// `rosrescue core` whose rosmaster uses any free port. It soon gives up a silent program at that port.
 fn core(scratch: &Scratch) -> Rescue {
     let port = free_port();
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
-    Setup::bare(scratch, arguments).at_port(port).start()
+    let setup = Setup::bare(scratch, arguments).args(["--probe-timeout", "500"]);
+    setup.at_port(port).start()
 }
 
 /// Process id and port of the rosmaster behind rosrescue.
