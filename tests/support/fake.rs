@@ -242,6 +242,12 @@ fn claim(table: &Mutex<BTreeMap<String, String>>, topic: &str, topic_type: Optio
     };
 }
 
+/// Whether rosrescue itself has sent the request with this head.
+pub(crate) fn is_from_rosrescue(head: &str) -> bool {
+    head.to_ascii_lowercase()
+        .contains("\nuser-agent: rosrescue/")
+}
+
 fn serve_node(inner: &Inner, stream: TcpStream) {
     let from = stream.peer_addr().ok().map(|peer| peer.ip());
     let mut stream = BufReader::new(stream);
@@ -369,12 +375,6 @@ fn http_reply(body: &[u8]) -> Vec<u8> {
     let head =
         format!("HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n");
     [head.as_bytes(), body].concat()
-}
-
-/// Whether rosrescue itself has sent the request with this head.
-pub(crate) fn is_from_rosrescue(head: &str) -> bool {
-    let head = head.to_ascii_lowercase();
-    head.contains("\nuser-agent: rosrescue/")
 }
 
 /// Reads the head and body of the next request. `None` at the end of the connection.

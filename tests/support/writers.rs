@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use ros1_master::xmlrpc::{self, Reply, Value};
 
-use super::fake::FakeMaster;
+use super::fake::{FakeMaster, is_from_rosrescue};
 use super::links::Dice;
 use super::params;
 use super::rpc::{Client, encode_call, http_request};
@@ -18,10 +18,18 @@ pub(crate) const SUBSCRIBERS: usize = 4;
 /// How long a node takes to answer.
 const ANSWER: Duration = Duration::from_millis(1);
 
+/// A notification of a parameter's value.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ParamUpdate {
+    pub(crate) value: i32,
+    pub(crate) from_rosrescue: bool,
+    pub(crate) at: Instant,
+}
+
 /// All notifications of a subscriber, by parameter and by topic, in order.
 #[derive(Debug, Default)]
 pub(crate) struct Told {
-    pub(crate) values: BTreeMap<String, Vec<i32>>,
+    pub(crate) values: BTreeMap<String, Vec<ParamUpdate>>,
     pub(crate) publishers: BTreeMap<String, Vec<Value>>,
 }
 
@@ -59,7 +67,9 @@ impl Subscriber {
     fn start(master: &Client, number: usize) -> Self {
         let told = Arc::new(Mutex::new(Told::default()));
         let theirs = Arc::clone(&told);
-        let server = FakeMaster::start(move |body| answer(&theirs, body));
+        let server = FakeMaster::start_with_heads(move |head, body| {
+            answer(&theirs, is_from_rosrescue(head), body)
+        });
         let (name, api) = (
             format!("/hears_{number}"),
             format!("http://127.0.0.1:{}/", server.port()),
@@ -88,14 +98,18 @@ impl Subscriber {
     }
 }
 
-fn answer(told: &Mutex<Told>, body: &[u8]) -> Vec<u8> {
+fn answer(told: &Mutex<Told>, from_rosrescue: bool, body: &[u8]) -> Vec<u8> {
     let call = xmlrpc::decode_call(body).expect("a call");
     if let [_, Value::String(name), value] = call.params.as_slice() {
         let mut told = lock(told);
         match (call.method.as_str(), value) {
             ("paramUpdate", Value::Int(value)) => {
                 let key = name.trim_end_matches('/').to_owned();
-                told.values.entry(key).or_default().push(*value);
+                told.values.entry(key).or_default().push(ParamUpdate {
+                    value: *value,
+                    from_rosrescue,
+                    at: Instant::now(),
+                });
             }
             ("publisherUpdate", list) => {
                 told.publishers

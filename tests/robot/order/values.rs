@@ -2,12 +2,12 @@
 //! the last one. The simulation of the write queue plays this without deaths, too.
 
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ros1_master::xmlrpc::Value;
 
 use crate::support::{
-    Client, Mode, Robot, State, eventually,
+    Mode, Robot, State, eventually,
     writers::{Subscriber, WRITERS, key, topic, write},
 };
 
@@ -17,33 +17,30 @@ const TIME: Duration = Duration::from_secs(4);
 
 #[test]
 fn no_value_goes_back_while_the_mirror_answers_first_and_the_master_dies_again_and_again() {
-    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--writes", "mirror"]);
-    no_value_goes_back(&robot.client(), || {
-        for _ in 0..2 {
-            robot.crash_master();
-        }
-    });
+    let options = ["--no-rosout", "--writes", "mirror"];
+    no_value_goes_back(Robot::start_with(Mode::Core, &options));
 }
 
 #[test]
 fn no_value_goes_back_while_the_master_dies_again_and_again() {
-    let mut robot = Robot::start(Mode::Proxy);
-    no_value_goes_back(&robot.client(), || {
-        for _ in 0..2 {
-            robot.crash_master();
-        }
-    });
+    no_value_goes_back(Robot::start(Mode::Proxy));
 }
 
 #[track_caller]
-fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
+fn no_value_goes_back(mut robot: Robot) {
+    let master = &robot.client();
     let seed = u64::from(std::process::id()) << 20;
     println!("seed {seed}");
     let subscribers = Subscriber::start_all(master);
+    let mut outages = Vec::new();
     let calls = thread::scope(|scope| {
         let start = |writer| scope.spawn(move || write(master, writer, seed, PAUSE, TIME).len());
         let writers: Vec<_> = (0..WRITERS).map(start).collect();
-        meanwhile();
+        for _ in 0..2 {
+            let begin = Instant::now();
+            robot.crash_master();
+            outages.push(begin..Instant::now());
+        }
         let calls = writers.into_iter().map(|writer| writer.join().unwrap());
         calls.sum::<usize>()
     });
@@ -58,7 +55,8 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
                     let told = subscriber.told();
                     told.values
                         .get(&key)
-                        .and_then(|values| values.last().copied())
+                        .and_then(|updates| updates.last())
+                        .map(|last| last.value)
                         == value
                 },
             );
@@ -76,8 +74,16 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
                     last.and_then(Value::as_array).map(<[Value]>::len) == Some(publishers)
                 },
             );
-            let values = subscriber.told().values[&key].clone();
-            told += values.len();
+            let mut updates = subscriber.told().values[&key].clone();
+            told += updates.len();
+            // The subscriber may read what the killed master has sent after what rosrescue sent next.
+            updates.dedup_by(|now, before| {
+                now.value < before.value
+                    && before.from_rosrescue
+                    && !now.from_rosrescue
+                    && outages.iter().any(|outage| outage.contains(&now.at))
+            });
+            let values: Vec<_> = updates.iter().map(|update| update.value).collect();
             let steps = (1..values.len()).filter(|&at| values[at] < values[at - 1]);
             let around = steps.map(|at| &values[at.saturating_sub(4)..values.len().min(at + 4)]);
             back.extend(around.map(|values| format!("subscriber {number}: {key} {values:?}")));
