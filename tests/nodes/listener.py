@@ -12,6 +12,7 @@ import threading
 import rospy
 import rospy.impl.masterslave
 import rospy.impl.tcpros_base
+import rospy.topics
 from std_msgs.msg import String
 
 from lines import now, say
@@ -60,18 +61,18 @@ def watch_reconnects():
     rospy.impl.tcpros_base.TCPROSTransport._reconnect = reconnect
 
 
-def watch_links(subscriber):
-    """Prints how many publishers are connected whenever that changes."""
-    impl = subscriber.impl
+def watch_links():
+    """Prints how many publishers are connected whenever that changes. Must be called before the node subscribes."""
+    impl = rospy.topics._SubscriberImpl
     saying = threading.Lock()
 
     def watched(original):
-        def method(connection):
-            answer = original(connection)
+        def method(self, connection):
+            answer = original(self, connection)
             # Without a lock, two threads would print their numbers in any order. It is not rospy's own lock: rospy
             # may hold that while it removes a connection, and would wait for ours forever.
             with saying:
-                say("links", len(impl.connections or ()))
+                say("links", len(self.connections or ()))
             return answer
 
         return method
@@ -83,13 +84,13 @@ def watch_links(subscriber):
 def main():
     watch_updates()
     watch_reconnects()
+    watch_links()
     arguments = rospy.myargv()
     rospy.init_node("listener")
     on_message = lambda message: say("got", message.data)
     if len(arguments) > 1:
         on_message = Summary(int(arguments[1])).on_message
-    subscriber = rospy.Subscriber("chatter", String, on_message, queue_size=None)
-    watch_links(subscriber)
+    rospy.Subscriber("chatter", String, on_message, queue_size=None)
     say("ready", rospy.get_name())
     rospy.spin()
 
