@@ -111,7 +111,11 @@ fn no_message_is_lost_when_a_master_behind_proxy_is_killed_again_and_again() {
     assert_eq!(failures(&readers), Vec::<String>::new());
     for user in &users {
         let heard: Vec<_> = (0..=kills).map(|speed| speed.to_string()).collect();
-        assert_eq!(user.said("value"), heard);
+        let said = user.said("value");
+        // A late user may read the previous value again after the new one. Then it is told the new one again.
+        let last = said.iter().enumerate();
+        let last = last.filter(|(at, value)| !said[at + 1..].contains(value));
+        assert!(last.map(|(_, value)| value).eq(&heard), "{said:?}");
         assert_eq!(user.said("failed"), Vec::<String>::new());
     }
     streams.assert_whole(&robot);
