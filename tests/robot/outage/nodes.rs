@@ -1,6 +1,8 @@
 //! Real nodes and tools that read while there is no master.
 
-use crate::support::{LIBRARIES, Mode, Node, Robot, Tool, eventually, in_both_modes};
+use crate::support::{
+    Client, LIBRARIES, Mode, Node, Robot, Tool, eventually, in_both_modes, params, port_of,
+};
 use ros1_master::xmlrpc::Value;
 
 /// Starts a node of each library, named with the library's suffix, without waiting for it.
@@ -43,6 +45,12 @@ fn nodes_and_tools_that_read_do_not_notice_an_outage(mode: Mode) {
         printed.collect::<Vec<_>>()
     };
     let before = robot.settled_state();
+    if mode == Mode::Core {
+        let server = Client::new(port_of(&client, "/server_cpp"));
+        eventually("rosout has a link to the node that is listed", || {
+            server.ok("getBusInfo", params!["/test"]) != Value::Array(Vec::new())
+        });
+    }
     let listed = run_all(&robot, &listings);
     assert!(!listed.contains(&String::new()), "{listed:?}");
     let dead = robot.master_pid();
