@@ -58,7 +58,7 @@ fn a_node_that_can_be_reached_again_is_told_everything() {
 /// Nodes of rosnodejs do not answer `paramUpdate`, but answer all other calls.
 #[test]
 fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "6000"]);
     let client = robot.client();
     client.set_param("/gain", 0);
     let node = FakeNode::start("/node");
@@ -90,7 +90,7 @@ fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
 /// A master does not look at answers. Boards search what they get for texts that every rosmaster sends.
 #[test]
 fn boards_that_answer_in_their_own_words_are_told_each_change_as_by_a_master() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "6000"]);
     let client = robot.client();
     let answers = [
         FakeMaster::proper(&Reply::Value("hmm".into())),
