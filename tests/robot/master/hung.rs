@@ -93,6 +93,9 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     let before = State::read(&client);
     let pid = robot.master_pid();
     let injections = robot.counter("masters_restored");
+    // A busy computer may have made the master late before.
+    let late = || robot.status().expect("a status")["late_answers"]["times"].as_u64();
+    let late_before = late();
 
     crate::support::stop(pid);
     // The master has received this call but not run it.
@@ -146,13 +149,10 @@ fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
     // Nothing has died, so this does not count as a rescue.
     let status = robot.status().expect("a status");
     assert_eq!(status["rescues"], 0, "{status}");
-    assert_eq!(status["late_answers"]["times"], 1, "{status}");
+    assert_eq!(late(), late_before.map(|times| times + 1), "{status}");
     assert_eq!(status["last_recovery"]["same_master"], true, "{status}");
     let shown = crate::support::page(&client, "/");
-    assert!(
-        shown.contains("answered in the master's place once, "),
-        "{shown}"
-    );
+    assert!(shown.contains("answered in the master's place "), "{shown}");
     after.assert_same(&robot.state(), "in the master that continues");
     after.assert_same(&State::read(&client), "through rosrescue");
     // The node never gets an older value or an incomplete list of publishers.
