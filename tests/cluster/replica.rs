@@ -61,14 +61,18 @@ impl Leader {
             .run(&settings("a"), &claim, None, None)
             .await
             .unwrap();
-        let EtcdAnswer::Applied { revision, .. } = answer else {
-            panic!("{answer:?}");
-        };
-        let guard = RevisionGuard {
-            origin: revision,
-            leader: revision,
-            alive: revision,
-            seq: 0,
+        let guard = match answer {
+            EtcdAnswer::Applied { revision, .. } => RevisionGuard {
+                origin: revision,
+                leader: revision,
+                alive: revision,
+                seq: 0,
+            },
+            // If the answer comes late, the request is sent again and finds itself done.
+            EtcdAnswer::Is(view) if (view.leader.as_ref()).is_some_and(|it| it.claim == 1) => {
+                view.guard()
+            }
+            answer => panic!("{answer:?}"),
         };
         Self {
             replica,
