@@ -245,11 +245,11 @@ impl<'a> Judge<'a> {
                 // while it was cut off. The others get such a write with the merge.
                 let elsewhere = |it: &&Write<'_>| it.alone && it.op.computer != op.computer;
                 // The next leader may lack a write that the previous one showed before it was acknowledged, until its
-                // computer sends it again.
+                // computer sends it again. The last sample of the previous leader may be older than the read.
                 let lost_for_a_while = |it: &&Write<'_>| {
                     let acknowledged = it.op.end.filter(|acknowledged| *acknowledged > end);
-                    acknowledged
-                        .is_some_and(|until| self.takeover_in(op.start, until + LEADS_SLACK))
+                    let from = op.start.saturating_sub(CLOSE);
+                    acknowledged.is_some_and(|until| self.takeover_in(from, until + LEADS_SLACK))
                 };
                 let counts =
                     |it: &&Write<'_>| !it.excused && !elsewhere(it) && !lost_for_a_while(it);
@@ -598,7 +598,7 @@ mod tests {
         for (sample, excused) in [(5 * S / 2, true), (3 * S + S / 2, true), (5 * S, false)] {
             let history = History {
                 ops: ops.to_vec(),
-                samples: vec![leads(1, 2 * S, 1), leads(0, sample, 2)],
+                samples: vec![leads(1, 2 * S - CLOSE / 2, 1), leads(0, sample, 2)],
                 ..History::default()
             };
             assert_eq!(violations(&history, &end).is_empty(), excused);

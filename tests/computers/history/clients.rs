@@ -349,8 +349,8 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
         wire.send(&get).ok()?;
         serde_json::from_slice(&wire.response().ok()?.body).ok()
     };
-    // The process that answered last, how often it had been alone, and when it answered.
-    let mut before = (None, 0, 0);
+    // The process that answered last, how often it had been alone, when it answered, and whether it was alone then.
+    let mut before = (None, 0, 0, false);
     while !shared.finish.load(Ordering::Relaxed) {
         let from = shared.now();
         let page = ask();
@@ -359,8 +359,9 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
             let cluster = &page["cluster"];
             let (pid, times) = (page["pid"].as_u64(), cluster["times_cut_off"].as_u64());
             let known = if pid == before.0 { before.1 } else { 0 };
-            if times > Some(known) {
-                // The computer may be back already.
+            let is_alone = cluster["role"] == "alone";
+            if times > Some(known) || before.3 && !is_alone {
+                // The computer may be back already, and was alone until it was.
                 shared.samples.lock().unwrap().push(Sample {
                     computer,
                     from: before.2,
@@ -368,7 +369,7 @@ fn sample(shared: &Shared, computer: usize, _: &Named, _: Dice) {
                     says: Says::Alone,
                 });
             }
-            before = (pid, times.unwrap_or(0), to);
+            before = (pid, times.unwrap_or(0), to, is_alone);
             let says = match cluster["role"].as_str() {
                 Some("alone") => Says::Alone,
                 Some("leading") if page["open"] == true => {
