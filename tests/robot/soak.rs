@@ -565,14 +565,17 @@ impl Stage<'_> {
 /// Runs the troubles of the disk until the end of the test.
 fn trouble(disk: &FailingDisk, mut dice: Dice, over: &AtomicBool) -> BTreeMap<String, u32> {
     let mut tally = BTreeMap::new();
+    let mut hung = false;
     while !over.load(Ordering::SeqCst) {
         let next = match dice.below(8) {
-            0..2 => Some(Trouble::Hangs),
+            // After 20 s of a hang, rosrescue starts without the checkpoint.
+            0..2 => (!hung).then_some(Trouble::Hangs),
             2 => Some(Trouble::Slow),
             3 => Some(Trouble::Full),
             4 => Some(Trouble::ReadOnly),
             _ => None,
         };
+        hung = matches!(next, Some(Trouble::Hangs));
         match next {
             Some(trouble) => {
                 *tally.entry(format!("{trouble:?}")).or_default() += 1;
