@@ -182,7 +182,8 @@ fn hold_and_probes_do_not_depend_on_the_wall_clock() {
         status(&client)["open"] == false
     });
     let found = start.elapsed();
-    assert!(found > Duration::from_millis(2500), "{found:?}");
+    // On a busy computer, earlier probes may have been late already. A jump would end them at once.
+    assert!(found > Duration::from_millis(900), "{found:?}");
     let allowed = control.allows(Duration::from_secs(15));
     assert!(found < allowed, "{found:?}; allowed are {allowed:?}");
     // A call that only a master understands is held for two seconds, not shorter and not much longer.
