@@ -178,10 +178,16 @@ async fn certificates_are_checked_on_both_sides() {
         ("ca", Some("expired")),
         ("ca", Some("stranger")),
     ] {
-        let error = client(access(ca, own))
-            .view(&keys(), limit)
-            .await
-            .unwrap_err();
+        let start = Instant::now();
+        let error = loop {
+            let client = client(access(ca, own));
+            let error = client.view(&keys(), limit).await.unwrap_err();
+            // On a busy computer the handshake may take too long.
+            let is_silent = matches!(error, EtcdError::Silent { .. });
+            if !is_silent || start.elapsed() > LIMIT {
+                break error;
+            }
+        };
         assert!(
             matches!(error, EtcdError::Tls { .. }),
             "{ca} {own:?}: {error}"

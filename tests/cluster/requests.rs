@@ -200,14 +200,17 @@ async fn without_a_majority_requests_fail_with_a_clear_error() {
     servers.kill(1);
     servers.kill(2);
     let start = Instant::now();
-    let limit = Duration::from_secs(2);
-    let error = client.put(&keys, 0, &[entry(1)], limit).await.unwrap_err();
-    assert!(start.elapsed() >= limit, "{error}");
-    let said = error.to_string();
-    assert!(
-        said.contains("cannot connect to etcd at http://127.0.0.1:"),
-        "{said}"
-    );
+    loop {
+        let (asked, limit) = (Instant::now(), Duration::from_secs(2));
+        let error = client.put(&keys, 0, &[entry(1)], limit).await.unwrap_err();
+        assert!(asked.elapsed() >= limit, "{error}");
+        let said = error.to_string();
+        if said.contains("cannot connect to etcd at http://127.0.0.1:") {
+            break;
+        }
+        // A busy computer may not have got to the second server.
+        assert!(start.elapsed() < LIMIT, "{said}");
+    }
     // The remaining member notices that it has no majority when its own election timeout is over.
     let mut statuses = client.status(LIMIT).await;
     while start.elapsed() < LIMIT && statuses[0].as_ref().unwrap().errors.is_empty() {
@@ -355,12 +358,16 @@ async fn an_endpoint_that_is_no_etcd_but_answers_is_passed_over() {
         both.view(&keys(), LIMIT).await.unwrap();
     }
     let alone = client(vec![wrong.clone()]);
-    let error = alone.view(&keys(), Duration::from_secs(2)).await;
-    let error = error.unwrap_err().to_string();
-    assert!(
-        error.starts_with(&format!("{wrong} does not answer as etcd")),
-        "{error}"
-    );
+    let start = Instant::now();
+    loop {
+        let error = alone.view(&keys(), Duration::from_secs(2)).await;
+        let error = error.unwrap_err().to_string();
+        if error.starts_with(&format!("{wrong} does not answer as etcd")) {
+            break;
+        }
+        // On a busy computer the answer may come too late.
+        assert!(start.elapsed() < LIMIT, "{error}");
+    }
     answers.abort();
 }
 
