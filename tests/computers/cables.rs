@@ -7,7 +7,7 @@ use rustix::process::Signal;
 use crate::chance::Chance;
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, TAKEOVER, TTL, victim};
-use crate::support::{Control, Library, PATIENCE, eventually, holds, params};
+use crate::support::{Control, Library, PATIENCE, State, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
 use crate::{rounds, turn};
 
@@ -175,10 +175,13 @@ fn with_alone_refuse_writes_to_a_computer_that_is_cut_off_wait() {
         eventually("the leader's rosout is registered", || {
             let client = leads.client();
             let rosout = leads.within(|| client.ask("lookupNode", params!["/test", "/rosout"]));
-            rosout.is_some_and(|api| {
+            let is_its_own = rosout.is_some_and(|api| {
                 api.as_str()
                     .is_some_and(|api| api.contains(&leads.address()))
-            })
+            });
+            // The subscription comes last.
+            let nodes = leads.within(|| State::read_subscribers(&client, "/rosout"));
+            is_its_own && nodes.is_some_and(|nodes| !nodes.is_empty())
         });
         fleet.await_same_state();
         let key = format!("/written_{cut}");
