@@ -82,24 +82,25 @@ impl Drop for Host {
 type Connections = (usize, Duration);
 
 /// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the connections before that,
-/// and for each of `windows` those within that many seconds after the recovery, or within more on a busy computer.
+/// and for each of `windows` those from then on until that many seconds after the recovery, or more on a busy computer.
 fn connections<const N: usize>(
     robot: &mut Robot,
     host: &Host,
     count: usize,
     windows: [u64; N],
 ) -> (Connections, [Connections; N]) {
-    let since = |start: Instant, seconds| {
-        thread::sleep(Duration::from_secs(seconds).saturating_sub(start.elapsed()));
+    let since = |start: Instant, span: Duration| {
+        thread::sleep(span.saturating_sub(start.elapsed()));
         let count = host.since(start);
         (count, start.elapsed())
     };
     let start = Instant::now();
     host.register(&robot.client(), count);
-    let before = since(start, 5);
-    robot.crash_master();
+    let before = since(start, Duration::from_secs(5));
     let start = Instant::now();
-    let after = windows.map(|seconds| since(start, seconds));
+    robot.crash_master();
+    let outage = start.elapsed();
+    let after = windows.map(|seconds| since(start, outage + Duration::from_secs(seconds)));
     let ports = host.ports.len();
     println!(
         "{count} names at {ports} ports: {before:?} connections, {after:?} after {windows:?} s"
