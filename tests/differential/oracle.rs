@@ -193,9 +193,14 @@ impl TrueLists {
 
     /// Whether a crash allows this callback to the node at `api`.
     pub(crate) fn has(&self, api: &str, call: &Call) -> bool {
-        // The last callback before a comparison may overtake one of another sender that no state between calls has.
+        // The last callback before a comparison may overtake one of another sender that no state between calls has. To
+        // these nodes rosrescue sends no `shutdown`.
         let mut callbacks = self.last_course.iter();
-        if callbacks.any(|it| matches!(it, Moment::Notice(to, late) if to == api && late == call)) {
+        let is_shutdown = call.method == "shutdown";
+        if !is_shutdown
+            && callbacks
+                .any(|it| matches!(it, Moment::Notice(to, late) if to == api && late == call))
+        {
             return true;
         }
         if call.method == "paramUpdate" {

@@ -326,11 +326,16 @@ pub(crate) fn run(
         let mut stage = Stage::new(nodes, wires.collect(), model);
         stage.allow_repeats();
         stage.callbacks = !script.unreturnable;
-        let result = steps(script, &mut rig, &mut stage, tally);
+        let mut result = steps(script, &mut rig, &mut stage, tally);
         if result.is_ok() {
             return (result, None);
         }
         rig.look(&mut stage);
+        if !survives(&stage.model) {
+            // Such a state is lost with its master.
+            result =
+                result.map_err(|why| format!("the state after the last callback was lost: {why}"));
+        }
         if !crate::nodes::HURRIED.get() {
             for computer in &rig.computers {
                 eprintln!("{}", computer.rescue.log());

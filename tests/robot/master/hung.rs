@@ -41,7 +41,8 @@ fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
 /// rosmaster answers such a call with 404, and runs nothing.
 #[test]
 fn a_call_to_a_path_that_rosmaster_does_not_have_never_takes_effect() {
-    let robot = Robot::start_with(Mode::Proxy, &["--stand-in-after", "100"]);
+    let options = ["--stand-in-after", "100", "--probe-timeout", "500"];
+    let robot = Robot::start_with(Mode::Proxy, &options);
     let client = robot.client();
     client.set_param("/before", 1);
     let pid = robot.master_pid();
