@@ -20,7 +20,7 @@ use crate::dice::{Cast, Dice};
 use crate::nodes::{Node, patience};
 use crate::real::{Rosmaster, Wire, lost_callback};
 use crate::script::{Script, Step, node_api};
-use crate::stage::{CLIENTS, Failure, Stage, undisturbed};
+use crate::stage::{CLIENTS, Failure, Stage, excuse, undisturbed};
 use crate::support::{
     Client, Rescue, Scratch, Setup, free_port, http_request, signal, status, try_status, unordered,
 };
@@ -311,7 +311,8 @@ pub(crate) fn run(
         }
         let scratch = rig.master.as_ref().map(|master| &master.scratch);
         let lost = || lost_callback(scratch.unwrap_or(&rig.scratch));
-        (result, stage.disturbance.or_else(lost))
+        let excuse = excuse(&result, stage.disturbance.or_else(lost));
+        (result, excuse)
     })
 }
 

@@ -10,7 +10,7 @@ use crate::dice::{Cast, Dice};
 use crate::nodes::Node;
 use crate::real::{Rosmaster, Wire, lost_callback};
 use crate::script::{Script, Step, node_api};
-use crate::stage::{CLIENTS, Failure, Stage, undisturbed};
+use crate::stage::{CLIENTS, Failure, Stage, excuse, undisturbed};
 use crate::support::unordered;
 
 /// Maximum number of calls that a successor has answered before it gets the state.
@@ -55,7 +55,9 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
     undisturbed(|| {
         let mut real = None;
         let result = steps(script, nodes, spare, &mut real);
-        (result, real.and_then(|real| lost_callback(&real.scratch)))
+        let lost = real.and_then(|real| lost_callback(&real.scratch));
+        let excuse = excuse(&result, lost);
+        (result, excuse)
     })
 }
 

@@ -21,7 +21,7 @@ use crate::dice::Dice;
 use crate::nodes::{Node, patience};
 use crate::real::{Wire, lost_callback};
 use crate::script::{Script, Step};
-use crate::stage::{CLIENTS, Failure, Stage, alike, undisturbed};
+use crate::stage::{CLIENTS, Failure, Stage, alike, excuse, undisturbed};
 use crate::support::{
     Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal, try_status,
 };
@@ -326,16 +326,11 @@ pub(crate) fn run(
         let mut stage = Stage::new(nodes, wires.collect(), model);
         stage.allow_repeats();
         stage.callbacks = !script.unreturnable;
-        let mut result = steps(script, &mut rig, &mut stage, tally);
+        let result = steps(script, &mut rig, &mut stage, tally);
         if result.is_ok() {
             return (result, None);
         }
         rig.look(&mut stage);
-        if !survives(&stage.model) {
-            // Such a state is lost with its master.
-            result =
-                result.map_err(|why| format!("the state after the last callback was lost: {why}"));
-        }
         if !crate::nodes::HURRIED.get() {
             for computer in &rig.computers {
                 eprintln!("{}", computer.rescue.log());
@@ -343,7 +338,13 @@ pub(crate) fn run(
         }
         let mut computers = rig.computers.iter();
         let lost = || computers.find_map(|computer| lost_callback(&computer.scratch));
-        (result, stage.disturbance.or_else(lost))
+        let disturbance = stage.disturbance.or_else(lost);
+        // A state that does not survive is lost with its master.
+        let excuse = match survives(&stage.model) {
+            true => excuse(&result, disturbance),
+            false => disturbance,
+        };
+        (result, excuse)
     })
 }
 

@@ -20,7 +20,8 @@ const FOLDERS: [&str; 4] = [
 pub(in crate::commands) const ADD_WAIT: &str = "add --wait to its roslaunch, so that it never starts a master \
                                                 (robot_upstart: `rosrun robot_upstart install --wait …`)";
 /// What to do about a unit that runs a roscore and nodes.
-pub(in crate::commands) const REMOVE_ROSCORE: &str = "remove roscore from it, and let it wait for the master (roslaunch --wait, or `rosrescue wait`)";
+pub(in crate::commands) const REMOVE_ROSCORE: &str = "remove roscore from it, and let it wait for the master \
+                                                      (roslaunch --wait, or `rosrescue wait`)";
 /// Programs whose arguments name other programs that they do not start.
 const LOOKUPS: [&str; 9] = [
     "echo",
